@@ -1,0 +1,1 @@
+"""Talks to drives; knows nothing of tests, logs or estimation."""

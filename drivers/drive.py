@@ -1,0 +1,188 @@
+"""The contract between a drive, of whatever make and bus, and everything above it.
+
+All quantities are SI at the motor shaft; torque positive drives speed positive. Nothing above `drivers`
+knows of objects, registers, per-mille or rpm. A caller goes down the list once:
+
+    connect → preflight → enable(mode) → exchange(command) … → quick_stop → exchange … → disable → close
+
+`enable`, `quick_stop` and `disable` only say what is wanted; the drive's state machine moves during the
+`exchange` calls that follow, one a cycle, so that every cycle is seen, recorded and guarded alike.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple, Protocol
+
+from drivers.clock import Clock
+
+
+class Mode(Enum):
+    """What the drive regulates."""
+
+    SPEED = "speed"
+    TORQUE = "torque"
+
+
+class PowerState(Enum):
+    """The drive's state machine as far as a caller needs it (CiA 402, figure of the state machine)."""
+
+    NOT_READY = "not ready"
+    OFF = "off"                    # switch on disabled: no torque
+    READY = "ready"                # ready to switch on, or switched on: no torque yet
+    ENABLED = "enabled"            # operation enabled: setpoints act
+    QUICK_STOP = "quick stop"      # decelerating or holding after a quick stop
+    FAULT = "fault"                # fault reaction active, or fault
+
+
+class Command(NamedTuple):
+    """One cycle's wish: the mode, and the setpoint of each mode (the other one seeds a later switch)."""
+
+    mode: Mode
+    speed_rad_s: float
+    torque_nm: float
+
+
+class Sample(NamedTuple):
+    """One cycle's feedback, torque and speed of one instant.
+
+    ``time_s`` is control time of the SYNC (of the middle of the transaction on Modbus, give or take
+    ``half_width_s``); ``age_s`` says how long after it the feedback arrived. ``fresh`` is False when the
+    cycle brought none: the values are then those of the cycle before.
+    """
+
+    time_s: float
+    age_s: float
+    half_width_s: float
+    fresh: bool
+    speed_rad_s: float
+    torque_nm: float
+    torque_demand_nm: float | None
+    mode: Mode | None              # as the drive displays it; None while it displays another one
+    state: PowerState
+    standstill: bool               # as the drive says, where it says so
+    limit_active: bool             # internal limit active (statusword bit 11)
+    status: int                    # raw statusword, for the log
+
+
+class RawFrame(NamedTuple):
+    """One frame as it stood on the bus; ``time_s`` is control time."""
+
+    time_s: float
+    outgoing: bool
+    identifier: int
+    data: bytes
+
+
+FrameTap = Callable[[RawFrame], None]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who is at the other end. ``simulated`` is decided by the simulator's marker alone."""
+
+    vendor: int
+    product: int
+    revision: int
+    serial: int
+    name: str
+    simulated: bool
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the caller wants the drive itself to enforce, written to it and read back in preflight."""
+
+    speed_rad_s: float
+    torque_nm: float
+    quick_stop_rad_s2: float
+    watchdog_s: float
+
+
+@dataclass(frozen=True)
+class ReportingFilters:
+    """First-order lags that the drive puts on what it reports, where it tells them; None = not told."""
+
+    speed_lag_s: float | None = None
+    torque_lag_s: float | None = None
+    source: str = ""
+
+
+class Outcome(Enum):
+    """How a preflight check went."""
+
+    OK = "ok"
+    NOTE = "note"                  # worth a line, no obstacle
+    REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the preflight table."""
+
+    name: str
+    wanted: str
+    found: str
+    outcome: Outcome
+    where: str = ""                # object, register or parameter
+    next_step: str = ""
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """What was found before anything moved."""
+
+    identity: Identity
+    checks: tuple[Check, ...]
+    modes: frozenset[Mode]
+    switch_while_enabled: bool
+    quick_stop_in_torque_mode: bool    # does a quick stop decelerate under speed control from torque mode?
+    rated_torque_nm: float
+    torque_resolution_nm: float
+    speed_resolution_rad_s: float
+    watchdog_s: float
+    safe_action: str                   # what the drive does by itself when the host falls silent
+    filters: ReportingFilters = ReportingFilters()
+
+    @property
+    def refused(self) -> tuple[Check, ...]:
+        return tuple(check for check in self.checks if check.outcome is Outcome.REFUSED)
+
+
+@dataclass(frozen=True)
+class Counters:
+    """What went wrong on the bus so far."""
+
+    cycles: int = 0
+    missed: int = 0                # cycles without feedback
+    late: int = 0                  # feedback that came after its cycle
+    overruns: int = 0              # cycles that began late by more than half a period
+
+
+class Drive(Protocol):
+    """One drive on one bus. Every method may raise `drivers.errors.TdhilError`."""
+
+    @property
+    def clock(self) -> Clock: ...
+
+    @property
+    def period_s(self) -> float: ...
+
+    @property
+    def counters(self) -> Counters: ...
+
+    def connect(self) -> Identity: ...
+
+    def preflight(self, limits: Limits) -> Preflight: ...
+
+    def reset_fault(self) -> None: ...
+
+    def enable(self, mode: Mode) -> None: ...
+
+    def exchange(self, command: Command) -> Sample: ...
+
+    def quick_stop(self) -> None: ...
+
+    def disable(self) -> None: ...
+
+    def close(self) -> None: ...

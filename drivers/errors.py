@@ -1,0 +1,59 @@
+"""The error tree of everything that talks to a drive.
+
+::
+
+    TdhilError                      what, where, next step
+    ├── DataFileError               rig.yaml:12: unknown key 'speed_max'
+    ├── PreflightRefused            the drive's identity is not the profile's; nothing has moved
+    ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out
+    ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck
+    │   └── ModeNotConfirmed        6061h did not follow 6060h in time
+    ├── LimitHit                    speed left its window; torque or time limit reached
+    ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
+    └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
+
+`tdhil.errors` says which of them ends with which exit code.
+"""
+
+from profiles.errors import DataFileError, Problem, TdhilError
+
+__all__ = [
+    "CommandRejected",
+    "CommunicationLost",
+    "DataFileError",
+    "DriveFault",
+    "LimitHit",
+    "ModeNotConfirmed",
+    "PreflightRefused",
+    "Problem",
+    "StopNotConfirmed",
+    "TdhilError",
+]
+
+
+class PreflightRefused(TdhilError):
+    """Refused before the shaft has moved: identity, limits, watchdog, mode or confirmation."""
+
+
+class CommunicationLost(TdhilError):
+    """The drive can't be heard or reached any more."""
+
+
+class DriveFault(TdhilError):
+    """The drive itself reports a fault or leaves the state it was asked to hold."""
+
+
+class ModeNotConfirmed(DriveFault):
+    """The drive did not take over the mode of operation it was asked for."""
+
+
+class LimitHit(TdhilError):
+    """A limit of the rig (speed window, torque, time) was reached or is about to be."""
+
+
+class StopNotConfirmed(TdhilError):
+    """The stop sequence ran, but the shaft was not seen at rest."""
+
+
+class CommandRejected(TdhilError):
+    """A setpoint that must not reach the bus: not finite, or outside the limits."""

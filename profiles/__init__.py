@@ -1,0 +1,1 @@
+"""Drive profiles as data: the schema, a strict YAML loader, and what ships."""

@@ -1,0 +1,44 @@
+"""The root of the error tree, and the errors of data files.
+
+The root stands here because `profiles` lies below every other room; `drivers.errors` re-exports it and
+draws the whole tree.
+"""
+
+from dataclasses import dataclass
+
+
+class TdhilError(Exception):
+    """Root of every error a user can cause or meet.
+
+    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, what to do about it.
+    """
+
+    def __init__(self, what: str, *, where: str = "", next_step: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.next_step = next_step
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.what}" if self.where else self.what
+        return f"{text}. {self.next_step}" if self.next_step else text
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a data file; ``line`` counts from 1, 0 where no line can be named."""
+
+    file: str
+    line: int
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}: {self.message}" if self.line else f"{self.file}: {self.message}"
+
+
+class DataFileError(TdhilError):
+    """A YAML, EDS or other data file that can't be used; carries every problem found, not only the first."""
+
+    def __init__(self, problems: tuple[Problem, ...]) -> None:
+        super().__init__("\n".join(str(problem) for problem in problems))
+        self.problems = problems

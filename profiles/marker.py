@@ -1,0 +1,10 @@
+"""How a simulated drive says that it is one.
+
+A simulator wears vendors' identities, so identity proves nothing; it bears this object besides, in the
+manufacturer's range, and no real drive does.
+"""
+
+MARKER_INDEX = 0x5FFE
+"""Record. Sub 1 (VISIBLE_STRING, ro): `MARKER_TEXT`. Sub 2 (UNSIGNED8, rw): 1 = stepped time, 0 = its own clock."""
+
+MARKER_TEXT = "tdhil simulated drive"
