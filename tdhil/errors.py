@@ -1,0 +1,94 @@
+"""How each error ends: the exit code, for people's scripts and for the tests.
+
+::
+
+    TdhilError                      what, where, next step                                     exit
+    ├── UsageError                  --node 300: must be at most 127                              2
+    ├── DataFileError               rig.yaml:12: unknown key 'speed_max'                         2
+    ├── PreflightRefused            the drive's identity is not the profile's; nothing moved     4
+    ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged                5
+    ├── DriveFault                  EMCY 7305h in motion; state machine stuck                    6
+    │   └── ModeNotConfirmed        6061h did not follow 6060h in time                           6
+    ├── LimitHit                    speed left its window; torque or time limit reached          7
+    ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
+    ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
+    ├── LogError                    in `tdhil.record`: brings its own `exit_code`
+    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP (143)
+
+Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors.
+A class or an instance may carry an attribute ``exit_code``, which goes before this table.
+"""
+
+import signal
+from enum import IntEnum
+
+from drivers.errors import (
+    CommunicationLost,
+    DataFileError,
+    DriveFault,
+    LimitHit,
+    PreflightRefused,
+    StopNotConfirmed,
+    TdhilError,
+)
+
+__all__ = ["ExitCode", "Interrupted", "TdhilError", "UsageError", "exit_code"]
+
+
+class ExitCode(IntEnum):
+    """How the process ends."""
+
+    OK = 0
+    INTERNAL = 1                # internal error: a mistake in this program
+    USAGE = 2                   # usage or configuration
+    PARTIAL = 3                 # partial result
+    REFUSED = 4                 # preflight refused: nothing has moved
+    COMMUNICATION = 5           # communication lost
+    DRIVE_FAULT = 6
+    LIMIT = 7                   # limit hit
+    STOP_NOT_CONFIRMED = 8      # use the hard-wired emergency stop
+    NOT_IDENTIFIABLE = 9        # not identifiable, or the model was rejected
+    NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
+    INTERRUPTED = 130           # Ctrl-C (SIGINT)
+    TERMINATED = 143            # SIGTERM, SIGHUP
+
+
+class UsageError(TdhilError):
+    """The command line asks for something that can't be, or for two things that exclude each other."""
+
+
+class Interrupted(TdhilError):
+    """Somebody, or the system, asked the program to end; raised once the shaft has been taken care of."""
+
+    def __init__(self, number: int, *, next_step: str = "") -> None:
+        self.signal = signal.Signals(number)
+        how = "Ctrl-C" if self.signal is signal.SIGINT else self.signal.name
+        super().__init__(f"interrupted by {how}", next_step=next_step)
+
+    @property
+    def exit_code(self) -> ExitCode:
+        return ExitCode.INTERRUPTED if self.signal is signal.SIGINT else ExitCode.TERMINATED
+
+
+_CODES: dict[type[BaseException], ExitCode] = {
+    UsageError: ExitCode.USAGE,
+    DataFileError: ExitCode.USAGE,
+    PreflightRefused: ExitCode.REFUSED,
+    CommunicationLost: ExitCode.COMMUNICATION,
+    DriveFault: ExitCode.DRIVE_FAULT,
+    LimitHit: ExitCode.LIMIT,
+    StopNotConfirmed: ExitCode.STOP_NOT_CONFIRMED,
+    KeyboardInterrupt: ExitCode.INTERRUPTED,
+}
+_VALUES = frozenset(int(code) for code in ExitCode)
+
+
+def exit_code(error: BaseException) -> ExitCode:
+    """The exit code for ``error``: its own attribute, else that of its nearest class in the table, else 1."""
+    own = getattr(error, "exit_code", None)
+    if isinstance(own, int) and own in _VALUES:
+        return ExitCode(own)
+    for kind in type(error).__mro__:
+        if kind in _CODES:
+            return _CODES[kind]
+    return ExitCode.INTERNAL

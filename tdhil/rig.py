@@ -1,0 +1,233 @@
+"""One bench: drive, bus, gear, load, machine limits, and what its user always wants of a run.
+
+`Rig` mirrors rig.yaml key by key; units stand in the names, all of them SI. Torque and speed are those of the
+motor shaft. It is frozen, and knows from which line of which file each of its keys came::
+
+    drive: canopen
+    bus: {interface: socketcan, channel: can0, bitrate: 500000}
+    node: 1
+    limits:
+      speed_min_rad_s: 0.5
+      …
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, PrivateAttr, ValidationError, model_validator
+
+from drivers.errors import DataFileError, PreflightRefused, Problem
+from profiles.data_model import DataModel, refuse_if
+from profiles.strict_yaml import load_with_lines
+from profiles.yaml_messages import messages_of
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class Bus(DataModel):
+    """python-can's own options; what is missing here is looked for in its environment variables and files."""
+
+    interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
+    channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
+    bitrate: int | None = Field(default=None, gt=0, le=1_000_000, description="bit/s; socketcan: as the link has it")
+    options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
+
+
+class Limits(DataModel):
+    """What the machine may do; watched by the host and, where it can, by the drive."""
+
+    speed_min_rad_s: float = Field(description="rad/s; lowest speed while torque is regulated")
+    speed_max_rad_s: float = Field(gt=0, description="rad/s; highest speed")
+    torque_nm: Positive = Field(description="N·m; highest torque, either sign")
+    time_s: Positive = Field(description="s; longest run")
+    quick_stop_rad_s2: Positive = Field(description="rad/s²; how hard the shaft is braked")
+    watchdog_s: float = Field(default=0.5, ge=0.02, le=5, description="s of silence until the drive stops by itself")
+    probe_torque_nm: Positive = Field(description="N·m; highest torque to find out the direction and the breakaway")
+    probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        findings = []
+        if self.speed_min_rad_s >= self.speed_max_rad_s:
+            findings.append(("speed_min_rad_s", f"must be below speed_max_rad_s, which is {self.speed_max_rad_s:g}"))
+        if self.probe_torque_nm > self.torque_nm:
+            findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {self.torque_nm:g}"))
+        refuse_if(findings)
+        return self
+
+
+class Gear(DataModel):
+    """Between motor and main shaft."""
+
+    ratio: Positive = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
+
+
+class DriveData(DataModel):
+    """What the drive does not tell of itself, and how far it can be trusted."""
+
+    rated_torque_nm: Positive | None = Field(default=None, description="N·m; name plate, where 6076h does not say")
+    torque_scale_rel_sd: float | None = Field(
+        default=None, ge=0, lt=1, description="standard deviation of the drive's torque scale, as a share (0.02 = 2 %)"
+    )
+    speed_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported speed")
+    speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
+    torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+
+    @model_validator(mode="after")
+    def _deviations(self) -> Self:
+        refuse_if(
+            [
+                (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
+                for name in ("speed_lag", "torque_lag")
+                if getattr(self, f"{name}_sd_s") is not None and getattr(self, f"{name}_s") is None
+            ]
+        )
+        return self
+
+
+class Run(DataModel):
+    """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
+
+    excitation: Literal["multisine", "sine", "step"] | None = None
+    mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
+    frequency_hz: Positive | None = Field(default=None, description="Hz; base frequency of the excitation")
+    amplitude_rad_s: Positive | None = Field(default=None, description="rad/s; amplitude of the speed")
+    offset_rad_s: float | None = Field(default=None, description="rad/s; mean speed")
+    periods: int | None = Field(default=None, ge=1, le=10_000)
+    tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
+    confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
+    seed: int | None = Field(default=None, ge=0, le=2**63 - 1, description="repeats a simulated run")
+    simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")
+    real_time: bool | None = Field(default=None, description="simulator against the wall clock")
+    stepped: bool | None = Field(default=None, description="simulator in another process, stepped by SYNC")
+    yes: bool | None = Field(default=None, description="no prompt before motion; replaces no limit")
+    json_: bool | None = Field(default=None, alias="json", description="one JSON document on stdout")
+    log: str | None = Field(default=None, min_length=1, description="file to write, from the working directory")
+    plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
+
+    @model_validator(mode="after")
+    def _clock(self) -> Self:
+        if self.real_time and self.stepped:
+            refuse_if([("stepped", "and real_time exclude each other; keep one")])
+        return self
+
+
+class Rig(DataModel):
+    """Everything that a bench has; each key is optional until something needs it."""
+
+    drive: Literal["canopen", "modbus"] | None = None
+    bus: Bus = Bus()
+    node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
+    profile: str | None = Field(default=None, min_length=1, description="name, or a .yaml file beside rig.yaml")
+    rate_hz: float | None = Field(default=None, gt=0, le=2000, description="cycles a second")
+    limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
+    gear: Gear = Gear()
+    load: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
+    make_up_torque_nm: Positive | None = Field(default=None, description="N·m at the motor; of the string's joints")
+    torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
+    allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
+    drive_data: DriveData = DriveData()
+    reference_inertia_kg_m2: Positive | None = Field(default=None, description="kg·m² at the motor; shown beside J")
+    run: Run = Run()
+
+    _file: str = PrivateAttr(default="")
+    _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        findings = [
+            ("load", f"string needs '{name}' ({_describe(name)})")
+            for name in ("make_up_torque_nm", "torque_ramp_nm_s")
+            if self.load == "string" and getattr(self, name) is None
+        ]
+        limits = self.limits
+        if limits and self.load == "string" and self.make_up_torque_nm and limits.torque_nm >= self.make_up_torque_nm:
+            findings.append(
+                ("limits.torque_nm", f"must be below make_up_torque_nm, which is {self.make_up_torque_nm:g}")
+            )
+        if limits and limits.speed_min_rad_s < 0 and not self.allow_reverse:
+            findings.append(("limits.speed_min_rad_s", "below 0 the shaft runs backwards: needs allow_reverse: true"))
+        if limits and self.rate_hz and limits.watchdog_s * self.rate_hz < 5:
+            findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / self.rate_hz:g} s at rate_hz)"))
+        refuse_if(findings)
+        return self
+
+    def line(self, dotted: str) -> int:
+        """The line in rig.yaml of a key such as ``limits.torque_nm``; 0 where it does not stand there."""
+        return self._lines.get(tuple(dotted.split(".")), 0)
+
+    def source(self, dotted: str) -> str:
+        """``rig.yaml:7``, or '' where the key does not stand in the file."""
+        line = self.line(dotted)
+        return f"{Path(self._file).name}:{line}" if line else ""
+
+    def get(self, dotted: str) -> Any:
+        """The value of a key such as ``run.seed``."""
+        value: Any = self
+        for part in dotted.split("."):
+            value = getattr(value, "json_" if part == "json" else part)
+        return value
+
+    @property
+    def folder(self) -> Path:
+        """Where the files that rig.yaml names are looked for."""
+        return Path(self._file).parent
+
+
+def load_rig(path: Path) -> Rig:
+    """The bench in a rig.yaml; DataFileError with every problem and its line."""
+    loaded = load_with_lines(path, Rig)
+    rig = loaded.value
+    rig._file, rig._lines = loaded.file, loaded.lines
+    return rig
+
+
+def require_limits(rig: Rig | None) -> Limits:
+    """The limits, without which nothing real moves; PreflightRefused, naming the keys, where there are none."""
+    if rig is not None and rig.limits is not None:
+        return rig.limits
+    keys = ", ".join(name for name, field in Limits.model_fields.items() if field.is_required())
+    file = rig._file if rig is not None and rig._file else ""
+    where = file or "rig.yaml"
+    step = f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if file else ", and name the file with --rig")
+    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step)
+
+
+_SIMULATED_LIMITS = Limits(
+    speed_min_rad_s=0.5,
+    speed_max_rad_s=7.0,
+    torque_nm=400.0,
+    time_s=900.0,
+    quick_stop_rad_s2=2.0,
+    watchdog_s=0.5,
+    probe_torque_nm=200.0,
+    probe_travel_rad=3.0,
+)
+_SIMULATED_TORQUE_SCALE_SD = 0.02
+
+
+def simulated_default_rig(rig: Rig | None = None) -> Rig:
+    """The bench of the simulated rig; what ``rig`` says goes before it. DataFileError where they don't fit."""
+    rig = rig or Rig()
+    data = rig.model_dump(by_alias=True)
+    data["limits"] = data["limits"] or _SIMULATED_LIMITS.model_dump()
+    if data["drive_data"]["torque_scale_rel_sd"] is None:
+        data["drive_data"]["torque_scale_rel_sd"] = _SIMULATED_TORQUE_SCALE_SD
+    try:
+        filled = Rig.model_validate(data)
+    except ValidationError as error:
+        file = rig._file or "rig"
+        found = [
+            Problem(file, rig.line(".".join(map(str, path))), f"{'.'.join(map(str, path))}: {message} (simulated rig)")
+            for path, message in messages_of(error, data, Rig)
+        ]
+        raise DataFileError(tuple(found)) from None
+    filled._file, filled._lines = rig._file, rig._lines
+    return filled
+
+
+def _describe(name: str) -> str:
+    return Rig.model_fields[name].description or name

@@ -1,0 +1,65 @@
+"""Each error ends with the exit code that the manual promises."""
+
+import signal
+
+import pytest
+
+from drivers.errors import (
+    CommandRejected,
+    CommunicationLost,
+    DataFileError,
+    DriveFault,
+    LimitHit,
+    ModeNotConfirmed,
+    PreflightRefused,
+    Problem,
+    StopNotConfirmed,
+    TdhilError,
+)
+from tdhil.errors import ExitCode, Interrupted, UsageError, exit_code
+
+
+class LogErrorLike(TdhilError):
+    exit_code = 10
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (RuntimeError("x"), 1),
+        (TdhilError("x"), 1),
+        (CommandRejected("x"), 1),
+        (UsageError("x"), 2),
+        (DataFileError((Problem("f", 1, "x"),)), 2),
+        (PreflightRefused("x"), 4),
+        (CommunicationLost("x"), 5),
+        (DriveFault("x"), 6),
+        (ModeNotConfirmed("x"), 6),
+        (LimitHit("x"), 7),
+        (StopNotConfirmed("x"), 8),
+        (LogErrorLike("x"), 10),
+        (Interrupted(signal.SIGINT), 130),
+        (KeyboardInterrupt(), 130),
+        (Interrupted(signal.SIGTERM), 143),
+        (Interrupted(signal.SIGHUP), 143),
+    ],
+)
+def test_exit_codes(error: BaseException, code: int) -> None:
+    assert exit_code(error) == code
+
+
+def test_the_table_of_exit_codes() -> None:
+    assert sorted(ExitCode) == [*range(11), 130, 143]
+
+
+def test_an_attribute_of_an_instance_goes_first() -> None:
+    error = TdhilError("x")
+    error.exit_code = 3  # type: ignore[attr-defined]
+    assert exit_code(error) is ExitCode.PARTIAL
+    error.exit_code = 99  # type: ignore[attr-defined]
+    assert exit_code(error) is ExitCode.INTERNAL
+
+
+def test_ctrl_c_is_called_by_its_name() -> None:
+    assert "Ctrl-C" in str(Interrupted(signal.SIGINT))
+    assert "SIGTERM" in str(Interrupted(signal.SIGTERM))
