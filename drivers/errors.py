@@ -5,6 +5,7 @@
     TdhilError                      what, where, next step
     ├── DataFileError               rig.yaml:12: unknown key 'speed_max'
     ├── PreflightRefused            the drive's identity is not the profile's; nothing has moved
+    │   └── ObjectRefused           SDO abort 06090030h on 6072h
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out
     ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck
     │   └── ModeNotConfirmed        6061h did not follow 6060h in time
@@ -24,6 +25,7 @@ __all__ = [
     "DriveFault",
     "LimitHit",
     "ModeNotConfirmed",
+    "ObjectRefused",
     "PreflightRefused",
     "Problem",
     "StopNotConfirmed",
@@ -33,6 +35,10 @@ __all__ = [
 
 class PreflightRefused(TdhilError):
     """Refused before the shaft has moved: identity, limits, watchdog, mode or confirmation."""
+
+
+class ObjectRefused(PreflightRefused):
+    """The drive aborted the transfer of an object; objects are read and written before the shaft moves only."""
 
 
 class CommunicationLost(TdhilError):

@@ -1,0 +1,410 @@
+"""A CiA 402 drive on a CAN bus, as `drivers.drive.Drive` asks for it.
+
+One cycle, all of it sent by this loop and nothing by any other thread or by the kernel::
+
+    tick ─ heartbeat (when due) ─ RPDO2 (when the mode changes) ─ RPDO1 ─ SYNC ─► TPDO1 (─ TPDO2)
+           700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
+
+Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
+switch and the torque target that seeds it therefore act together.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from drivers.cia402 import preflight as checks
+from drivers.cia402.link import CanLink
+from drivers.cia402.mapping import layout, write_pdo
+from drivers.cia402.objects import (
+    RPDO1,
+    RPDO2,
+    TPDO1,
+    TPDO2_MODE,
+    TPDO2_MODE_DEMAND,
+    Units,
+    consumer_heartbeat,
+    encode_speed,
+    encode_torque,
+)
+from drivers.cia402.sdo import Objects, name
+from drivers.cia402.state import (
+    DISABLE_VOLTAGE,
+    FAULT_RESET,
+    INTERNAL_LIMIT,
+    SPEED_ZERO,
+    TARGET_REACHED,
+    State,
+    Wish,
+    controlword_towards,
+    decode,
+    power_state,
+)
+from drivers.cia402.watch import OPERATIONAL, PRE_OPERATIONAL, Watch
+from drivers.clock import Clock
+from drivers.drive import (
+    Command,
+    Counters,
+    FrameTap,
+    Identity,
+    Limits,
+    Mode,
+    PowerState,
+    Preflight,
+    Sample,
+)
+from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
+from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.schema import CanopenProfile
+
+if TYPE_CHECKING:
+    import can
+
+HOST_NODE = 127
+SYNC = 0x080
+NMT = 0x000
+START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+_NO_WORD = b""
+_PROFILE_VELOCITY = 3
+_REPEAT_MODE_CYCLES = 25
+"""A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
+
+
+class Cia402Drive:
+    """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame.
+
+    ``stepped`` asks a simulated peer to let each SYNC advance its time; a real one is refused it.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        profile: CanopenProfile,
+        clock: Clock,
+        *,
+        node: int,
+        rate_hz: float | None = None,
+        rated_torque_nm: float | None = None,
+        host_node: int = HOST_NODE,
+        tap: FrameTap | None = None,
+    ) -> None:
+        self.clock = clock
+        self.period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
+        self._profile = profile
+        self._node = node
+        self._host_node = host_node
+        self._rated_torque_nm = rated_torque_nm
+        self._link = CanLink(bus, clock, tap)
+        self._objects = Objects(self._link, node)
+        self._watch = Watch(node, clock)
+        self._link.handlers[0x700 + node] = self._watch.on_heartbeat
+        self._link.handlers[0x080 + node] = self._watch.on_emcy
+        self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
+        self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
+        self._link.handlers[self._tpdo1_id] = self._on_feedback
+        self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
+        self._identity: Identity | None = None
+        self._units = Units(1.0, 1.0)
+        self._codes: dict[Mode, int] = {}
+        self._modes: dict[int, Mode] = {}
+        self._slow_layout = TPDO2_MODE
+        self._watchdog_s = 0.0
+        self._heartbeat_every_s = 0.1
+        self._wish = Wish.OFF
+        self._state = State.NOT_READY
+        self._status = 0
+        self._speed_raw = 0
+        self._torque_raw = 0
+        self._demand_raw: int | None = None
+        self._shown_code = 0
+        self._sent_code = 0
+        self._since_mode_sent = 0
+        self._feedback = _NO_WORD
+        self._next_tick_s = 0.0
+        self._next_heartbeat_s = 0.0
+        self._cycles = self._missed = self._late = self._overruns = 0
+
+    @property
+    def counters(self) -> Counters:
+        """What went wrong on the bus so far."""
+        return Counters(self._cycles, self._missed, self._late, self._overruns)
+
+    # -- before motion ---------------------------------------------------------------------------------------
+
+    def connect(self) -> Identity:
+        """Find the node, put it into pre-operational, read who it is (1018h) and whether it is simulated."""
+        self._objects.read(0x1000)
+        self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        vendor, product, revision, serial = (self._objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
+        try:
+            title = self._objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 ")
+        except ObjectRefused:
+            title = "CiA 402 drive"
+        self._identity = Identity(vendor, product, revision, serial, title, self._is_simulated())
+        if self.clock.stepped and not self._identity.simulated:
+            raise PreflightRefused(
+                "stepped time was asked for, but the peer does not bear the simulator's marker",
+                where=name(MARKER_INDEX, 1),
+                next_step="Leave --stepped out: a real shaft moves in real time",
+            )
+        return self._identity
+
+    def preflight(self, limits: Limits) -> Preflight:
+        """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
+        if self._identity is None:
+            raise PreflightRefused("preflight before connect", where="driver")
+        table, objects = checks.Table(), self._objects
+        checks.check_identity(table, self._identity, self._profile)
+        checks.check_state(table, objects)
+        self._codes = checks.choose_modes(table, objects, self._profile)
+        self._modes = {code: mode for mode, code in self._codes.items()}
+        self._units, rated_nm = checks.find_units(table, objects, self._profile, self._rated_torque_nm)
+        checks.set_limits(table, objects, self._profile, limits, rated_nm)
+        for index, bits in ((0x6071, 16), (0x60FF, 32)):
+            objects.write(index, 0, 0, bits)
+        for code in self._codes.values():
+            checks.check_mode_display(table, objects, code, self._pause)
+        self._map_pdos(table)
+        self._set_timing(table)
+        self._arm_watchdog(table, limits.watchdog_s)
+        found = checks.report(
+            table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
+        )
+        self._sent_code = self._codes.get(Mode.SPEED, 0)
+        self._start()
+        return found
+
+    def _is_simulated(self) -> bool:
+        try:
+            return self._objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
+        except ObjectRefused:
+            return False
+
+    def _map_pdos(self, table: checks.Table) -> None:
+        has_demand = self._profile.torque.has_demand and self._objects.read_if_there(0x6074) is not None
+        self._slow_layout = TPDO2_MODE_DEMAND if has_demand else TPDO2_MODE
+
+        def work() -> tuple[str, bool]:
+            for pdo in layout(has_demand):
+                write_pdo(self._objects, self._node, pdo)
+            return "as wanted", True
+
+        table.attempt("PDO mapping", "6040+6071+60FF, 6041+6077+606C, 6060, 6061", "1600h, 1A00h", work)
+
+    def _set_timing(self, table: checks.Table) -> None:
+        period_us = round(self.period_s * 1e6)
+        try:
+            back = self._objects.change(0x1006, 0, period_us, 32)
+            table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
+        except ObjectRefused:
+            table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")
+        if self.clock.stepped:
+            stepped = self._objects.change(MARKER_INDEX, 2, 1, 8)
+            table.row("stepped time", "on", "on" if stepped else "off", stepped == 1, name(MARKER_INDEX, 2))
+        try:
+            self._objects.change(0x1017, 0, round(self._heartbeat_every_s * 1000), 16)
+        except ObjectRefused:
+            table.note("drive's heartbeat", "the drive produces none", "1017h")
+        else:
+            self._watch.allowed_silence_s = 5.0 * self._heartbeat_every_s
+
+    def _arm_watchdog(self, table: checks.Table, watchdog_s: float) -> None:
+        """1016h last, since its supervision begins with the first heartbeat and wants to be fed from then on."""
+        entry = self._profile.watchdog
+        if entry.kind == "none":
+            table.row(
+                "watchdog", "armed", "this drive has none", False, "profile",
+                "A host that dies would leave the shaft turning: this drive can't be used",
+            )
+            return
+        time_ms = round(watchdog_s * 1000)
+        self._heartbeat_every_s = min(self._heartbeat_every_s, watchdog_s / 5.0)
+        index, sub = entry.reaction_index, entry.reaction_sub
+        if index is not None and entry.reaction_value is not None:
+            wanted = entry.reaction_value
+
+            def react() -> tuple[str, bool]:
+                found = self._objects.change(index, sub, wanted, 16)
+                return str(found), found == wanted
+
+            table.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
+        value = consumer_heartbeat(self._host_node, time_ms)
+
+        def arm() -> tuple[str, bool]:
+            self._objects.change(entry.consumer_index, entry.consumer_sub, value, 32)
+            self._send_heartbeat()
+            found = self._objects.read(entry.consumer_index, entry.consumer_sub)
+            return f"node {found >> 16 & 0x7F}, {found & 0xFFFF} ms", found == value
+
+        table.attempt(
+            "watchdog", f"node {self._host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm,
+            "Without it a host that dies would leave the shaft turning",
+        )
+        self._watchdog_s = watchdog_s
+
+    def _start(self) -> None:
+        self._link.send(NMT, bytes((START, self._node)))
+        self._link.drain()
+        now_s = self.clock.now_s()
+        self._next_tick_s = now_s + self.period_s
+        self._watch.start(self._watch.allowed_silence_s)
+
+    def _pause(self) -> None:
+        """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""
+        if self._watchdog_s:
+            self._send_heartbeat()
+        self._link.pump_until(lambda: False, 0.01)
+
+    # -- the cycle -------------------------------------------------------------------------------------------
+
+    def enable(self, mode: Mode) -> None:
+        """From the next cycle on move towards operation enabled in ``mode``."""
+        if mode not in self._codes:
+            raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
+        self._wish = Wish.ENABLED
+
+    def quick_stop(self) -> None:
+        """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling."""
+        self._wish = Wish.QUICK_STOP
+
+    def disable(self) -> None:
+        """From the next cycle on towards switch on disabled."""
+        self._wish = Wish.OFF
+
+    def reset_fault(self) -> None:
+        """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word."""
+        # Low first, so that the drive sees an edge whatever stood there before.
+        for word in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
+            self._objects.write(0x6040, 0, word, 16)
+            self._pause()
+
+    def exchange(self, command: Command) -> Sample:
+        """One cycle: wait for the tick, send, SYNC, take the feedback.
+
+        Raises CommunicationLost (bus, heartbeat, foreign NMT command, a loop that was frozen), DriveFault (EMCY,
+        restart) and CommandRejected; each trouble of the drive once, so that a stop can go on exchanging.
+        """
+        speed_raw = encode_speed(command.speed_rad_s, self._units)
+        torque_raw = encode_torque(command.torque_nm, self._units)
+        self._wait_for_tick()
+        now_s = self.clock.now_s()
+        if now_s >= self._next_heartbeat_s:
+            self._send_heartbeat()
+        code = self._codes[command.mode]
+        self._since_mode_sent += 1
+        if code != self._sent_code or (code != self._shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES):
+            self._link.send(self._rpdo2_id, RPDO2.pack(code))
+            self._sent_code, self._since_mode_sent = code, 0
+        self._link.send(self._rpdo1_id, RPDO1.pack(controlword_towards(self._state, self._wish), torque_raw, speed_raw))
+        self._feedback = _NO_WORD
+        self._link.send(SYNC, _NO_WORD)
+        age_s = self._await_feedback(now_s)
+        self._cycles += 1
+        fresh = bool(self._feedback)
+        if fresh:
+            self._status, self._torque_raw, self._speed_raw = TPDO1.unpack(self._feedback)
+            self._state = decode(self._status)
+        else:
+            self._missed += 1
+        self._watch.check()
+        return self._sample(now_s, age_s, fresh)
+
+    def _wait_for_tick(self) -> None:
+        clock = self.clock
+        before = self._feedback
+        if clock.stepped:
+            clock.wait_until(self._next_tick_s)
+            self._next_tick_s += self.period_s
+            self._link.drain()
+        else:
+            while (left_s := self._next_tick_s - clock.now_s()) > 0.0:
+                if self._link.receive(left_s) is None:
+                    break
+            self._link.drain()
+        if self._feedback is not before:
+            self._late += 1
+        if clock.stepped:
+            return
+        behind_s = clock.now_s() - self._next_tick_s
+        if behind_s > 0.5 * self.period_s:
+            self._overruns += 1
+        # A tick that was overslept is not caught up with: two SYNCs in a row would be one instant measured twice.
+        self._next_tick_s = max(self._next_tick_s + self.period_s, clock.now_s() + 0.5 * self.period_s)
+        if self._watchdog_s and behind_s > 0.5 * self._watchdog_s:
+            self._next_tick_s = clock.now_s() + self.period_s
+            raise CommunicationLost(
+                f"the control loop stood still for {behind_s:.2f} s; the setpoint it had in hand was not sent",
+                where="host",
+                next_step="Was the laptop asleep, the process frozen? The drive's watchdog may have stopped the shaft",
+            )
+
+    def _await_feedback(self, sync_s: float) -> float:
+        """Take frames until TPDO1 is there; its age in seconds of control time."""
+        clock = self.clock
+        link = self._link
+        if clock.stepped:
+            deadline_s = time.monotonic() + 0.5
+            while not self._feedback and (left_s := deadline_s - time.monotonic()) > 0.0:
+                link.receive(left_s)
+            return 0.0
+        deadline_s = sync_s + 0.8 * self.period_s
+        while not self._feedback and (left_s := deadline_s - clock.now_s()) > 0.0:
+            link.receive(left_s)
+        return clock.now_s() - sync_s
+
+    def _send_heartbeat(self) -> None:
+        self._link.send(0x700 + self._host_node, bytes((OPERATIONAL,)))
+        self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
+
+    def _on_feedback(self, data: bytes) -> None:
+        if len(data) == TPDO1.size:
+            self._feedback = data
+
+    def _on_slow_feedback(self, data: bytes) -> None:
+        if len(data) == self._slow_layout.size:
+            values = self._slow_layout.unpack(data)
+            self._shown_code = values[0]
+            self._demand_raw = values[1] if len(values) > 1 else None
+
+    def _sample(self, time_s: float, age_s: float, fresh: bool) -> Sample:
+        status, units = self._status, self._units
+        power = power_state(self._state)
+        reached = bool(status & TARGET_REACHED) and power is PowerState.QUICK_STOP
+        zero = bool(status & SPEED_ZERO) and self._shown_code == _PROFILE_VELOCITY and power is PowerState.ENABLED
+        demand = self._demand_raw
+        return Sample(
+            time_s,
+            age_s,
+            0.0,
+            fresh,
+            self._speed_raw * units.speed_rad_s_per_lsb,
+            self._torque_raw * units.torque_nm_per_lsb,
+            None if demand is None else demand * units.torque_nm_per_lsb,
+            self._modes.get(self._shown_code),
+            power,
+            reached or zero,
+            bool(status & INTERNAL_LIMIT),
+            status,
+        )
+
+    # -- afterwards ------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Give the drive its former settings back and let go of the bus.
+
+        Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that
+        follows makes it act.
+        """
+        self._watch.stop()
+        try:
+            if self._state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+                self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+                self._objects.restore()
+        except CommunicationLost:
+            pass  # nothing can be given back to a drive that can't be reached
+        finally:
+            self._link.close()
+
+
+__all__ = ["HOST_NODE", "PRE_OPERATIONAL", "Cia402Drive"]

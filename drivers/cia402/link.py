@@ -1,0 +1,94 @@
+"""One thread on one CAN bus: every frame in and out passes here, in order.
+
+There is no Notifier and no other thread. Whoever waits, for a TPDO or for an SDO response, pulls frames off
+the bus himself and hands on those meant for others; so an error of the bus surfaces in the control loop
+that caused it, and nothing is ever sent behind the loop's back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from drivers.clock import Clock
+from drivers.drive import FrameTap, RawFrame
+from drivers.errors import CommunicationLost
+
+if TYPE_CHECKING:
+    import can
+
+Handler = Callable[[bytes], None]
+
+
+class CanLink:
+    """Sends and receives on a python-can bus; ``tap`` sees every frame, ``handlers`` those of their identifier."""
+
+    def __init__(self, bus: can.BusABC, clock: Clock, tap: FrameTap | None = None) -> None:
+        from can import Message
+
+        self._message = Message
+        self._bus = bus
+        self._clock = clock
+        self._tap = tap
+        self.handlers: dict[int, Handler] = {}
+        self.error_frames = 0
+        self.name = str(bus.channel_info)
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it."""
+        message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
+        try:
+            self._bus.send(message)
+        except Exception as error:  # python-can's backends raise CanError, OSError, BrokenPipeError alike
+            raise CommunicationLost(
+                f"the bus did not take a frame: {error}",
+                where=self.name,
+                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+            ) from error
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
+
+    def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
+        """The next frame as (identifier, data), already handed on; None after ``timeout_s`` of wall time."""
+        try:
+            message = self._bus.recv(timeout_s)
+        except Exception as error:  # see send
+            raise CommunicationLost(
+                f"nothing can be received any more: {error}",
+                where=self.name,
+                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+            ) from error
+        if message is None:
+            return None
+        if message.is_error_frame:
+            self.error_frames += 1
+            return -1, b""
+        identifier, data = message.arbitration_id, bytes(message.data)
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
+        handler = self.handlers.get(identifier)
+        if handler is not None:
+            handler(data)
+        return identifier, data
+
+    def drain(self) -> None:
+        """Handle all that has arrived, without waiting."""
+        while self.receive(0.0) is not None:
+            pass
+
+    def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Handle frames until ``done()`` or until ``timeout_s`` of wall time has passed; whether it was done."""
+        deadline_s = time.monotonic() + timeout_s
+        while not done():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                return False
+            self.receive(left_s)
+        return True
+
+    def close(self) -> None:
+        """Shut the bus down; its errors no longer matter."""
+        with contextlib.suppress(Exception):
+            self._bus.shutdown()

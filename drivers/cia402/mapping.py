@@ -1,0 +1,81 @@
+"""PDO mapping and communication parameters, written by SDO (CiA 301, 1400h…1A03h).
+
+Real drives map 6040h alone, or 6040h with 60FFh, into their first RPDOs and none maps 6071h, so mapping is
+always written, in the order that the standard asks for: disable the PDO, empty the mapping, fill it, set the
+transmission type, enable.
+"""
+
+from dataclasses import dataclass
+
+from drivers.cia402.objects import (
+    CONTROLWORD,
+    MODE,
+    MODE_DISPLAY,
+    STATUSWORD,
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    TORQUE_ACTUAL,
+    TORQUE_DEMAND,
+    VELOCITY_ACTUAL,
+    mapping_entry,
+)
+from drivers.cia402.sdo import Objects, name
+from drivers.errors import PreflightRefused
+
+DISABLED = 1 << 31
+SLOW_SYNCS = 5
+"""The second TPDO (mode display, torque demand) comes with every fifth SYNC: it is looked at by people and by mode
+switches, not by the loop, and the bus is short."""
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """One PDO as it shall be: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
+
+    receive: bool                  # as the drive sees it
+    number: int
+    sync_type: int
+    mapped: tuple[tuple[int, int, int], ...]
+
+    @property
+    def communication(self) -> int:
+        return (0x1400 if self.receive else 0x1800) + self.number - 1
+
+    @property
+    def mapping(self) -> int:
+        return (0x1600 if self.receive else 0x1A00) + self.number - 1
+
+    def identifier(self, node: int) -> int:
+        """COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, and 100h on for each further."""
+        return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
+
+
+def layout(with_demand: bool) -> tuple[Pdo, Pdo, Pdo, Pdo]:
+    """RPDO1, TPDO1, RPDO2, TPDO2 (see `objects`); ``with_demand`` adds 6074h where the drive has it."""
+    slow = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
+    return (
+        Pdo(True, 1, 1, (CONTROLWORD, TARGET_TORQUE, TARGET_VELOCITY)),
+        Pdo(False, 1, 1, (STATUSWORD, TORQUE_ACTUAL, VELOCITY_ACTUAL)),
+        Pdo(True, 2, 1, (MODE,)),
+        Pdo(False, 2, SLOW_SYNCS, slow),
+    )
+
+
+def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
+    """Map one PDO and read it back. Raises ObjectRefused, or PreflightRefused if it doesn't read back."""
+    identifier = pdo.identifier(node)
+    objects.write(pdo.communication, 1, DISABLED | identifier, 32)
+    objects.write(pdo.mapping, 0, 0, 8)
+    for position, mapped in enumerate(pdo.mapped, start=1):
+        objects.write(pdo.mapping, position, mapping_entry(mapped), 32)
+    objects.write(pdo.mapping, 0, len(pdo.mapped), 8)
+    objects.write(pdo.communication, 2, pdo.sync_type, 8)
+    objects.write(pdo.communication, 1, identifier, 32)
+    wanted = [mapping_entry(mapped) for mapped in pdo.mapped]
+    found = [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
+    if found != wanted:
+        raise PreflightRefused(
+            f"the PDO mapping reads back as {[f'{entry:08X}h' for entry in found]}",
+            where=name(pdo.mapping),
+            next_step="Some drives fix their mapping: this one can't be driven with torque and speed of one instant",
+        )

@@ -1,0 +1,123 @@
+"""Reading and writing of objects by SDO, over `CanLink`.
+
+canopen's client does the transfers (CiA 301, SDO upload and download, expedited and segmented); only its
+waiting is replaced: it pulls frames off the link instead of sleeping on a queue that another thread fills.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import canopen
+from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
+
+from drivers.cia402.link import CanLink
+from drivers.errors import CommunicationLost, ObjectRefused
+
+
+class _LinkNetwork(canopen.Network):  # type: ignore[misc]
+    """A canopen network without a bus of its own: what it sends goes out by the link."""
+
+    def __init__(self, link: CanLink) -> None:
+        super().__init__()
+        self._link = link
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        self._link.send(can_id, bytes(data))
+
+
+class _PumpingClient(SdoClient):  # type: ignore[misc]
+    """Waits for a response by pulling frames off the link."""
+
+    RESPONSE_TIMEOUT = 0.5
+    MAX_RETRIES = 3
+
+    def __init__(self, link: CanLink, node: int) -> None:
+        super().__init__(0x600 + node, 0x580 + node, canopen.ObjectDictionary())
+        self.network = _LinkNetwork(link)
+        self._link = link
+        link.handlers[self.tx_cobid] = self._take
+
+    def _take(self, data: bytes) -> None:
+        if len(data) == 8:  # anything shorter is no SDO (CiA 301) and would only confuse the transfer
+            self.responses.put(data)
+
+    def read_response(self) -> Any:
+        self._link.pump_until(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
+        if self.responses.empty():
+            raise SdoCommunicationError("No SDO response received")
+        return super().read_response()
+
+
+class Objects:
+    """The drive's object dictionary, as integers and strings.
+
+    Raises ObjectRefused when the drive aborts a transfer and CommunicationLost when it doesn't answer.
+    """
+
+    def __init__(self, link: CanLink, node: int) -> None:
+        self._client = _PumpingClient(link, node)
+        self._node = node
+        self._written: dict[tuple[int, int], tuple[int, int]] = {}
+
+    def read_bytes(self, index: int, subindex: int = 0) -> bytes:
+        try:
+            return bytes(self._client.upload(index, subindex))
+        except SdoAbortedError as error:
+            raise ObjectRefused(f"the drive did not give the object: {error}", where=name(index, subindex)) from error
+        except SdoCommunicationError as error:
+            raise self._silent(index, subindex) from error
+
+    def read(self, index: int, subindex: int = 0, *, signed: bool = False) -> int:
+        return int.from_bytes(self.read_bytes(index, subindex), "little", signed=signed)
+
+    def read_if_there(self, index: int, subindex: int = 0, *, signed: bool = False) -> int | None:
+        """The value, or None where the drive hasn't the object."""
+        try:
+            return self.read(index, subindex, signed=signed)
+        except ObjectRefused:
+            return None
+
+    def write(self, index: int, subindex: int, value: int, bits: int) -> None:
+        signed = value < 0
+        try:
+            self._client.download(index, subindex, value.to_bytes(bits // 8, "little", signed=signed))
+        except SdoAbortedError as error:
+            raise ObjectRefused(
+                f"the drive did not take {value} for the object: {error}", where=name(index, subindex)
+            ) from error
+        except SdoCommunicationError as error:
+            raise self._silent(index, subindex) from error
+
+    def change(self, index: int, subindex: int, value: int, bits: int) -> int:
+        """Write, remember what stood there before, and read back what stands there now."""
+        before = self.read(index, subindex)
+        if before != value:
+            self._written.setdefault((index, subindex), (before, bits))
+            self.write(index, subindex, value, bits)
+        return self.read(index, subindex)
+
+    def restore(self) -> tuple[str, ...]:
+        """Give every changed object its former value back, the last change first; what could not be given back."""
+        failed = []
+        for (index, subindex), (value, bits) in reversed(self._written.items()):
+            try:
+                self.write(index, subindex, value, bits)
+            except (ObjectRefused, CommunicationLost) as error:
+                failed.append(str(error))
+                if isinstance(error, CommunicationLost):
+                    break
+        self._written.clear()
+        return tuple(failed)
+
+    def _silent(self, index: int, subindex: int) -> CommunicationLost:
+        return CommunicationLost(
+            f"node {self._node} does not answer",
+            where=name(index, subindex),
+            next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
+        )
+
+
+def name(index: int, subindex: int = 0) -> str:
+    """How an object is written in messages: 6040h, 1016h:1."""
+    return f"{index:04X}h:{subindex}" if subindex else f"{index:04X}h"

@@ -1,0 +1,117 @@
+"""The CiA 402 power state machine, pure: statusword in, controlword out.
+
+::
+
+    NOT_READY → SWITCH_ON_DISABLED ─2→ READY_TO_SWITCH_ON ─3→ SWITCHED_ON ─4→ OPERATION_ENABLED
+                     ▲  ▲                                                        │11
+                     │  └──────────────────── 12 ──────────── QUICK_STOP_ACTIVE ◄┘
+                     └─15─ FAULT ◄─14─ FAULT_REACTION_ACTIVE ◄─13─ (any)
+
+Source: CiA 402-2, power drive state machine; objects 6040h (controlword) and 6041h (statusword).
+"""
+
+from enum import Enum
+
+from drivers.drive import PowerState
+
+
+class State(Enum):
+    """The states of the standard's figure."""
+
+    NOT_READY = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY_TO_SWITCH_ON = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    OPERATION_ENABLED = "operation enabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
+    FAULT_REACTION_ACTIVE = "fault reaction active"
+    FAULT = "fault"
+
+
+class Wish(Enum):
+    """Where the caller wants the drive to be."""
+
+    OFF = "off"
+    ENABLED = "enabled"
+    QUICK_STOP = "quick stop"
+
+
+# Statusword bits (6041h).
+VOLTAGE_ENABLED = 1 << 4
+WARNING = 1 << 7
+REMOTE = 1 << 9
+TARGET_REACHED = 1 << 10
+INTERNAL_LIMIT = 1 << 11
+SPEED_ZERO = 1 << 12               # profile velocity mode only
+
+# Controlwords (6040h).
+DISABLE_VOLTAGE = 0x0000
+QUICK_STOP = 0x0002
+SHUTDOWN = 0x0006
+SWITCH_ON = 0x0007
+ENABLE_OPERATION = 0x000F
+FAULT_RESET = 0x0080
+
+# (mask, value) → state. Bit 5 (quick stop) is don't care where the standard leaves it open.
+_PATTERNS = (
+    (0x4F, 0x00, State.NOT_READY),
+    (0x4F, 0x40, State.SWITCH_ON_DISABLED),
+    (0x6F, 0x21, State.READY_TO_SWITCH_ON),
+    (0x6F, 0x23, State.SWITCHED_ON),
+    (0x6F, 0x27, State.OPERATION_ENABLED),
+    (0x6F, 0x07, State.QUICK_STOP_ACTIVE),
+    (0x4F, 0x0F, State.FAULT_REACTION_ACTIVE),
+    (0x4F, 0x08, State.FAULT),
+)
+
+_DECODED: dict[int, State] = {
+    low: state for low in range(0x80) for mask, value, state in _PATTERNS if low & mask == value
+}
+
+_POWER = {
+    State.NOT_READY: PowerState.NOT_READY,
+    State.SWITCH_ON_DISABLED: PowerState.OFF,
+    State.READY_TO_SWITCH_ON: PowerState.READY,
+    State.SWITCHED_ON: PowerState.READY,
+    State.OPERATION_ENABLED: PowerState.ENABLED,
+    State.QUICK_STOP_ACTIVE: PowerState.QUICK_STOP,
+    State.FAULT_REACTION_ACTIVE: PowerState.FAULT,
+    State.FAULT: PowerState.FAULT,
+}
+
+
+def decode(statusword: int) -> State:
+    """The state that a statusword shows; a pattern of no state counts as not ready."""
+    return _DECODED.get(statusword & 0x7F, State.NOT_READY)
+
+
+def power_state(state: State) -> PowerState:
+    """What callers above the driver see of it."""
+    return _POWER[state]
+
+
+_TOWARDS_ENABLED = {
+    State.SWITCH_ON_DISABLED: SHUTDOWN,
+    State.READY_TO_SWITCH_ON: SWITCH_ON,
+    State.SWITCHED_ON: ENABLE_OPERATION,
+    State.OPERATION_ENABLED: ENABLE_OPERATION,
+}
+_TOWARDS_OFF = {
+    # Disable operation first, which ramps down (605Ch): without voltage a shaft that still turns would coast.
+    State.OPERATION_ENABLED: SWITCH_ON,
+}
+
+
+def controlword_towards(state: State, wish: Wish) -> int:
+    """The controlword that brings the drive one transition nearer to the wish.
+
+    A fault is never reset here, and a quick stop never ended by enabling again: both must be asked for, and
+    until then the word is the harmless one.
+    """
+    if wish is Wish.ENABLED:
+        return _TOWARDS_ENABLED.get(state, QUICK_STOP if state is State.QUICK_STOP_ACTIVE else DISABLE_VOLTAGE)
+    if wish is Wish.QUICK_STOP:
+        if state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
+            return QUICK_STOP
+        return DISABLE_VOLTAGE
+    return _TOWARDS_OFF.get(state, DISABLE_VOLTAGE)

@@ -1,0 +1,139 @@
+"""What the drive says unasked: heartbeat, boot-up and emergency messages.
+
+The first trouble is kept until it has been raised once; a stop sequence that goes on exchanging is then not
+disturbed by it again.
+"""
+
+from drivers.clock import Clock
+from drivers.errors import CommunicationLost, DriveFault, TdhilError
+
+BOOT_UP = 0x00
+STOPPED = 0x04
+OPERATIONAL = 0x05
+PRE_OPERATIONAL = 0x7F
+
+_NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
+
+# EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
+_EMCY_CLASSES = {
+    0x10: "generic error",
+    0x20: "current",
+    0x21: "current, input side",
+    0x22: "current inside the drive",
+    0x23: "current, output side (short circuit or overload)",
+    0x30: "voltage",
+    0x31: "mains voltage",
+    0x32: "DC link voltage",
+    0x33: "output voltage",
+    0x40: "temperature",
+    0x42: "drive temperature",
+    0x43: "motor temperature",
+    0x50: "drive hardware",
+    0x54: "power section (or STO)",
+    0x60: "drive software",
+    0x70: "additional modules",
+    0x73: "sensor",
+    0x75: "communication module",
+    0x80: "monitoring",
+    0x81: "communication (host heartbeat lost, CAN overrun or passive)",
+    0x82: "protocol error (PDO length)",
+    0x84: "speed controller (speed limit or following error)",
+    0x86: "positioning",
+    0x90: "external error",
+    0xF0: "additional functions",
+}
+
+
+def emcy_text(code: int) -> str:
+    """What an EMCY error code means, by its class."""
+    meaning = _EMCY_CLASSES.get(code >> 8) or _EMCY_CLASSES.get(code >> 8 & 0xF0) or "manufacturer specific"
+    return f"EMCY {code:04X}h, {meaning}"
+
+
+class Watch:
+    """Follows one node. ``allowed_silence_s`` is how long its heartbeat may fail to come (0 = not watched)."""
+
+    def __init__(self, node: int, clock: Clock) -> None:
+        self._node = node
+        self._clock = clock
+        self._heard_s: float | None = None
+        self._trouble: TdhilError | None = None
+        self._raised: set[str] = set()
+        self.allowed_silence_s = 0.0
+        self.expect_operational = False
+        self.emcy_code = 0
+
+    def on_heartbeat(self, data: bytes) -> None:
+        """700h + node: the NMT state, or 0 for boot-up."""
+        state = data[0] & 0x7F if data else -1
+        self._heard_s = self._clock.now_s()
+        if not self.expect_operational:
+            return
+        if state == BOOT_UP:
+            self._keep(
+                "boot-up",
+                DriveFault(
+                    "the drive restarted in the middle of the run (boot-up message)",
+                    where=f"node {self._node}",
+                    next_step="It is not enabled again by itself. Find out why it restarted, then start anew",
+                ),
+            )
+        elif state != OPERATIONAL:
+            self._keep(
+                "nmt",
+                CommunicationLost(
+                    f"somebody put the drive into NMT state {_NMT_NAMES.get(state, state)}",
+                    where=f"node {self._node}",
+                    next_step="Is a second master on the bus? Take it off and start anew",
+                ),
+            )
+
+    def on_emcy(self, data: bytes) -> None:
+        """080h + node: error code u16, error register u8, manufacturer's bytes; code 0 = all errors gone."""
+        if len(data) < 2:
+            return
+        code = int.from_bytes(data[:2], "little")
+        self.emcy_code = code
+        if code and self.expect_operational:
+            extra = data[3:].hex(" ")
+            self._keep(
+                "emcy",
+                DriveFault(
+                    emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""),
+                    where=f"node {self._node}",
+                    next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
+                ),
+            )
+
+    def check(self) -> None:
+        """Raise the first trouble not raised yet."""
+        if self.allowed_silence_s and self._heard_s is not None:
+            silent_s = self._clock.now_s() - self._heard_s
+            if silent_s > self.allowed_silence_s:
+                self._keep(
+                    "heartbeat",
+                    CommunicationLost(
+                        f"the drive's heartbeat has been missing for {silent_s:.2f} s",
+                        where=f"node {self._node}, 1017h",
+                        next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
+                    ),
+                )
+        if self._trouble is not None:
+            trouble, self._trouble = self._trouble, None
+            raise trouble
+
+    def start(self, allowed_silence_s: float) -> None:
+        """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
+        self._heard_s = self._clock.now_s()
+        self.allowed_silence_s = allowed_silence_s
+        self.expect_operational = True
+
+    def stop(self) -> None:
+        """Nothing is trouble any more."""
+        self.expect_operational = False
+        self.allowed_silence_s = 0.0
+
+    def _keep(self, kind: str, trouble: TdhilError) -> None:
+        if kind not in self._raised:
+            self._raised.add(kind)
+            self._trouble = self._trouble or trouble
