@@ -198,7 +198,7 @@ def require_limits(rig: Rig | None) -> Limits:
 
 _SIMULATED_LIMITS = Limits(
     speed_min_rad_s=0.5,
-    speed_max_rad_s=7.0,
+    speed_max_rad_s=10.0,
     torque_nm=400.0,
     time_s=900.0,
     quick_stop_rad_s2=2.0,

@@ -171,7 +171,6 @@ class Cia402Drive:
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
         )
-        self._sent_code = self._codes.get(Mode.SPEED, 0)
         self._start()
         return found
 

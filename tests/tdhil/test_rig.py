@@ -128,7 +128,7 @@ def test_a_real_drive_needs_limits(tmp_path: Path) -> None:
 
 def test_the_simulated_rig_needs_none(tmp_path: Path) -> None:
     limits = require_limits(simulated_default_rig())
-    assert (limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm) == (0.5, 7.0, 400.0)
+    assert (limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm) == (0.5, 10.0, 400.0)
     assert simulated_default_rig().drive_data.torque_scale_rel_sd == 0.02
     mine = simulated_default_rig(rig_of(tmp_path, FULL))
     assert mine == rig_of(tmp_path, FULL)

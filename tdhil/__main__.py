@@ -1,0 +1,7 @@
+"""`python -m tdhil`."""
+
+import sys
+
+from tdhil.cli import main
+
+sys.exit(main())

@@ -1,0 +1,100 @@
+"""The command line: which command, with which options. Imports what a command needs only once it is chosen."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from tdhil import __version__
+
+_COMMANDS = {
+    "identify": "put a drive into motion and identify its moment of inertia",
+    "replay": "identify again from a log, with no bus and no other file",
+    "simulate": "run the simulated rig as a process of its own",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    # Libraries log what we report ourselves, with where and what next.
+    for library in ("can", "canopen"):
+        logging.getLogger(library).addHandler(logging.NullHandler())
+        logging.getLogger(library).propagate = False
+    parser = build_parser(_chosen(arguments))
+    namespace = parser.parse_args(arguments)
+    if namespace.command is None:
+        parser.print_help(sys.stderr)
+        return 2
+    try:
+        code = int(namespace.run(namespace))
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has gone; nothing may be written at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except Exception as error:
+        return _report(error, getattr(namespace, "json", None) is True)
+    return code
+
+
+def build_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """The parser; only the chosen command's options are built, since python-can's alone cost 150 ms to import."""
+    parser = argparse.ArgumentParser(
+        prog="tdhil",
+        description="Identifies the moment of inertia of a top drive, or of any inverter-driven machine, "
+        "with an interval that holds.",
+        epilog="tdhil COMMAND --help tells more. Ctrl-C stops the shaft, but it is no emergency stop: "
+        "keep the hard-wired one within reach.",
+    )
+    parser.add_argument("--version", action="version", version=f"tdhil {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    for name, summary in _COMMANDS.items():
+        sub = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
+        if name == chosen:
+            _builder(name)(sub)
+    return parser
+
+
+def _chosen(arguments: Sequence[str]) -> str | None:
+    return next((argument for argument in arguments if not argument.startswith("-")), None)
+
+
+def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
+    if name == "identify":
+        from tdhil.commands.identify import add_arguments
+    elif name == "replay":
+        from tdhil.commands.replay import add_arguments
+    else:
+        from tdhil.commands.simulate import add_arguments
+    return add_arguments
+
+
+def _report(error: Exception, as_json: bool) -> int:
+    """One message for an error of the tree; a traceback only for what is a mistake of ours."""
+    from tdhil.errors import ExitCode, TdhilError, exit_code
+
+    code = exit_code(error)
+    if isinstance(error, TdhilError):
+        print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
+    else:
+        import traceback
+
+        traceback.print_exception(error, file=sys.stderr)
+        print("tdhil: internal error; please report it with the lines above", file=sys.stderr)  # noqa: T201
+        code = ExitCode.INTERNAL
+    if as_json:
+        document = {"error": {"kind": type(error).__name__, "message": str(error)}, "exit_code": int(code)}
+        print(json.dumps(document, ensure_ascii=False))  # noqa: T201
+    return int(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""The typed confirmation before a real shaft moves. While it waits, the drive's watchdog is fed."""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+from collections.abc import Callable
+
+from rich.console import Console
+
+from drivers.drive import Preflight
+from drivers.errors import PreflightRefused
+from tdhil.protocol.runner import Idle, Task
+from tdhil.protocol.settings import ExcitationRequest, MachineLimits
+from tdhil.report.numbers import minutes
+
+WORD = "MOVE"
+
+
+def confirm_motion(
+    task: Task,
+    preflight: Preflight,
+    idle: Idle,
+    *,
+    yes: bool,
+    console: Console,
+    pause_display: Callable[[], None],
+) -> None:
+    """Return if the shaft may be moved; raises PreflightRefused (exit 4) if not.
+
+    A simulated peer needs no confirmation. ``--yes`` replaces the prompt, not the limits.
+    """
+    if preflight.identity.simulated:
+        return
+    pause_display()
+    console.print(summary(preflight, task.limits, task.request), markup=False)
+    if yes:
+        console.print("Confirmed by --yes.")
+        return
+    if not sys.stdin.isatty():
+        raise PreflightRefused(
+            "nobody is there to confirm that the shaft may move",
+            where="no terminal",
+            next_step="Run it at a terminal, or pass --yes if somebody stands at the hard-wired stop",
+        )
+    console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
+    if _ask(idle).strip() != WORD:
+        raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
+
+
+def summary(preflight: Preflight, limits: MachineLimits, request: ExcitationRequest) -> str:
+    """What will happen, and what the operator must have seen to."""
+    silent = preflight.safe_action.replace("_", " ")
+    return (
+        f"\nThis run will move {preflight.identity.name}:\n"
+        f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
+        f"  speed window    {limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s\n"
+        f"  peak torque     {limits.torque_nm:g} N·m\n"
+        f"  excitation      {request.kind}\n"
+        f"  duration        at most {minutes(limits.time_s)}\n"
+        f"  watchdog        {preflight.watchdog_s:g} s in the drive, then {silent}\n"
+        "Before you confirm:\n"
+        "  [ ] brake released\n"
+        "  [ ] pipe handler and people clear of the shaft\n"
+        "  [ ] hard-wired emergency stop tested and within reach (Ctrl-C stops, but is no emergency stop)\n"
+    )
+
+
+def _ask(idle: Idle) -> str:
+    """A line from the terminal, with a cycle of nothing again and again until it is there."""
+    answers: queue.Queue[str] = queue.Queue()
+    threading.Thread(target=lambda: answers.put(sys.stdin.readline()), name="prompt", daemon=True).start()
+    while True:
+        idle()
+        try:
+            return answers.get_nowait()
+        except queue.Empty:
+            continue

@@ -1,0 +1,121 @@
+"""One cycle of a run: guard, drive, guard, log. Every stage goes through here, and nothing goes around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol, TypeVar
+
+from drivers.drive import Command, Drive, Mode, PowerState, Sample
+from drivers.errors import DriveFault, ModeNotConfirmed
+from tdhil.errors import Interrupted
+from tdhil.protocol.guard import Guard
+from tdhil.protocol.settings import StopRequest
+
+T = TypeVar("T")
+
+
+class RunLog(Protocol):
+    """Where a run is written as it goes (record room); `cycle` is called once per exchange."""
+
+    def cycle(self, command: Command, sample: Sample) -> None: ...
+
+    def event(self, time_s: float, kind: str, text: str) -> None: ...
+
+
+Watcher = Callable[[Command, Sample], None]
+
+
+class Bench:
+    """A drive under guard. ``watch`` sees every cycle (live display); ``stop_request`` is looked at in each."""
+
+    def __init__(
+        self, drive: Drive, guard: Guard, log: RunLog, stop_request: StopRequest, watch: Watcher | None = None
+    ) -> None:
+        self.drive = drive
+        self.guard = guard
+        self.log = log
+        self.period_s = drive.period_s
+        self.stop_side_troubles: list[str] = []
+        self.last: Sample | None = None
+        self._stop_request = stop_request
+        self._watch = watch
+
+    @property
+    def now_s(self) -> float:
+        """Control time."""
+        return self.drive.clock.now_s()
+
+    def cycle(self, command: Command) -> Sample:
+        """One exchange. Raises Interrupted when a stop was asked for, and whatever guard, drive and log raise."""
+        if self._stop_request.signum is not None:
+            raise Interrupted(self._stop_request.signum)
+        self.guard.check_command(command)
+        sample = self.drive.exchange(command)
+        self.log.cycle(command, sample)
+        self.last = sample
+        self.guard.check_sample(command, sample)
+        if self._watch is not None:
+            self._watch(command, sample)
+        return sample
+
+    def stop_cycle(self, command: Command) -> Sample:
+        """One exchange of the stop sequence: unguarded, and neither log nor display may keep it from going on."""
+        sample = self.drive.exchange(command)
+        try:
+            self.log.cycle(command, sample)
+            if self._watch is not None:
+                self._watch(command, sample)
+        except Exception as error:
+            self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
+            del self.stop_side_troubles[10:]
+        return sample
+
+    def cycles(self, seconds: float) -> int:
+        """How many cycles last that long."""
+        return max(1, round(seconds / self.period_s))
+
+    def hold(self, command: Command, seconds: float) -> list[Sample]:
+        """Keep one command for a time; the samples."""
+        return [self.cycle(command) for _ in range(self.cycles(seconds))]
+
+    def enable(self, mode: Mode, command: Command, timeout_s: float = 3.0) -> Sample:
+        """Enable in a mode and wait until the drive says so."""
+        self.drive.enable(mode)
+        for _ in range(self.cycles(timeout_s)):
+            sample = self.cycle(command)
+            if sample.state is PowerState.ENABLED and sample.mode is mode:
+                self.guard.expected = PowerState.ENABLED
+                return sample
+            if sample.state is PowerState.FAULT:
+                break
+        raise DriveFault(
+            f"no {mode.value} mode within {timeout_s:g} s of enabling; the drive shows '{sample.state.value}'",
+            where=f"statusword {sample.status:04X}h",
+            next_step="Look for STO, a missing enable input or a fault on the drive's own panel",
+        )
+
+    def switch_mode(self, command: Command, timeout_s: float = 0.5) -> Sample:
+        """Go on with ``command.mode`` while enabled; the drive must display the new mode in time."""
+        for _ in range(self.cycles(timeout_s)):
+            sample = self.cycle(command)
+            if sample.mode is command.mode:
+                return sample
+        raise ModeNotConfirmed(
+            f"the drive did not take over {command.mode.value} mode within {timeout_s:g} s",
+            where="modes of operation display 6061h",
+            next_step="Check in the drive's manual whether the mode may change while enabled; use --mode speed",
+        )
+
+    def compute(self, work: Callable[[], T], command: Command) -> T:
+        """Do a longer piece of arithmetic without letting the drive starve of setpoints.
+
+        In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat.
+        """
+        if self.drive.clock.stepped:
+            return work()
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            future = pool.submit(work)
+            while not future.done():
+                self.cycle(command)
+            return future.result()

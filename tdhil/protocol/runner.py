@@ -1,0 +1,331 @@
+"""Runs the five stages in order, and whatever happens in them, the one stop sequence.
+
+The first cause is kept: what goes wrong while stopping is reported beside it, never instead of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+from drivers.drive import Command, Drive, Identity, Limits, Mode, Outcome, Preflight, ReportingFilters, Sample
+from drivers.errors import PreflightRefused
+from tdhil.errors import Interrupted
+from tdhil.protocol import excitation
+from tdhil.protocol.bench import Bench
+from tdhil.protocol.control import MeanSpeedControl
+from tdhil.protocol.excitation import ExcitationWish, Plan, PlanRefused, RigGuess, make_plan
+from tdhil.protocol.guard import Guard
+from tdhil.protocol.settings import ControlAssumptions, ExcitationRequest, MachineLimits, StopRequest
+from tdhil.protocol.stage_acquire import run_acquire
+from tdhil.protocol.stage_hold import run_hold
+from tdhil.protocol.stage_setup import measure_offsets, probe_sign
+from tdhil.protocol.stage_speed import SpeedResult, run_speed
+from tdhil.protocol.stage_torque import TorqueResult, run_torque
+from tdhil.protocol.stop import StopReport, StopSequence
+from tdhil.record.recording import Excitation, LagPrior, Ramp, Stage
+from tdhil.record.run_log import RunLog
+
+STAGES = ("setup", "speed", "torque", "hold", "acquire")
+
+Idle = Callable[[], None]
+"""One cycle of nothing, which keeps the drive's watchdog fed while somebody makes up his mind."""
+
+
+class Display(Protocol):
+    """Whoever shows a run as it goes."""
+
+    def preflight(self, preflight: Preflight) -> None: ...
+
+    def stage_started(self, name: str, expected_s: float) -> None: ...
+
+    def cycle(self, command: Command, sample: Sample) -> None: ...
+
+    def planned(self, plan: Plan) -> None: ...
+
+    def stage_ended(self, stage: Stage) -> None: ...
+
+
+Confirm = Callable[["Task", Preflight, Idle], None]
+"""Asks whether the shaft may be moved; raises PreflightRefused if not."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """How a run went: its stages, what ended it (None = it went to its end), and how the stop went."""
+
+    stages: tuple[Stage, ...]
+    cause: BaseException | None
+    stop: StopReport | None            # None: the drive was never enabled
+    preflight: Preflight | None
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to do with a drive. ``facts`` are those of the bench, by their names in Recording."""
+
+    limits: MachineLimits
+    request: ExcitationRequest
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
+
+
+MakeTask = Callable[[Identity], Task]
+"""The task for whoever turned out to be at the other end; raises PreflightRefused if he can't have one."""
+
+
+class Runner:
+    """One run of one drive. `run` never raises: everything is in the outcome."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        make_task: MakeTask,
+        log: RunLog,
+        stop_request: StopRequest,
+        display: Display,
+        confirm: Confirm,
+        *,
+        reset_fault: bool = False,
+    ) -> None:
+        self._drive = drive
+        self._make_task = make_task
+        self._reset_fault = reset_fault
+        self._log = log
+        self._stop_request = stop_request
+        self._display = display
+        self._confirm = confirm
+        self._stages: list[Stage] = []
+        self._preflight: Preflight | None = None
+        self._stop: StopSequence | None = None
+
+    def run(self) -> RunOutcome:
+        """Connect, five stages, stop, close."""
+        cause: BaseException | None = None
+        report: StopReport | None = None
+        try:
+            self._run_stages()
+        except BaseException as error:
+            cause = error
+            self._log_failure(error)
+        finally:
+            if self._stop is not None:
+                report = self._stop.run()
+            try:
+                self._drive.close()
+            except Exception as error:
+                cause = cause or error
+        return RunOutcome(tuple(self._stages), cause, report, self._preflight)
+
+    # -- the stages ------------------------------------------------------------------------------------------
+
+    def _run_stages(self) -> None:
+        with self._stage("setup", 10.0):
+            task, bench, preflight = self._prepare()
+            limits, assumptions = task.limits, task.assumptions
+            mode = _choose_mode(task.request.mode, preflight)
+            _, torque_offset = measure_offsets(bench, limits)
+            self._log.learn(torque_offset_nm=torque_offset)
+            self._confirm(task, preflight, lambda: self._idle(bench))
+            self._stop = StopSequence(
+                bench, limits, preflight.speed_resolution_rad_s, preflight.quick_stop_in_torque_mode, assumptions
+            )
+            bench.guard.start_clock(bench.now_s)
+            breakaway = probe_sign(bench, limits, mode, preflight.speed_resolution_rad_s)
+            if breakaway is not None:
+                self._log.event(bench.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
+        with self._stage("speed", 50.0):
+            speed = run_speed(bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset)
+            self._log.motion(None, speed.levels, (speed.ramp,))
+            self._note_rough(bench, speed)
+        ramps: tuple[Ramp, ...] = (speed.ramp,)
+        drifted: TorqueResult | None = None
+        if mode is Mode.TORQUE:
+            with self._stage("torque", 15.0):
+                drifted = run_torque(bench, limits, speed, torque_offset)
+                ramps = (speed.ramp, drifted.ramp)
+                self._log.motion(None, speed.levels, ramps)
+        else:
+            self._skip("torque", bench, "speed mode")
+        model = self._model(bench, speed, drifted)
+        plan = self._plan(task, bench, model, mode)
+        control: MeanSpeedControl | None = None
+        if drifted is not None:
+            with self._stage("hold", 15.0):
+                control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
+                target = plan.segments[0].reference.offset_rad_s
+                run_hold(bench, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
+        else:
+            self._skip("hold", bench, "speed mode")
+        with self._stage("acquire", plan.duration_s + 10.0):
+            announced = self._announcer(speed, ramps)
+            run_acquire(bench, limits, plan, control, announced)
+
+    def _prepare(self) -> tuple[Task, Bench, Preflight]:
+        identity = self._drive.connect()
+        self._log.learn(simulated=identity.simulated)
+        task = self._make_task(identity)
+        limits = task.limits
+        self._log.learn(**task.facts)
+        if self._reset_fault:
+            self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
+            self._drive.reset_fault()
+        preflight = self._preflight = self._drive.preflight(
+            Limits(limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s)
+        )
+        self._display.preflight(preflight)
+        for check in preflight.checks:
+            wanted = f"wanted {check.wanted}, " if check.wanted else ""
+            text = f"{check.name}: {wanted}found {check.found} ({check.outcome.value}) {check.where}"
+            self._log.event(self._drive.clock.now_s(), "preflight", text)
+        if preflight.refused:
+            raise _refusal(preflight)
+        self._log.learn(
+            speed_resolution_rad_s=preflight.speed_resolution_rad_s,
+            torque_resolution_nm=preflight.torque_resolution_nm,
+            torque_limit_nm=limits.torque_nm,
+            lag_prior=_with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters),
+        )
+        guard = Guard(
+            limits,
+            self._drive.period_s,
+            preflight.speed_resolution_rad_s,
+            preflight.torque_resolution_nm,
+            task.assumptions,
+        )
+        return task, Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle), preflight
+
+    def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
+        """The rough rig: stage 2's, with the drift of stage 3 as a witness."""
+        model = speed.model
+        if drifted is not None and drifted.rough is not None:
+            ratio = drifted.rough.inertia_kg_m2 / model.inertia_kg_m2
+            text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} of it from the drift"
+            self._log.event(bench.now_s, "plan", text)
+        return model
+
+    def _plan(self, task: Task, bench: Bench, model: RigGuess, mode: Mode) -> Plan:
+        request, limits = task.request, task.limits
+        offsets = None if request.offset_rad_s is None else (request.offset_rad_s,)
+        wish = ExcitationWish(
+            kind=request.kind,
+            mode=mode.value,
+            frequency_hz=request.frequency_hz,
+            amplitude_rad_s=request.amplitude_rad_s,
+            offsets_rad_s=offsets,
+            periods=request.periods,
+        )
+        room = excitation.MachineLimits(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm)
+        last = bench.last
+        speed_now = max(0.0, last.speed_rad_s) if last else 0.0
+        keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
+        try:
+            plan = bench.compute(lambda: make_plan(room, model, wish), keep)
+        except PlanRefused as error:
+            raise PreflightRefused(
+                str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
+            ) from error
+        self._display.planned(plan)
+        self._log.event(
+            bench.now_s,
+            "plan",
+            f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
+        )
+        return plan
+
+    def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
+        return lambda motion: self._log.motion(motion, speed.levels, ramps)
+
+    def _note_rough(self, bench: Bench, speed: SpeedResult) -> None:
+        model = speed.model
+        self._log.event(
+            bench.now_s,
+            "plan",
+            f"rough model: J {model.inertia_kg_m2:.4g} kg·m² ± {100 * speed.rough.rel_error:.0f} %, "
+            f"B {model.viscous_nm_s_rad:.3g} N·m·s/rad, T_c {model.coulomb_nm:.3g} N·m",
+        )
+
+    # -- around the stages -----------------------------------------------------------------------------------
+
+    @contextmanager
+    def _stage(self, name: str, expected_s: float) -> Iterator[None]:
+        start_s = self._drive.clock.now_s()
+        missed = self._drive.counters.missed
+        self._display.stage_started(name, expected_s)
+        try:
+            yield
+        except BaseException as error:
+            self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "aborted", _short(error)))
+            raise
+        lost = self._drive.counters.missed - missed
+        detail = f"{lost} cycles without feedback" if lost else ""
+        self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "degraded" if lost else "ok", detail))
+
+    def _skip(self, name: str, bench: Bench, why: str) -> None:
+        self._display.stage_started(name, 0.0)
+        self._end_stage(Stage(name, bench.now_s, bench.now_s, "skipped", why))
+
+    def _end_stage(self, stage: Stage) -> None:
+        self._stages.append(stage)
+        self._display.stage_ended(stage)
+        self._log.stage(stage)
+
+    def _idle(self, bench: Bench) -> None:
+        bench.cycle(Command(Mode.SPEED, 0.0, 0.0))
+
+    def _log_failure(self, error: BaseException) -> None:
+        try:
+            if isinstance(error, Interrupted):
+                self._log.event(self._drive.clock.now_s(), "interrupted", str(error))
+            else:
+                self._log.failure(self._drive.clock.now_s(), error)
+        except Exception as also:
+            error.add_note(f"and the log did not take it: {also}")
+
+
+def _refusal(preflight: Preflight) -> PreflightRefused:
+    refused = [check for check in preflight.checks if check.outcome is Outcome.REFUSED]
+    first = refused[0]
+    more = f" (and {len(refused) - 1} more, see the table)" if len(refused) > 1 else ""
+    return PreflightRefused(
+        f"{first.name}: wanted {first.wanted}, found {first.found}{more}", where=first.where, next_step=first.next_step
+    )
+
+
+def _short(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"[:300]
+
+
+def _choose_mode(wanted: str | None, preflight: Preflight) -> Mode:
+    """Torque mode where the drive has it and can enter it while it turns, unless speed mode was asked for."""
+    can_torque = Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
+    if wanted == Mode.TORQUE.value and not can_torque:
+        raise PreflightRefused(
+            "torque mode was asked for, but this drive has none that can be entered while it turns",
+            where="6502h and profile",
+            next_step="Use --mode speed",
+        )
+    return Mode.SPEED if wanted == Mode.SPEED.value or not can_torque else Mode.TORQUE
+
+
+READ_FILTER_SD_SHARE = 0.1
+READ_FILTER_SD_S = 0.001
+"""How exactly a filter setting that the drive tells is the lag that it causes."""
+
+
+def _with_read_filters(prior: LagPrior, filters: ReportingFilters) -> LagPrior:
+    """What rig.yaml states goes before what the drive tells of itself."""
+    speed, torque = prior.speed_lag_s, prior.torque_lag_s
+    sources = [prior.source] if prior.source else []
+    if speed is None and filters.speed_lag_s is not None:
+        sd = READ_FILTER_SD_SHARE * filters.speed_lag_s + READ_FILTER_SD_S
+        prior = replace(prior, speed_lag_s=filters.speed_lag_s, speed_lag_sd_s=sd)
+    if torque is None and filters.torque_lag_s is not None:
+        sd = READ_FILTER_SD_SHARE * filters.torque_lag_s + READ_FILTER_SD_S
+        prior = replace(prior, torque_lag_s=filters.torque_lag_s, torque_lag_sd_s=sd)
+    if filters.source:
+        sources.append(filters.source)
+    return replace(prior, source="; ".join(sources))

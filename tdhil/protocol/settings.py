@@ -1,0 +1,56 @@
+"""What a run is allowed to do and asked to do: plain numbers, SI at the motor shaft."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class MachineLimits:
+    """Limits of the machine, from rig.yaml; the guard holds them, the drive gets them too."""
+
+    speed_min_rad_s: float             # lower edge of the window in which the excitation stays
+    speed_max_rad_s: float             # upper edge; the guard trips on it
+    torque_nm: float                   # largest magnitude of commanded torque
+    time_s: float                      # the whole run from first motion to rest
+    quick_stop_rad_s2: float = 2.0
+    watchdog_s: float = 0.5
+    probe_torque_nm: float = 0.0       # sign probe: torque may rise to this until the shaft moves
+    probe_travel_rad: float = 3.0      # sign probe: how far the shaft may turn
+    allow_reverse: bool = False
+    load: str = "none"                 # none, string
+    torque_ramp_nm_s: float = 0.0      # with a string: how fast trapped torque is brought down
+
+
+@dataclass(frozen=True)
+class ExcitationRequest:
+    """What stage 5 shall do; None = the default, scaled to the rig."""
+
+    kind: Literal["multisine", "sine", "step"] = "multisine"
+    mode: str | None = None            # torque, speed; None = torque where the drive has it
+    frequency_hz: float | None = None
+    amplitude_rad_s: float | None = None
+    offset_rad_s: float | None = None
+    periods: int | None = None
+
+
+@dataclass(frozen=True)
+class ControlAssumptions:
+    """What the host's control and guard assume before anything is known of the drive's reporting."""
+
+    largest_speed_lag_s: float = 0.5   # largest plausible lag of the reported speed
+    reaction_s: float = 0.1            # from a sample to the torque that answers it
+    smallest_inertia_share: float = 0.7    # smallest plausible J as a share of the rough J
+
+
+class StopRequest:
+    """A wish to stop, set from a signal handler: one assignment, nothing else. The first cause stays."""
+
+    def __init__(self) -> None:
+        self.signum: int | None = None
+        self.count = 0
+
+    def ask(self, signum: int) -> None:
+        """Called by the signal handler."""
+        self.count += 1
+        if self.signum is None:
+            self.signum = signum

@@ -1,0 +1,69 @@
+"""The result card: what a field engineer reads first, in 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from tdhil.report.document import SIMULATED
+from tdhil.report.numbers import percent, with_interval
+
+_VERDICT_STYLE = {
+    "valid": "bold green",
+    "valid_wide": "bold yellow",
+    "not_identifiable": "bold red",
+    "model_rejected": "bold red",
+}
+
+
+def result_card(document: Mapping[str, Any]) -> RenderableType:
+    """A panel of the result document."""
+    rows = Table.grid(padding=(0, 2))
+    rows.add_column(style="dim", no_wrap=True)
+    rows.add_column(overflow="fold")
+    verdict = document["verdict"]
+    rows.add_row("verdict", Text(verdict, style=_VERDICT_STYLE.get(verdict, "bold")))
+    inertia = document["inertia_kg_m2"]
+    if inertia is not None:
+        half = 0.5 * (inertia["high"] - inertia["low"])
+        shown = with_interval(inertia["value"], inertia["low"], inertia["high"], "kg·m²")
+        title = f"J, {100 * inertia['confidence']:g} % interval"
+        rows.add_row(title, Text(f"{shown}  {percent(half, inertia['value'])}", style="bold"))
+        total = with_interval(inertia["value"], inertia["low_total"], inertia["high_total"], "kg·m²")
+        rows.add_row("with torque scale", total)
+        if document["gear_ratio"] != 1.0:
+            main = document["inertia_main_shaft_kg_m2"]
+            rows.add_row("J at main shaft", with_interval(main["value"], main["low"], main["high"], "kg·m²"))
+    if document["reference_inertia_kg_m2"] is not None:
+        rows.add_row("reference J", f"{document['reference_inertia_kg_m2']:g} kg·m² (rig.yaml)")
+    for title, key, unit in (
+        ("viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"),
+        ("Coulomb friction", "coulomb_nm", "N·m"),
+        ("lag of speed", "speed_lag_s", "s"),
+        ("lag of torque", "torque_lag_s", "s"),
+        ("skew", "skew_s", "s"),
+    ):
+        if (part := document[key]) is not None:
+            rows.add_row(title, with_interval(part["value"], part["low"], part["high"], unit))
+    if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
+        text = f"{paper['inertia_kg_m2']:.1f} kg·m²  (r² {paper['r2']:.3f}"
+        raw = paper["raw_rate"]["inertia_kg_m2"]
+        rows.add_row("the paper's method", text + (f"; at the raw rate {raw:.1f})" if raw is not None else ")"))
+    rows.add_row("model", document["model"])
+    body: list[RenderableType] = [rows, Text(), Text(document["reason"])]
+    if document["advice"]:
+        body.append(Text(document["advice"], style="italic"))
+    body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
+    body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
+    title = "moment of inertia at the motor shaft" + (f" · {SIMULATED}" if document["simulated"] else "")
+    return Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue")
+
+
+def print_card(document: Mapping[str, Any], console: Console) -> None:
+    """The card, on a console."""
+    console.print(result_card(document))

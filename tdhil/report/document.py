@@ -1,0 +1,85 @@
+"""The result as one JSON document: the same from a live run and from its replay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from tdhil import __version__
+from tdhil.identify.identification import Identification, InertiaEstimate, LineFit
+from tdhil.record.recording import Recording
+
+SIMULATED = "SIMULATED"
+
+
+def result_document(
+    identification: Identification, recording: Recording, run: Mapping[str, Any], log: str
+) -> dict[str, Any]:
+    """Plain data for `json.dumps`. ``run`` is the log's configuration; everything else is SI at the motor shaft.
+
+    Numbers that aren't finite become null: JSON knows no NaN.
+    """
+    found = identification
+    document: dict[str, Any] = {
+        "verdict": found.verdict.value,
+        "model": found.model,
+        "reason": found.reason,
+        "advice": found.advice,
+        "inertia_kg_m2": None if found.inertia is None else asdict(found.inertia),
+        "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
+        "gear_ratio": recording.gear_ratio,
+        "reference_inertia_kg_m2": run.get("reference_inertia_kg_m2"),
+        "viscous_nm_s_rad": _estimate(found.viscous_nm_s_rad),
+        "coulomb_nm": _estimate(found.coulomb_nm),
+        "speed_lag_s": _estimate(found.speed_lag_s),
+        "torque_lag_s": _estimate(found.torque_lag_s),
+        "skew_s": _estimate(found.skew_s),
+        "paper": None,
+        "residual": None if found.residual is None else asdict(found.residual),
+        "periods_used": found.periods_used,
+        "samples_used": found.samples_used,
+        "warnings": list(found.warnings),
+        "simulated": recording.simulated,
+        "complete": recording.complete,
+        "log": log,
+        "stages": [
+            {"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
+            | ({"detail": stage.detail} if stage.detail else {})
+            for stage in recording.stages
+        ],
+        "tdhil": __version__,
+    }
+    if found.paper is not None:
+        document["paper"] = _line_fit(found.paper.stepped) | {"raw_rate": _line_fit(found.paper.raw_rate)}
+    cleaned = _finite(document)
+    assert isinstance(cleaned, dict)
+    return cleaned
+
+
+def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[str, float] | None:
+    """J·i² with i = ω_motor/ω_main."""
+    if inertia is None:
+        return None
+    squared = gear_ratio * gear_ratio
+    names = ("value", "low", "high", "low_total", "high_total")
+    return {name: getattr(inertia, name) * squared for name in names}
+
+
+def _estimate(estimate: Any) -> dict[str, float] | None:
+    return None if estimate is None else asdict(estimate)
+
+
+def _line_fit(fit: LineFit) -> dict[str, float]:
+    return asdict(fit)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

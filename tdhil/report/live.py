@@ -1,0 +1,163 @@
+"""A run as it goes: the five stages with live speed, torque and time left. On stderr, which is not for results."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from drivers.drive import Command, Outcome, Preflight, Sample
+from tdhil.record.recording import Stage
+from tdhil.report.document import SIMULATED
+from tdhil.report.numbers import minutes
+
+if TYPE_CHECKING:
+    from tdhil.protocol.excitation import Plan
+
+_EXPECTED_S = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
+_MARKS = {"ok": "[green]✓[/]", "degraded": "[yellow]~[/]", "aborted": "[red]✗[/]", "skipped": "[dim]-[/]"}
+_REFRESH_S = 0.2
+
+
+class LiveDisplay:
+    """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle."""
+
+    def __init__(self, console: Console, show_preflight: bool) -> None:
+        self._console = console
+        self._show_preflight = show_preflight
+        self._simulated = False
+        self._expected_s = dict(_EXPECTED_S)
+        self._ended: dict[str, Stage] = {}
+        self._current: str | None = None
+        self._started_s: float | None = None
+        self._last: tuple[Command, Sample] | None = None
+        self._next_s = 0.0
+        self._live: Live | None = None
+
+    def __enter__(self) -> LiveDisplay:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.pause()
+
+    def pause(self) -> None:
+        """Leave the terminal to somebody else (a prompt); the next stage or cycle takes it back."""
+        if self._live is not None:
+            self._live.update(self._picture(), refresh=True)
+            self._live.stop()
+            self._live = None
+
+    def preflight(self, preflight: Preflight) -> None:
+        """The preflight table, on a real peer or where something was refused."""
+        self._simulated = preflight.identity.simulated
+        if self._show_preflight or preflight.refused or not preflight.identity.simulated:
+            self.pause()
+            self._console.print(preflight_table(preflight))
+
+    def stage_started(self, name: str, expected_s: float) -> None:
+        self._current = name
+        self._expected_s[name] = expected_s
+        self._started_s = None
+        if not self._console.is_terminal:
+            self._console.print(f"{self._prefix()}stage {name} …", highlight=False)
+
+    def planned(self, plan: Plan) -> None:
+        """The plan of stage 5, as soon as there is one."""
+        self._expected_s["acquire"] = plan.duration_s + 5.0
+        text = (
+            f"plan: {plan.kind} in {plan.mode} mode, {minutes(plan.duration_s)}, speed {plan.speed_min_rad_s:.2f} to "
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m"
+        )
+        (self._live.console if self._live else self._console).print(self._prefix() + text, style="dim", highlight=False)
+
+    def cycle(self, command: Command, sample: Sample) -> None:
+        """Called in every cycle."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return
+        self._next_s = now_s + _REFRESH_S
+        if self._started_s is None:
+            self._started_s = sample.time_s
+        self._last = (command, sample)
+        if self._console.is_terminal:
+            if self._live is None:
+                self._live = Live(console=self._console, auto_refresh=False, transient=False)
+                self._live.start()
+            self._live.update(self._picture(), refresh=True)
+
+    def stage_ended(self, stage: Stage) -> None:
+        self._ended[stage.name] = stage
+        if not self._console.is_terminal:
+            detail = f": {stage.detail}" if stage.detail else ""
+            took = minutes(stage.end_s - stage.start_s)
+            self._console.print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}", highlight=False)
+        elif self._live is not None:
+            self._live.update(self._picture(), refresh=True)
+
+    def _prefix(self) -> str:
+        return f"{SIMULATED} " if self._simulated else ""
+
+    def _picture(self) -> RenderableType:
+        table = Table.grid(padding=(0, 1))
+        table.add_column(width=1)
+        table.add_column(width=8)
+        table.add_column(width=34)
+        table.add_column()
+        left_s = 0.0
+        for name, expected_s in self._expected_s.items():
+            stage = self._ended.get(name)
+            if stage is not None:
+                took = minutes(stage.end_s - stage.start_s)
+                note = stage.outcome if stage.outcome != "ok" else ""
+                table.add_row(_MARKS.get(stage.outcome, " "), name, note, f"[dim]{took}[/]")
+            elif name == self._current:
+                done_s = self._elapsed_s()
+                left_s += max(0.0, expected_s - done_s)
+                bar = ProgressBar(total=max(expected_s, 0.1), completed=min(done_s, expected_s), width=32)
+                table.add_row("[cyan]▸[/]", f"[bold]{name}[/]", bar, minutes(done_s))
+            else:
+                left_s += expected_s
+                table.add_row(" ", f"[dim]{name}[/]", "", "")
+        parts: list[RenderableType] = [table]
+        if self._last is not None:
+            command, sample = self._last
+            text = (
+                f"{sample.speed_rad_s:7.3f} rad/s  {sample.torque_nm:8.1f} N·m  {sample.state.value}, "
+                f"{command.mode.value} mode  {minutes(left_s)} left"
+            )
+            parts.append(Text(text, no_wrap=True, overflow="ellipsis"))
+        if self._simulated:
+            parts.insert(0, Text(f"{SIMULATED} drive and rig: nothing real turns", style="magenta"))
+        return Group(*parts)
+
+    def _elapsed_s(self) -> float:
+        if self._last is None or self._started_s is None:
+            return 0.0
+        return self._last[1].time_s - self._started_s
+
+
+def preflight_table(preflight: Preflight) -> Table:
+    """Every check with what was wanted and what was found."""
+    who = preflight.identity
+    title = f"preflight: {who.name}" + (f" · {SIMULATED}" if who.simulated else "")
+    table = Table(title=title, title_justify="left", expand=False)
+    for heading in ("", "check", "wanted", "found", "where"):
+        table.add_column(heading, overflow="fold")
+    marks = {Outcome.OK: "[green]✓[/]", Outcome.NOTE: "[dim]i[/]", Outcome.REFUSED: "[red]✗[/]"}
+    for check in preflight.checks:
+        table.add_row(marks[check.outcome], check.name, check.wanted, check.found, check.where)
+        if check.next_step:
+            table.add_row("", "", "", f"[yellow]{check.next_step}[/]", "")
+    table.add_row("", "if the host falls silent", "", preflight.safe_action.replace("_", " "), "")
+    return table
+
+
+def stderr_console() -> Console:
+    """Progress and messages go here; stdout is for results."""
+    return Console(file=sys.stderr, highlight=False)

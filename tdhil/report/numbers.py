@@ -1,0 +1,23 @@
+"""Numbers as people read them: as many digits as the interval bears, and no more."""
+
+import math
+
+
+def with_interval(value: float, low: float, high: float, unit: str) -> str:
+    """``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width decide the decimals."""
+    half = 0.5 * (high - low)
+    if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
+        return f"{value:.5g} {unit}"
+    decimals = max(0, 1 - math.floor(math.log10(half)))
+    return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}) {unit}"
+
+
+def percent(half_width: float, value: float) -> str:
+    """``±0.8 %`` of the value."""
+    return f"±{100.0 * half_width / abs(value):.2g} %" if value else "±?"
+
+
+def minutes(seconds: float) -> str:
+    """``4:07``, or ``12 s`` under a minute."""
+    whole = max(0, round(seconds))
+    return f"{whole // 60}:{whole % 60:02d}" if whole >= 60 else f"{whole} s"
