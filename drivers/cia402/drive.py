@@ -14,9 +14,9 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
+from drivers.cia402 import arming
 from drivers.cia402 import preflight as checks
 from drivers.cia402.link import CanLink
-from drivers.cia402.mapping import layout, write_pdo
 from drivers.cia402.objects import (
     RPDO1,
     RPDO2,
@@ -24,7 +24,6 @@ from drivers.cia402.objects import (
     TPDO2_MODE,
     TPDO2_MODE_DEMAND,
     Units,
-    consumer_heartbeat,
     encode_speed,
     encode_torque,
 )
@@ -65,6 +64,10 @@ HOST_NODE = 127
 SYNC = 0x080
 NMT = 0x000
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+HEARTBEAT_S = 0.1
+"""Both ways; the host's comes faster where the watchdog is shorter than five of them."""
+DRIVE_SILENT_S = 0.5
+"""After so long without its heartbeat the drive counts as lost."""
 _NO_WORD = b""
 _PROFILE_VELOCITY = 3
 _REPEAT_MODE_CYCLES = 25
@@ -110,7 +113,7 @@ class Cia402Drive:
         self._modes: dict[int, Mode] = {}
         self._slow_layout = TPDO2_MODE
         self._watchdog_s = 0.0
-        self._heartbeat_every_s = 0.1
+        self._heartbeat_every_s = HEARTBEAT_S
         self._wish = Wish.OFF
         self._state = State.NOT_READY
         self._status = 0
@@ -165,13 +168,18 @@ class Cia402Drive:
             objects.write(index, 0, 0, bits)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
-        self._map_pdos(table)
-        self._set_timing(table)
-        self._arm_watchdog(table, limits.watchdog_s)
+        with_demand = arming.map_pdos(table, objects, self._node, self._profile)
+        self._slow_layout = TPDO2_MODE_DEMAND if with_demand else TPDO2_MODE
+        self._heartbeat_every_s = min(HEARTBEAT_S, limits.watchdog_s / 5.0)
+        heard = arming.set_timing(table, objects, self.period_s, HEARTBEAT_S, self.clock.stepped)
+        self._watchdog_s = limits.watchdog_s
+        arming.arm_watchdog(
+            table, objects, self._profile.watchdog, self._host_node, limits.watchdog_s, self._send_heartbeat
+        )
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
         )
-        self._start()
+        self._start(DRIVE_SILENT_S if heard else 0.0)
         return found
 
     def _is_simulated(self) -> bool:
@@ -180,74 +188,12 @@ class Cia402Drive:
         except ObjectRefused:
             return False
 
-    def _map_pdos(self, table: checks.Table) -> None:
-        has_demand = self._profile.torque.has_demand and self._objects.read_if_there(0x6074) is not None
-        self._slow_layout = TPDO2_MODE_DEMAND if has_demand else TPDO2_MODE
-
-        def work() -> tuple[str, bool]:
-            for pdo in layout(has_demand):
-                write_pdo(self._objects, self._node, pdo)
-            return "as wanted", True
-
-        table.attempt("PDO mapping", "6040+6071+60FF, 6041+6077+606C, 6060, 6061", "1600h, 1A00h", work)
-
-    def _set_timing(self, table: checks.Table) -> None:
-        period_us = round(self.period_s * 1e6)
-        try:
-            back = self._objects.change(0x1006, 0, period_us, 32)
-            table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
-        except ObjectRefused:
-            table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")
-        if self.clock.stepped:
-            stepped = self._objects.change(MARKER_INDEX, 2, 1, 8)
-            table.row("stepped time", "on", "on" if stepped else "off", stepped == 1, name(MARKER_INDEX, 2))
-        try:
-            self._objects.change(0x1017, 0, round(self._heartbeat_every_s * 1000), 16)
-        except ObjectRefused:
-            table.note("drive's heartbeat", "the drive produces none", "1017h")
-        else:
-            self._watch.allowed_silence_s = 5.0 * self._heartbeat_every_s
-
-    def _arm_watchdog(self, table: checks.Table, watchdog_s: float) -> None:
-        """1016h last, since its supervision begins with the first heartbeat and wants to be fed from then on."""
-        entry = self._profile.watchdog
-        if entry.kind == "none":
-            table.row(
-                "watchdog", "armed", "this drive has none", False, "profile",
-                "A host that dies would leave the shaft turning: this drive can't be used",
-            )
-            return
-        time_ms = round(watchdog_s * 1000)
-        self._heartbeat_every_s = min(self._heartbeat_every_s, watchdog_s / 5.0)
-        index, sub = entry.reaction_index, entry.reaction_sub
-        if index is not None and entry.reaction_value is not None:
-            wanted = entry.reaction_value
-
-            def react() -> tuple[str, bool]:
-                found = self._objects.change(index, sub, wanted, 16)
-                return str(found), found == wanted
-
-            table.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
-        value = consumer_heartbeat(self._host_node, time_ms)
-
-        def arm() -> tuple[str, bool]:
-            self._objects.change(entry.consumer_index, entry.consumer_sub, value, 32)
-            self._send_heartbeat()
-            found = self._objects.read(entry.consumer_index, entry.consumer_sub)
-            return f"node {found >> 16 & 0x7F}, {found & 0xFFFF} ms", found == value
-
-        table.attempt(
-            "watchdog", f"node {self._host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm,
-            "Without it a host that dies would leave the shaft turning",
-        )
-        self._watchdog_s = watchdog_s
-
-    def _start(self) -> None:
+    def _start(self, allowed_silence_s: float) -> None:
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
         now_s = self.clock.now_s()
         self._next_tick_s = now_s + self.period_s
-        self._watch.start(self._watch.allowed_silence_s)
+        self._watch.start(allowed_silence_s)
 
     def _pause(self) -> None:
         """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""

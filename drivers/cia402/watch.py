@@ -14,6 +14,9 @@ PRE_OPERATIONAL = 0x7F
 
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
+START_GRACE_S = 0.5
+"""A heartbeat that was under way when the node was started still says pre-operational."""
+
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
     0x10: "generic error",
@@ -59,6 +62,8 @@ class Watch:
         self._heard_s: float | None = None
         self._trouble: TdhilError | None = None
         self._raised: set[str] = set()
+        self._started_s = 0.0
+        self._operational = False
         self.allowed_silence_s = 0.0
         self.expect_operational = False
         self.emcy_code = 0
@@ -78,7 +83,9 @@ class Watch:
                     next_step="It is not enabled again by itself. Find out why it restarted, then start anew",
                 ),
             )
-        elif state != OPERATIONAL:
+        elif state == OPERATIONAL:
+            self._operational = True
+        elif self._operational or self._clock.now_s() - self._started_s > START_GRACE_S:
             self._keep(
                 "nmt",
                 CommunicationLost(
@@ -124,7 +131,8 @@ class Watch:
 
     def start(self, allowed_silence_s: float) -> None:
         """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
-        self._heard_s = self._clock.now_s()
+        self._heard_s = self._started_s = self._clock.now_s()
+        self._operational = False
         self.allowed_silence_s = allowed_silence_s
         self.expect_operational = True
 

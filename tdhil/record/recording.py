@@ -66,6 +66,7 @@ class LagPrior:
     torque_lag_s: float | None = None
     torque_lag_sd_s: float = 0.0
     source: str = ""
+    skew_sd_s: float = 0.01    # torque and speed are of one frame to within this; used only if the lines can't tell
 
 
 @dataclass(frozen=True)

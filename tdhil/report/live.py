@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -17,8 +17,31 @@ from tdhil.record.recording import Stage
 from tdhil.report.document import SIMULATED
 from tdhil.report.numbers import minutes
 
-if TYPE_CHECKING:
-    from tdhil.protocol.excitation import Plan
+
+class PlannedMotion(Protocol):
+    """What is shown of a plan of stage 5."""
+
+    @property
+    def kind(self) -> str: ...
+
+    @property
+    def mode(self) -> str: ...
+
+    @property
+    def duration_s(self) -> float: ...
+
+    @property
+    def speed_min_rad_s(self) -> float: ...
+
+    @property
+    def speed_max_rad_s(self) -> float: ...
+
+    @property
+    def torque_min_nm(self) -> float: ...
+
+    @property
+    def torque_max_nm(self) -> float: ...
+
 
 _EXPECTED_S = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
 _MARKS = {"ok": "[green]✓[/]", "degraded": "[yellow]~[/]", "aborted": "[red]✗[/]", "skipped": "[dim]-[/]"}
@@ -67,7 +90,7 @@ class LiveDisplay:
         if not self._console.is_terminal:
             self._console.print(f"{self._prefix()}stage {name} …", highlight=False)
 
-    def planned(self, plan: Plan) -> None:
+    def planned(self, plan: PlannedMotion) -> None:
         """The plan of stage 5, as soon as there is one."""
         self._expected_s["acquire"] = plan.duration_s + 5.0
         text = (

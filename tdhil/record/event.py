@@ -1,0 +1,13 @@
+"""Something that happened in a run and is worth a line: an error, a warning, a drop, a key press."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Event:
+    """``time_s`` is control time; ``kind`` is one lower-case word; ``traceback`` is empty where there was none."""
+
+    time_s: float
+    kind: str
+    text: str
+    traceback: str = ""

@@ -1,0 +1,79 @@
+"""The messages of our channels in a file that may be anything."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from tdhil.record import chunk
+from tdhil.record.channels import CHANNELS, PACKAGE
+from tdhil.record.container import MAGIC
+from tdhil.record.errors import LogError
+from tdhil.record.inflate import Contents, Damage
+from tdhil.record.recovery import Library, Whole, walk
+
+_NUMBER: Final = {(topic, f"{PACKAGE}.{message}"): number for number, (topic, message) in CHANNELS.items()}
+_OTHER: Final = "Give a run.mcap of this tool"
+
+
+def messages(path: Path) -> Iterator[tuple[int, bytes] | Damage | Whole]:
+    """Channel numbers of ours with payloads, what was stepped over, and at the end `Whole` if the file was closed.
+
+    Raises `LogError` where the file can't be opened, is empty, is not MCAP, or (at the end) holds nothing of ours.
+    """
+    declared = _Declared()
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(0)
+            if size == 0:
+                raise LogError("the file is empty", where=str(path), next_step="The run has to be done again")
+            if file.read(len(MAGIC)) != MAGIC[:size]:
+                raise LogError("this is not an MCAP file", where=str(path), next_step=_OTHER)
+            for found in walk(file, size):
+                if isinstance(found, Contents):
+                    yield from declared.messages(found)
+                elif isinstance(found, Library):
+                    declared.library(found.name)
+                else:
+                    yield found
+    except OSError as error:
+        raise LogError(f"the log can't be read: {error.strerror or error}", where=str(path),
+                       next_step="Check the path") from error
+    if not declared.ours:
+        raise LogError("an MCAP file, but not a run of this tool", where=str(path), next_step=_OTHER)
+
+
+class _Declared:
+    """Which channel of the file is which of ours, by topic and schema."""
+
+    def __init__(self) -> None:
+        self.ours = False
+        self._schemas: dict[int, str] = {}
+        self._numbers: dict[int, int] = {}
+
+    def library(self, name: str) -> None:
+        """Our own files: the channels are known even if the chunk that declares them is lost."""
+        if name.split(" ", maxsplit=1)[0] == PACKAGE:
+            self.ours = True
+            self._numbers = {number: number for number in CHANNELS} | self._numbers
+
+    def messages(self, contents: Contents) -> Iterator[tuple[int, bytes] | Damage]:
+        numbers = self._numbers
+        try:
+            for record in chunk.records(contents.data):
+                if isinstance(record, chunk.Message):
+                    if record.channel in numbers:
+                        yield numbers[record.channel], record.payload
+                elif isinstance(record, chunk.Schema):
+                    self._schemas[record.identifier] = record.name
+                else:
+                    self._channel(record)
+        except ValueError as error:
+            yield Damage(contents.offset, f"a chunk is malformed: {error}")
+
+    def _channel(self, record: chunk.Channel) -> None:
+        number = _NUMBER.get((record.topic, self._schemas.get(record.schema, "")))
+        self._numbers.pop(record.identifier, None)
+        if number is not None:
+            self.ours = True
+            self._numbers[record.identifier] = number

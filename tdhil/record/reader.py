@@ -1,0 +1,168 @@
+"""run.mcap back into a Recording, from a file that may be whole, cut, damaged or hostile."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from google.protobuf.message import DecodeError
+
+from drivers.drive import PowerState, RawFrame, Sample
+from tdhil.record import channels
+from tdhil.record.builder import FACTS, RecordingBuilder
+from tdhil.record.channels import CHANNELS, CLASSES, MODE_OF, STATE_OF
+from tdhil.record.cold import TEXT_LIMIT
+from tdhil.record.event import Event
+from tdhil.record.inflate import Damage
+from tdhil.record.messages import messages
+from tdhil.record.plain import structure
+from tdhil.record.recording import Excitation, Level, Ramp, Recording, Stage
+
+SAMPLES: Final = 8_000_000             # 25 bytes each; two hours at 1 kHz
+RARE: Final = 20_000                   # stages, events, problems
+RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as the log has it. ``complete`` is False where the file wasn't closed or some of it is lost.
+
+    ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none.
+    """
+
+    recording: Recording
+    configuration: dict[str, Any]
+    result: dict[str, Any] | None
+    events: tuple[Event, ...]
+    stages: tuple[Stage, ...]
+    complete: bool
+    problems: tuple[str, ...]
+
+
+def read_run(path: Path) -> Run:
+    """Everything but the raw frames and the commands. Raises `LogError` if there is nothing of ours in the file."""
+    return _Reading().run(path)
+
+
+def read_samples(path: Path) -> Iterator[Sample]:
+    """The samples as they were logged, damaged stretches left out. Raises `LogError` like `read_run`."""
+    for message in _messages(path, channels.SAMPLE):
+        demand_nm = message.torque_demand_nm if message.HasField("torque_demand_nm") else None
+        yield Sample(
+            message.time_s, message.age_s, message.half_width_s, message.fresh, message.speed_rad_s,
+            message.torque_nm, demand_nm, MODE_OF.get(message.mode), STATE_OF.get(message.state, PowerState.NOT_READY),
+            message.standstill, message.limit_active, message.status)
+
+
+def read_frames(path: Path) -> Iterator[RawFrame]:
+    """The raw frames as they stood on the bus, damaged stretches left out. Raises `LogError` like `read_run`."""
+    for message in _messages(path, channels.CAN):
+        for frame in message.frames:
+            yield RawFrame(frame.time_s, frame.outgoing, frame.identifier, frame.data)
+
+
+def _messages(path: Path, wanted: int) -> Iterator[Any]:
+    parse = CLASSES[CHANNELS[wanted][1]].FromString
+    for found in messages(path):
+        if isinstance(found, tuple) and found[0] == wanted:
+            with suppress(DecodeError):
+                yield parse(found[1])
+
+
+class _Reading:
+    """One reading of one file."""
+
+    def __init__(self) -> None:
+        self._builder = RecordingBuilder()
+        self._texts: dict[int, dict[str, Any]] = {}
+        self._events: list[Event] = []
+        self._stages: list[Stage] = []
+        self._problems: list[str] = []
+        self._budget = RARE_BYTES
+        self._whole = False
+        self._lost = False
+        self._take: dict[int, Callable[[Any], None]] = {
+            channels.SAMPLE: self._sample,
+            channels.STAGE: self._stage,
+            channels.EXCITATION: self._excitation,
+            channels.EVENT: self._event,
+        }
+
+    def run(self, path: Path) -> Run:
+        for found in messages(path):
+            if isinstance(found, tuple):
+                self._message(*found)
+            elif isinstance(found, Damage):
+                self._problem(str(found))
+            else:
+                self._whole = True
+            if len(self._builder) >= SAMPLES:
+                self._problem(f"more than {SAMPLES} samples: the rest is not read")
+                break
+        self._learn()
+        run = self._texts.get(channels.CONFIGURATION, {}).get("run")
+        complete = self._whole and not self._lost
+        return Run(
+            recording=self._builder.recording(complete=complete),
+            configuration=run if isinstance(run, dict) else {},
+            result=self._texts.get(channels.RESULT),
+            events=tuple(self._events),
+            stages=tuple(self._stages),
+            complete=complete,
+            problems=tuple(self._problems),
+        )
+
+    def _message(self, number: int, payload: bytes) -> None:
+        try:
+            if number not in (channels.SAMPLE, channels.COMMAND, channels.CAN):
+                self._budget -= len(payload)
+                if self._budget < 0:
+                    raise ValueError(f"more than {RARE_BYTES} bytes of such messages")
+            if number in (channels.CONFIGURATION, channels.RESULT):
+                self._text(number, payload)
+            elif number in self._take:
+                self._take[number](CLASSES[CHANNELS[number][1]].FromString(payload))
+        except (DecodeError, TypeError, ValueError, RecursionError) as error:
+            self._problem(f"a message on {CHANNELS[number][0]} can't be read: {error}")
+
+    def _sample(self, message: Any) -> None:
+        self._builder.add_values(
+            message.time_s, message.speed_rad_s, message.torque_nm, fresh=message.fresh, limited=message.limit_active)
+
+    def _stage(self, message: Any) -> None:
+        if len(self._stages) < RARE:
+            stage = structure(Stage, message)
+            self._stages.append(stage)
+            self._builder.stage(stage)
+
+    def _event(self, message: Any) -> None:
+        if len(self._events) < RARE:
+            self._events.append(structure(Event, message))
+
+    def _excitation(self, message: Any) -> None:
+        self._builder.excitation(
+            structure(Excitation, message.excitation) if message.HasField("excitation") else None,
+            structure(tuple[Level, ...], message.levels),
+            structure(tuple[Ramp, ...], message.ramps))
+
+    def _text(self, number: int, payload: bytes) -> None:
+        if len(payload) > TEXT_LIMIT:
+            raise ValueError(f"{len(payload)} bytes of text (limit {TEXT_LIMIT})")
+        content = json.loads(CLASSES["Text"].FromString(payload).json)
+        if not isinstance(content, dict):
+            raise TypeError("not a JSON object")
+        self._texts[number] = content
+
+    def _learn(self) -> None:
+        facts = self._texts.get(channels.CONFIGURATION, {}).get("recording", {})
+        try:
+            self._builder.learn(**{name: value for name, value in facts.items() if name in FACTS})
+        except (TypeError, ValueError, AttributeError) as error:
+            self._problem(f"the configuration can't be read: {error}")
+
+    def _problem(self, text: str) -> None:
+        self._lost = True
+        if len(self._problems) < RARE:
+            self._problems.append(text[:200])

@@ -1,0 +1,154 @@
+"""The log of a run as it is written: a cheap front for the control loop, a thread behind it for all the rest.
+
+The front appends to a bounded queue and does nothing else. The thread (`pump`) empties the queue every 50 ms, lays
+out the messages, and closes a chunk after 0.25 s of wall time or 0.4 s of control time, whichever comes first:
+a kill costs less than half a second. In stepped time, where control time runs ahead of the wall, the front wakes
+the thread as soon as 256 records wait.
+"""
+
+import errno
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from threading import Thread
+from types import TracebackType
+from typing import Any, Final, Self
+
+from drivers.drive import Command, RawFrame, Sample
+from tdhil.record import cold
+from tdhil.record.backlog import Backlog
+from tdhil.record.container import Container, RawFile
+from tdhil.record.errors import LogError
+from tdhil.record.event import Event
+from tdhil.record.pump import Pump
+from tdhil.record.recording import Excitation, Level, Ramp, Stage
+
+STEPPED_QUEUE: Final = 1024            # records; small, since in stepped time it can hold much control time
+REAL_TIME_QUEUE: Final = 16384         # some seconds at 250 Hz: what a slow disk may take before records are lost
+
+
+class RunWriter:
+    """One run.mcap. ``epoch_ns`` is the wall clock at control time zero, 0 for stepped runs so that files repeat.
+
+    ``queue_size`` counts records; None takes the default of stepped or real time.
+    ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in
+    ``dropped``, and the drop is logged as an event (real time).
+
+    When the thread fails (disk full), the next call raises `LogError`, once; after that records are
+    discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close` raises it again.
+    `frame` never raises: it is called from inside the drive's own input and output.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        epoch_ns: int,
+        block: bool,
+        queue_size: int | None = None,
+        min_free_bytes: int = 200_000_000,
+        overwrite: bool = True,
+        opener: Callable[[Path], RawFile] | None = None,
+    ) -> None:
+        self.path = path
+        self._raised = False
+        self._backlog = Backlog(queue_size or (STEPPED_QUEUE if block else REAL_TIME_QUEUE), block=block)
+        try:
+            free = shutil.disk_usage(path.absolute().parent).free
+            if free < min_free_bytes:
+                raise LogError(
+                    f"only {free / 1e6:.0f} MB free for the log, {min_free_bytes / 1e6:.0f} MB wanted",
+                    where=str(path), next_step="Free some space, or log to another disk")
+            file = opener(path) if opener else path.open("wb" if overwrite else "xb", buffering=0)
+            container = Container(file)
+        except OSError as error:
+            raise self._error("the log can't be opened", error) from error
+        self._pump = Pump(self._backlog, container, epoch_ns)
+        self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Records that did not make it into the log so far."""
+        return self._backlog.dropped
+
+    @property
+    def failure(self) -> LogError | None:
+        """What ended the log before its time, or None."""
+        cause = self._pump.failure
+        return None if cause is None else self._error("the log can't be written any more", cause)
+
+    def sample(self, sample: Sample) -> None:
+        """One cycle's feedback; call it after the cycle's command and frames."""
+        if not self._backlog.put(sample):
+            self._refused()
+
+    def command(self, time_s: float, command: Command) -> None:
+        """One cycle's command; ``time_s`` is control time."""
+        if not self._backlog.put((time_s, command)):
+            self._refused()
+
+    def frame(self, frame: RawFrame) -> None:
+        """One frame from the bus; a `FrameTap`, may be called from any thread."""
+        self._backlog.put(frame)
+
+    def stage(self, stage: Stage) -> None:
+        """A stage that has ended."""
+        self._rare(cold.stage_message(stage))
+
+    def excitation(
+        self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()
+    ) -> None:
+        """Everything known so far of the motion; may be called again, the last call counts."""
+        self._rare(cold.excitation_message(excitation, levels, ramps))
+
+    def event(self, event: Event) -> None:
+        """Something that happened."""
+        self._rare(cold.event_message(event))
+
+    def configuration(self, run: Mapping[str, Any], facts: Mapping[str, Any]) -> None:
+        """The run's configuration and `RecordingBuilder.facts`; may be called again, the last call counts."""
+        self._rare(cold.configuration_message(run, facts))
+
+    def result(self, result: Mapping[str, Any]) -> None:
+        """The result document; may be called again, the last call counts."""
+        self._rare(cold.result_message(result))
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Writes what waits and finishes the file; idempotent. Raises `LogError` if the log isn't whole."""
+        self._backlog.end()
+        self._backlog.wake.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise LogError(f"the disk has not taken the log within {timeout_s:g} s", where=str(self.path),
+                           next_step="What is there can be replayed")
+        if self.failure is not None:
+            raise self.failure from self._pump.failure
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.close()
+        except LogError:
+            if error is None:                  # an exception under way is the first cause and stays it
+                raise
+
+    def _rare(self, message: cold.Cold) -> None:
+        if not self._backlog.put_rare(message):
+            self._refused()
+
+    def _refused(self) -> None:
+        failure = self.failure
+        if failure is not None and not self._raised:
+            self._raised = True
+            raise failure from self._pump.failure
+
+    def _error(self, what: str, cause: Exception) -> LogError:
+        reason = cause.strerror if isinstance(cause, OSError) and cause.strerror else f"{type(cause).__name__}: {cause}"
+        full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
+        return LogError(f"{what}: {reason}", where=str(self.path),
+                        next_step="Free some space, or log to another disk" if full else "Choose another file")

@@ -1,0 +1,186 @@
+"""The front, the queue, the thread, and disks that are slow, full or gone."""
+
+import errno
+import io
+import random
+import threading
+import time
+
+import pytest
+from log_runs import RESULT, fill, frames, make_run, sample
+from mcap.reader import make_reader
+
+from tdhil.record.builder import RecordingBuilder
+from tdhil.record.errors import LogError
+from tdhil.record.event import Event
+from tdhil.record.reader import read_run, read_samples
+from tdhil.record.writer import RunWriter
+
+
+class Disk(io.FileIO):
+    """A file that stands still while its gate is shut, and is full after so many bytes."""
+
+    def __init__(self, path, room=10**9):
+        super().__init__(path, "wb")
+        self.gate = threading.Event()
+        self.gate.set()
+        self.room = room
+
+    def write(self, data):
+        self.gate.wait()
+        part = bytes(data)[:self.room]
+        if not part:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.room -= len(part)
+        return super().write(part)
+
+
+def test_a_full_queue_makes_stepped_time_wait(tmp_path):
+    disk = Disk(tmp_path / "run.mcap")
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, queue_size=10, opener=lambda _: disk)
+    disk.gate.clear()
+    done = threading.Event()
+
+    def run():
+        rng = random.Random(1)
+        for cycle in range(3000):
+            writer.sample(sample(cycle, rng))
+        done.set()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert not done.wait(0.3)
+    disk.gate.set()
+    thread.join()
+    writer.close()
+    assert writer.dropped == 0
+    assert len(read_run(tmp_path / "run.mcap").recording.time_s) == 3000
+
+
+def test_a_full_queue_drops_in_real_time_and_says_so(tmp_path):
+    disk = Disk(tmp_path / "run.mcap")
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=False, queue_size=100, opener=lambda _: disk)
+    disk.gate.clear()
+    rng = random.Random(1)
+    for cycle in range(10_000):
+        writer.sample(sample(cycle, rng))
+    writer.event(Event(1.0, "warning", "rare records keep a place"))
+    dropped = writer.dropped
+    assert dropped >= 1000
+    disk.gate.set()
+    writer.close()
+    writer.close()
+    run = read_run(tmp_path / "run.mcap")
+    assert run.complete
+    assert len(run.recording.time_s) == 10_000 - dropped
+    assert sum(int(event.text.split()[0]) for event in run.events if event.kind == "dropped") == dropped
+    assert "warning" in [event.kind for event in run.events]
+
+
+def test_a_full_disk_is_said_once_and_the_rest_is_whole(tmp_path):
+    path, rng = tmp_path / "run.mcap", random.Random(1)
+    disk = Disk(path, room=60_000)
+    writer = RunWriter(path, epoch_ns=0, block=True, opener=lambda _: disk)
+    raised = []
+    for cycle in range(5000):
+        try:
+            for frame in frames(cycle, rng):
+                writer.frame(frame)
+            writer.sample(sample(cycle, rng))
+        except LogError as error:
+            raised.append(error)
+    with pytest.raises(LogError) as at_close:
+        writer.close()
+    assert len(raised) <= 1
+    for error in (*raised, at_close.value):
+        assert str(error).startswith(f"{path}: the log can't be written any more: No space left on device. Free")
+    run = read_run(path)
+    assert 0 < len(run.recording.time_s) < 5000
+    assert path.stat().st_size <= 60_000
+
+
+def test_a_full_disk_while_closing_leaves_the_samples(tmp_path):
+    path = tmp_path / "run.mcap"
+    make_run(tmp_path / "whole.mcap", 500)
+    disk = Disk(path, room=(tmp_path / "whole.mcap").stat().st_size - 10)
+    with pytest.raises(LogError), RunWriter(path, epoch_ns=0, block=True, opener=lambda _: disk) as writer:
+        fill(writer, RecordingBuilder(), 500)
+    run = read_run(path)
+    assert (len(run.recording.time_s), run.complete, repr(run.result)) == (500, False, repr(RESULT))
+
+
+def test_the_first_error_stays_the_first(tmp_path):
+    disk = Disk(tmp_path / "run.mcap", room=1000)
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk)
+    with pytest.raises(KeyError), writer:
+        writer.sample(sample(0, random.Random(1)))
+        raise KeyError
+
+
+def test_a_record_that_cannot_be_laid_out_ends_the_log_with_its_reason(tmp_path):
+    path, rng = tmp_path / "run.mcap", random.Random(1)
+    writer = RunWriter(path, epoch_ns=0, block=True)
+    writer.sample(sample(0, rng))
+    writer.sample(sample(1, rng)._replace(status=-1))
+    with pytest.raises(LogError, match="can't be written any more: error"):
+        writer.close()
+    with path.open("rb") as file:
+        assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 1
+
+
+def test_little_space_at_the_start_is_refused(tmp_path):
+    with pytest.raises(LogError, match=r"MB free for the log, 1000000000000 MB wanted. Free some space"):
+        RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, min_free_bytes=10**18)
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_paths_that_cannot_be_written(tmp_path):
+    for path in (tmp_path / "none" / "run.mcap", tmp_path):
+        with pytest.raises(LogError, match="can't be opened"):
+            RunWriter(path, epoch_ns=0, block=True)
+    (tmp_path / "old.mcap").write_bytes(b"old")
+    with pytest.raises(LogError, match="File exists"):
+        RunWriter(tmp_path / "old.mcap", epoch_ns=0, block=True, overwrite=False)
+
+
+def test_what_is_no_json_is_refused_where_it_is_handed_in(tmp_path):
+    with RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True) as writer:
+        with pytest.raises(LogError, match="JSON"):
+            writer.result({"a": object()})
+        with pytest.raises(LogError, match="too long"):
+            writer.result({"a": "x" * 5_000_000})
+    assert read_run(tmp_path / "run.mcap").complete
+
+
+def test_after_close_nothing_is_taken_and_nothing_raised(tmp_path):
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True)
+    writer.close()
+    writer.sample(sample(0, random.Random(1)))
+    writer.event(Event(0.0, "late", ""))
+    writer.close()
+    assert (writer.dropped, writer.failure) == (0, None)
+    assert list(read_samples(tmp_path / "run.mcap")) == []
+
+
+def test_close_does_not_wait_for_ever(tmp_path):
+    disk = Disk(tmp_path / "run.mcap")
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk)
+    disk.gate.clear()
+    writer.sample(sample(0, random.Random(1)))
+    with pytest.raises(LogError, match=r"has not taken the log within 0\.1 s"):
+        writer.close(timeout_s=0.1)
+    disk.gate.set()
+    writer.close()
+
+
+def test_a_quiet_run_reaches_the_disk_too(tmp_path):
+    """Nothing but one frame: no sample closes its chunk, so the wall clock does."""
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, epoch_ns=0, block=False)
+    before = path.stat().st_size
+    writer.frame(frames(0, random.Random(1))[0])
+    end = time.monotonic() + 5
+    while path.stat().st_size == before and time.monotonic() < end:
+        time.sleep(0.02)
+    assert path.stat().st_size > before
+    writer.close()
