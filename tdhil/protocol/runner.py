@@ -6,7 +6,7 @@ The first cause is kept: what goes wrong while stopping is reported beside it, n
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -30,6 +30,9 @@ from tdhil.record.run_log import RunLog
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
+TOLERATED_LOSS = 0.01
+"""A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
+
 Idle = Callable[[], None]
 """One cycle of nothing, which keeps the drive's watchdog fed while somebody makes up his mind."""
 
@@ -46,6 +49,8 @@ class Display(Protocol):
     def planned(self, plan: Plan) -> None: ...
 
     def stage_ended(self, stage: Stage) -> None: ...
+
+    def stopped(self, confirmed: bool) -> None: ...
 
 
 Confirm = Callable[["Task", Preflight, Idle], None]
@@ -113,6 +118,8 @@ class Runner:
         finally:
             if self._stop is not None:
                 report = self._stop.run()
+                with suppress(Exception):
+                    self._display.stopped(report.confirmed)
             try:
                 self._drive.close()
             except Exception as error:
@@ -253,16 +260,18 @@ class Runner:
     @contextmanager
     def _stage(self, name: str, expected_s: float) -> Iterator[None]:
         start_s = self._drive.clock.now_s()
-        missed = self._drive.counters.missed
+        before = self._drive.counters
         self._display.stage_started(name, expected_s)
         try:
             yield
         except BaseException as error:
             self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "aborted", _short(error)))
             raise
-        lost = self._drive.counters.missed - missed
-        detail = f"{lost} cycles without feedback" if lost else ""
-        self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "degraded" if lost else "ok", detail))
+        after = self._drive.counters
+        lost, cycles = after.missed - before.missed, after.cycles - before.cycles
+        detail = f"{lost} of {cycles} cycles without feedback" if lost else ""
+        outcome = "degraded" if lost > TOLERATED_LOSS * cycles else "ok"
+        self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), outcome, detail))
 
     def _skip(self, name: str, bench: Bench, why: str) -> None:
         self._display.stage_started(name, 0.0)

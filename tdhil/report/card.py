@@ -51,17 +51,32 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
         if (part := document[key]) is not None:
             rows.add_row(title, with_interval(part["value"], part["low"], part["high"], unit))
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
-        text = f"{paper['inertia_kg_m2']:.1f} kg·m²  (r² {paper['r2']:.3f}"
-        raw = paper["raw_rate"]["inertia_kg_m2"]
-        rows.add_row("the paper's method", text + (f"; at the raw rate {raw:.1f})" if raw is not None else ")"))
+        rows.add_row("the paper's method", _paper_text(paper, inertia))
     rows.add_row("model", document["model"])
-    body: list[RenderableType] = [rows, Text(), Text(document["reason"])]
+    body: list[RenderableType] = [rows, Text(), Text(_sentence(document["reason"]))]
     if document["advice"]:
-        body.append(Text(document["advice"], style="italic"))
+        body.append(Text(_sentence(document["advice"]), style="italic"))
     body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
     title = "moment of inertia at the motor shaft" + (f" · {SIMULATED}" if document["simulated"] else "")
     return Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue")
+
+
+def _paper_text(paper: Mapping[str, Any], inertia: Mapping[str, Any] | None) -> str:
+    """The paper's own number, how far it is from ours, and what it becomes at the raw rate."""
+    parts = []
+    if inertia is not None:
+        parts.append(f"{100.0 * (paper['inertia_kg_m2'] / inertia['value'] - 1.0):+.1f} %")
+    if paper["r2"] is not None:
+        parts.append(f"r² {paper['r2']:.3f}")
+    raw = paper["raw_rate"]["inertia_kg_m2"]
+    if raw is not None:
+        parts.append(f"at the raw rate {raw:.4g}")
+    return f"{paper['inertia_kg_m2']:.5g} kg·m²  ({'; '.join(parts)})"
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
 def print_card(document: Mapping[str, Any], console: Console) -> None:

@@ -62,6 +62,7 @@ class LiveDisplay:
         self._last: tuple[Command, Sample] | None = None
         self._next_s = 0.0
         self._live: Live | None = None
+        self._end = ""
 
     def __enter__(self) -> LiveDisplay:
         return self
@@ -123,6 +124,14 @@ class LiveDisplay:
         elif self._live is not None:
             self._live.update(self._picture(), refresh=True)
 
+    def stopped(self, confirmed: bool) -> None:
+        """The stop sequence has ended."""
+        self._end = "shaft at rest, drive disabled" if confirmed else "STOP NOT CONFIRMED"
+        if self._live is not None:
+            self._live.update(self._picture(), refresh=True)
+        elif not self._console.is_terminal:
+            self._console.print(f"{self._prefix()}{self._end}", highlight=False)
+
     def _prefix(self) -> str:
         return f"{SIMULATED} " if self._simulated else ""
 
@@ -150,7 +159,7 @@ class LiveDisplay:
         parts: list[RenderableType] = [table]
         if self._last is not None:
             command, sample = self._last
-            text = (
+            text = self._end or (
                 f"{sample.speed_rad_s:7.3f} rad/s  {sample.torque_nm:8.1f} N·m  {sample.state.value}, "
                 f"{command.mode.value} mode  {minutes(left_s)} left"
             )
