@@ -1,0 +1,252 @@
+"""The CiA 402 device profile over one inverter: states, modes, option codes, statusword. Knows no bus.
+
+Every way to a stop goes through speed control, from torque mode too: quick stop (605Ah), halt (605Dh), shutdown and
+disable operation with ramp (605Bh, 605Ch), fault reaction (605Eh). Ramp by option code: 1 slow-down ramp 6084h,
+2 quick-stop ramp 6085h, 3 torque limit; 5, 6, 7 are 1, 2, 3 and then stay in quick stop active.
+
+A quick stop that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps
+coming: another command has to be seen first.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from math import inf
+
+from sim_bus import cia402_states as sm
+from sim_bus.cia402_states import Command, State
+from sim_bus.inverter import Inverter
+
+
+class Mode(IntEnum):
+    """Modes of operation, 6060h."""
+
+    PROFILE_VELOCITY = 3
+    PROFILE_TORQUE = 4
+    CYCLIC_VELOCITY = 9
+    CYCLIC_TORQUE = 10
+
+
+@dataclass(slots=True)
+class Settings:
+    """Option codes and rates in SI units; the object dictionary writes them."""
+
+    quick_stop_option: int = 2           # 605Ah
+    shutdown_option: int = 0             # 605Bh
+    disable_option: int = 1              # 605Ch
+    halt_option: int = 1                 # 605Dh
+    fault_option: int = 2                # 605Eh
+    connection_option: int = 1           # 6007h
+    accel_rad_s2: float = 1.0            # 6083h
+    decel_rad_s2: float = 1.0            # 6084h
+    quick_stop_rad_s2: float = 3.0       # 6085h
+    torque_slope_nm_s: float = 100.0     # 6087h
+    window_rad_s: float = 0.1            # 606Dh
+    window_s: float = 0.0                # 606Eh
+    standstill_rad_s: float = 0.05       # 606Fh
+    standstill_s: float = 0.1            # 6070h
+
+
+def _ignore(_text: str) -> None:
+    pass
+
+
+class Application:
+    """The drive between its objects and its inverter; `step` moves it, everything else only says what is wanted."""
+
+    def __init__(self, inverter: Inverter) -> None:
+        self.inverter = inverter
+        self.settings = Settings()
+        self.state = State.SWITCH_ON_DISABLED
+        self.mode = Mode.PROFILE_VELOCITY
+        self.controlword = 0
+        self.target_speed_rad_s = 0.0
+        self.target_torque_nm = 0.0
+        self.warning = False
+        self.on_event: Callable[[str], None] = _ignore
+        self.on_fault_reset: Callable[[], None] = lambda: None
+        self._after_stop: State | None = None       # where a stop under way ends
+        self._stop_option = 0                       # and the ramp it uses
+        self._own_stop = False                      # quick stop begun by the drive itself
+        self._weighed: tuple[int, State] | None = None
+        self._slow_for_s = 0.0
+        self._in_window_s = 0.0
+
+    # -- what is asked of it ------------------------------------------------------------------------------
+
+    def write_controlword(self, word: int) -> None:
+        """6040h: a state command, fault reset on the rising edge of bit 7, halt in bit 8."""
+        if self._weighed == (word, self.state):
+            return
+        before, self.controlword = self.controlword, word
+        if self.state is State.FAULT and sm.fault_reset_edge(before, word):
+            self._enter(State.SWITCH_ON_DISABLED)
+            self.on_fault_reset()
+        command = sm.decode(word)
+        if self._own_stop and command is not Command.ENABLE:
+            self._own_stop = False
+        while self._obey(command):
+            pass
+        self._weighed = (word, self.state)
+
+    def set_mode(self, code: int) -> bool:
+        """6060h; False where the mode is not supported. 0 means no change (CiA 402-2)."""
+        if code in {0, self.mode}:
+            return True
+        try:
+            self.mode = Mode(code)
+        except ValueError:
+            return False
+        self.on_event(f"mode {self.mode.value}")
+        self._in_window_s = 0.0
+        return True
+
+    def fault(self) -> None:
+        """Transition 13: fault reaction after 605Eh, then fault."""
+        if self.state in {State.FAULT, State.FAULT_REACTION}:
+            return
+        turning = self.energised
+        self._enter(State.FAULT_REACTION)
+        if turning and self.settings.fault_option:
+            self._stop_then(State.FAULT, self.settings.fault_option)
+        else:
+            self._enter(State.FAULT)
+
+    def abort_connection(self) -> None:
+        """6007h: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop. The fault itself (1) is the caller's to raise."""
+        option = self.settings.connection_option
+        if option == 1:
+            self.fault()
+        elif option == 2:
+            self._obey(Command.DISABLE_VOLTAGE)
+        elif option == 3 and self._obey(Command.QUICK_STOP):
+            self._own_stop = self.state is State.QUICK_STOP
+        self._weighed = None
+
+    def power_off(self) -> None:
+        """Reset of the device: no torque, switch on disabled, setpoints forgotten."""
+        self.controlword = 0
+        self.mode = Mode.PROFILE_VELOCITY
+        self.target_speed_rad_s = self.target_torque_nm = 0.0
+        self._own_stop = False
+        self._weighed = None
+        self._enter(State.SWITCH_ON_DISABLED)
+        self.inverter.control.off()
+
+    # -- what it says ------------------------------------------------------------------------------------
+
+    @property
+    def standstill(self) -> bool:
+        """Slower than 606Fh for 6070h."""
+        return self._slow_for_s >= self.settings.standstill_s
+
+    @property
+    def energised(self) -> bool:
+        """Torque may flow on the host's behalf."""
+        return self.state in {State.ENABLED, State.QUICK_STOP}
+
+    @property
+    def halted(self) -> bool:
+        """Halt is asked for in operation enabled."""
+        return self.state is State.ENABLED and bool(self.controlword & sm.HALT)
+
+    def statusword(self) -> int:
+        """6041h."""
+        word = sm.STATUS[self.state] | sm.VOLTAGE_ENABLED | sm.REMOTE
+        if self.warning:
+            word |= sm.WARNING
+        control = self.inverter.control
+        if control.limited:
+            word |= sm.INTERNAL_LIMIT
+        stopping = self.state is State.QUICK_STOP or self.halted or self._after_stop is not None
+        if stopping:
+            reached = self.standstill
+        elif self.state is not State.ENABLED:
+            reached = False
+        elif self.mode is Mode.PROFILE_VELOCITY:
+            reached = self._in_window_s > self.settings.window_s
+        else:
+            reached = self.mode is Mode.PROFILE_TORQUE and control.ramp_done
+        if reached:
+            word |= sm.TARGET_REACHED
+        if self.mode is Mode.PROFILE_VELOCITY:
+            specific = self.standstill                                        # speed is zero
+        else:
+            cyclic = self.mode in {Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE}
+            specific = cyclic and self.state is State.ENABLED and not stopping  # follows the setpoint
+        return word | sm.MODE_SPECIFIC if specific else word
+
+    # -- time --------------------------------------------------------------------------------------------
+
+    def step(self, dt_s: float) -> None:
+        """One step of at most the control period, with the setpoints as `regulate` left them."""
+        self.inverter.step(dt_s)
+        settings = self.settings
+        speed = self.inverter.control.filtered_rad_s
+        self._slow_for_s = self._slow_for_s + dt_s if abs(speed) < settings.standstill_rad_s else 0.0
+        near = abs(speed - self.target_speed_rad_s) < settings.window_rad_s
+        self._in_window_s = self._in_window_s + dt_s if near else 0.0
+        if self._after_stop is not None and self.standstill and self.inverter.control.at_rest_reference:
+            self._enter(self._after_stop)
+            self.regulate()
+
+    def regulate(self) -> None:
+        """Hands state, mode and setpoints to the control loops; called once before the steps of a cycle."""
+        control, settings = self.inverter.control, self.settings
+        if self._after_stop is not None or self.state is State.QUICK_STOP:
+            control.stop(self._ramp(self._stop_option))
+        elif self.state is not State.ENABLED:
+            control.off()
+        elif self.controlword & sm.HALT:
+            control.stop(self._ramp(settings.halt_option))
+        elif self.mode is Mode.CYCLIC_TORQUE:
+            control.torque(self.target_torque_nm)
+        elif self.mode is Mode.CYCLIC_VELOCITY:
+            control.speed(self.target_speed_rad_s)
+        elif self.mode is Mode.PROFILE_TORQUE:
+            control.torque(self.target_torque_nm, settings.torque_slope_nm_s)
+        else:
+            control.speed(self.target_speed_rad_s, settings.accel_rad_s2, settings.decel_rad_s2)
+
+    # -- transitions -------------------------------------------------------------------------------------
+
+    def _obey(self, command: Command) -> bool:
+        """Carries out one transition on command; True where the state changed, so that the next may follow."""
+        if self._own_stop and command is Command.ENABLE:
+            return False
+        target = sm.next_state(self.state, command, self.settings.quick_stop_option)
+        if target is self.state:
+            if command is Command.ENABLE and self.state is State.ENABLED:
+                self._after_stop = None                  # taken back while slowing down
+            return False
+        if self.state is State.ENABLED and target in {State.READY, State.SWITCHED_ON}:
+            option = self.settings.shutdown_option if target is State.READY else self.settings.disable_option
+            if option:
+                self._stop_then(target, option)
+                return False
+        self._enter(target)
+        if target is State.QUICK_STOP:
+            option = self.settings.quick_stop_option
+            if option == 0:
+                self._enter(State.SWITCH_ON_DISABLED)
+            else:
+                self._stop_then(None if option >= 5 else State.SWITCH_ON_DISABLED, (option - 1) % 4 + 1)
+        return True
+
+    def _stop_then(self, state: State | None, option: int) -> None:
+        self._after_stop = state
+        self._stop_option = option
+
+    def _ramp(self, option: int) -> float:
+        """The deceleration of an option code (1, 2, 3), rad/s²."""
+        if option == 1:
+            return self.settings.decel_rad_s2
+        return self.settings.quick_stop_rad_s2 if option == 2 else inf
+
+    def _enter(self, state: State) -> None:
+        self._after_stop = None
+        if state is not self.state:
+            self.state = state
+            self._own_stop = self._own_stop and state is State.QUICK_STOP
+            self._in_window_s = 0.0
+            self.on_event("")

@@ -1,0 +1,56 @@
+"""Frames out: one sender that survives a dying bus, a cheap message, canopen's network on top of it."""
+
+from collections.abc import Callable
+
+import can
+import canopen
+
+BUS_ERRORS = (can.CanError, OSError, ValueError)
+"""What python-can's buses raise when they die; a closed socket gives ValueError in `select`."""
+
+
+class Frame(can.Message):
+    """A data frame with an 11-bit identifier, cheap to copy: python-can's virtual bus deep-copies what it sends."""
+
+    __slots__ = ()
+
+    def __init__(self, can_id: int, data: bytes) -> None:
+        super().__init__(arbitration_id=can_id, data=bytearray(data), is_extended_id=False, check=False)
+
+    def __deepcopy__(self, memo: dict[int, object] | None) -> can.Message:
+        return can.Message(arbitration_id=self.arbitration_id, data=bytearray(self.data), is_extended_id=False)
+
+
+class Sender:
+    """Sends; after an error frames are dropped until `revive`, and ``on_lost`` has been told once."""
+
+    def __init__(self, bus: can.BusABC, on_lost: Callable[[BaseException], None]) -> None:
+        self._bus_send = bus.send
+        self._on_lost = on_lost
+        self.lost = False
+
+    def revive(self) -> None:
+        """The bus has been heard again."""
+        self.lost = False
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Puts one data frame on the bus."""
+        if self.lost:
+            return
+        try:
+            self._bus_send(Frame(can_id, data))
+        except BUS_ERRORS as error:
+            self.lost = True
+            self._on_lost(error)
+
+
+class PassiveNetwork(canopen.Network):  # type: ignore[misc, unused-ignore]
+    """A network that is never connected: it is fed by `notify` and sends through our sender, in one thread."""
+
+    def __init__(self, sender: Sender) -> None:
+        super().__init__()
+        self._sender = sender
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """What canopen's servers answer; remote frames are never asked for."""
+        self._sender.send(can_id, bytes(data))

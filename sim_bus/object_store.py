@@ -1,0 +1,131 @@
+"""The object dictionary as it lives in the drive: values, live objects, write hooks, limits, abort codes.
+
+Keys are ``index << 8 | subindex``. A *live* object is read from the drive at the moment of asking; a *hook*
+sees a value before it is stored and may refuse it with an SDO abort. This replaces the data store and the callbacks
+of canopen's LocalNode, of which the SDO server is kept: its callbacks start a heartbeat thread on 1017h.
+"""
+
+from collections.abc import Callable
+
+import canopen
+from canopen import objectdictionary
+from canopen.objectdictionary import ODVariable
+from canopen.sdo import SdoAbortedError
+
+ABORT_READ_WRITE_ONLY = 0x06010001
+ABORT_WRITE_READ_ONLY = 0x06010002
+ABORT_NO_OBJECT = 0x06020000
+ABORT_NOT_MAPPABLE = 0x06040041
+ABORT_PDO_TOO_LONG = 0x06040042
+ABORT_LENGTH = 0x06070010
+ABORT_NO_SUBINDEX = 0x06090011
+ABORT_VALUE = 0x06090030
+ABORT_TOO_HIGH = 0x06090031
+ABORT_TOO_LOW = 0x06090032
+ABORT_STATE = 0x08000022
+ABORT_NO_DATA = 0x08000024
+
+Value = int | str
+
+
+def key_of(index: int, subindex: int = 0) -> int:
+    """The key of an object."""
+    return index << 8 | subindex
+
+
+class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
+    """canopen's local node with our own storage behind its SDO server, and without its NMT slave."""
+
+    def __init__(self, node_id: int, eds: str) -> None:
+        super().__init__(node_id, eds)
+        self.live: dict[int, Callable[[], int]] = {}
+        self.hooks: dict[int, Callable[[int], None]] = {}
+        self.values: dict[int, Value] = {}
+        self._factory: dict[int, Value] = {}
+        for entry in self.object_dictionary.values():
+            variables = [entry] if isinstance(entry, ODVariable) else list(entry.values())
+            for variable in variables:
+                if variable.default is not None:
+                    self._factory[key_of(variable.index, variable.subindex)] = variable.default
+
+    def associate_network(self, network: canopen.Network) -> None:
+        """Subscribes the SDO server only: NMT and EMCY are ours."""
+        self.network = network
+        self.sdo.network = network
+        network.subscribe(self.sdo.rx_cobid, self.sdo.on_request)
+
+    def set_default(self, index: int, subindex: int, value: Value) -> None:
+        """Replaces what the EDS gives as default."""
+        self._factory[key_of(index, subindex)] = value
+
+    def default(self, key: int) -> int:
+        """A numeric object's default."""
+        value = self._factory.get(key, 0)
+        return value if isinstance(value, int) else 0
+
+    def restore(self, first: int = 0x1000, last: int = 0x9FFF) -> None:
+        """Gives stored objects their defaults back, through their hooks; live ones are their owners' to reset."""
+        for key, value in sorted(self._factory.items()):
+            if first <= key >> 8 <= last and key not in self.live:
+                hook = self.hooks.get(key)
+                if hook is not None and isinstance(value, int):
+                    hook(value)
+                self.values[key] = value
+
+    def number(self, key: int) -> int:
+        """The present value of a numeric object."""
+        live = self.live.get(key)
+        if live is not None:
+            return live()
+        value = self.values[key]
+        if not isinstance(value, int):
+            raise TypeError(f"object {key >> 8:04X}h:{key & 0xFF} is no number")
+        return value
+
+    def variable(self, index: int, subindex: int) -> ODVariable:
+        """The object's description; raises the right SDO abort where there is none."""
+        found = self.object_dictionary.get(index)
+        if found is None:
+            raise SdoAbortedError(ABORT_NO_OBJECT)
+        if isinstance(found, ODVariable):
+            if subindex:
+                raise SdoAbortedError(ABORT_NO_SUBINDEX)
+            return found
+        if subindex not in found.subindices:
+            raise SdoAbortedError(ABORT_NO_SUBINDEX)
+        return found.subindices[subindex]
+
+    def write(self, key: int, value: int) -> None:
+        """Checks a number against the limits and the hook, then stores it; an SDO abort says what is wrong."""
+        variable = self.variable(key >> 8, key & 0xFF)
+        if variable.min is not None and value < variable.min:
+            raise SdoAbortedError(ABORT_TOO_LOW)
+        if variable.max is not None and value > variable.max:
+            raise SdoAbortedError(ABORT_TOO_HIGH)
+        hook = self.hooks.get(key)
+        if hook is not None:
+            hook(value)
+        self.values[key] = value
+
+    def get_data(self, index: int, subindex: int, check_readable: bool = False) -> bytes:
+        """An SDO upload."""
+        variable = self.variable(index, subindex)
+        if check_readable and not variable.readable:
+            raise SdoAbortedError(ABORT_READ_WRITE_ONLY)
+        key = key_of(index, subindex)
+        if key not in self.live and key not in self.values:
+            raise SdoAbortedError(ABORT_NO_DATA)
+        value: Value = self.live[key]() if key in self.live else self.values[key]
+        return bytes(variable.encode_raw(value))
+
+    def set_data(self, index: int, subindex: int, data: bytes, check_writable: bool = False) -> None:
+        """An SDO download."""
+        variable = self.variable(index, subindex)
+        if check_writable and not variable.writable:
+            raise SdoAbortedError(ABORT_WRITE_READ_ONLY)
+        if variable.data_type not in objectdictionary.INTEGER_TYPES or 8 * len(data) != len(variable):
+            raise SdoAbortedError(ABORT_LENGTH)
+        value = variable.decode_raw(bytes(data))
+        if not isinstance(value, int):
+            raise SdoAbortedError(ABORT_LENGTH)
+        self.write(key_of(index, subindex), value)

@@ -1,0 +1,74 @@
+"""Everything that can be set about the simulated rig; ``plant.yaml`` may replace any of it.
+
+The defaults are a field-like rig: they reproduce the paper's four field slopes with one inertia.
+A noise, lag or quantum of 0 switches that effect off.
+"""
+
+from pathlib import Path
+
+from pydantic import Field
+
+from sim_bus.plant import Params as PlantParams
+from sim_bus.validated import NonNegative, Positive, Validated
+
+
+class DriveParams(Validated):
+    """The inverter's own ratings and loops."""
+
+    rated_torque_nm: Positive = 1000.0
+    rated_current_a: Positive = 200.0
+    torque_limit_nm: Positive = 400.0
+    speed_limit_rpm: Positive = 200.0
+    speed_gain_nm_s_rad: NonNegative = 300.0
+    speed_integral_gain_nm_rad: NonNegative = 300.0
+    speed_filter_s: NonNegative = 0.02
+    torque_lag_s: NonNegative = 0.01
+    control_period_s: float = Field(default=0.002, gt=0.0, le=0.01)
+    """The longest step of control and plant."""
+
+
+class ReportingParams(Validated):
+    """What happens to speed and torque between the drive's inside and its bus."""
+
+    speed_lag_s: NonNegative = 0.40
+    torque_lag_s: NonNegative = 0.15
+    speed_noise_rad_s: NonNegative = 0.003
+    torque_noise_nm: NonNegative = 2.0
+    speed_quantum_rpm: NonNegative = 0.1
+    torque_quantum_permille: NonNegative = 1.0
+    """Of rated torque."""
+
+
+class NoiseParams(Validated):
+    """Standard deviations of what disturbs; white ones as they stand in a plant step of 2 ms."""
+
+    speed_sensor_rad_s: NonNegative = 0.02
+    torque_nm: NonNegative = 10.0
+    load_nm: NonNegative = 3.0
+    load_correlation_s: Positive = 0.5
+
+
+class RigParams(Validated):
+    """The simulated rig."""
+
+    plant: PlantParams = PlantParams()
+    drive: DriveParams = DriveParams()
+    reporting: ReportingParams = ReportingParams()
+    noise: NoiseParams = NoiseParams()
+
+
+QUIET = NoiseParams(speed_sensor_rad_s=0.0, torque_nm=0.0, load_nm=0.0)
+"""No disturbance at all."""
+
+FAITHFUL = ReportingParams(
+    speed_lag_s=0.0, torque_lag_s=0.0, speed_noise_rad_s=0.0, torque_noise_nm=0.0,
+    speed_quantum_rpm=0.0, torque_quantum_permille=0.0,
+)
+"""Reports the truth."""
+
+
+def load_rig(path: Path) -> RigParams:
+    """Reads ``plant.yaml``; raises `profiles.errors.DataFileError` with every problem and its line."""
+    from profiles.strict_yaml import load_model
+
+    return load_model(path, RigParams)

@@ -1,0 +1,66 @@
+"""The shaft trace: what the true shaft did, for tests and for whoever wants to see behind the reported values.
+
+::
+
+    time_s,speed_rad_s,torque_nm,state,event
+    0.010000,0.00314,1.25,operation enabled,
+    0.012000,0.0041,1.3,quick stop active,host silent: running on in own time
+
+Plant time; a row per 10 ms, one more per change of state and per event. Flushed with every event and at least
+each 0.25 s of wall time, so that a reader sees a stop while it happens.
+"""
+
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
+ROW_PERIOD_US = 10_000
+_FLUSH_S = 0.25
+
+
+class Trace:
+    """Writes the file; without a path nothing happens."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file = path.open("w", encoding="utf-8") if path is not None else None
+        self._flushed_s = time.monotonic()
+        if self._file is not None:
+            self._file.write(HEADER)
+            self._file.flush()
+
+    @property
+    def active(self) -> bool:
+        """There is a file."""
+        return self._file is not None
+
+    def row(self, time_s: float, speed_rad_s: float, torque_nm: float, state: str, event: str = "") -> None:
+        """One row; an event is flushed at once."""
+        if self._file is None:
+            return
+        text = event.replace(",", ";").replace("\n", " ")
+        self._file.write(f"{time_s:.6f},{speed_rad_s:.7g},{torque_nm:.6g},{state},{text}\n")
+        self.flush(now=bool(event))
+
+    def flush(self, *, now: bool = False) -> None:
+        """Flushes if it is time to, or ``now``."""
+        if self._file is None:
+            return
+        wall_s = time.monotonic()
+        if now or wall_s - self._flushed_s >= _FLUSH_S:
+            self._file.flush()
+            self._flushed_s = wall_s
+
+    def close(self) -> None:
+        """Closes the file; safe to repeat."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 where: TracebackType | None) -> None:
+        self.close()
