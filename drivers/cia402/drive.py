@@ -53,7 +53,7 @@ from drivers.drive import (
     Preflight,
     Sample,
 )
-from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
 from profiles.schema import CanopenProfile
 
@@ -164,8 +164,7 @@ class Cia402Drive:
         self._modes = {code: mode for mode, code in self._codes.items()}
         self._units, rated_nm = checks.find_units(table, objects, self._profile, self._rated_torque_nm)
         checks.set_limits(table, objects, self._profile, limits, rated_nm)
-        for index, bits in ((0x6071, 16), (0x60FF, 32)):
-            objects.write(index, 0, 0, bits)
+        checks.clear_targets(table, objects)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
         with_demand = arming.map_pdos(table, objects, self._node, self._profile)
@@ -230,6 +229,8 @@ class Cia402Drive:
         Raises CommunicationLost (bus, heartbeat, foreign NMT command, a loop that was frozen), DriveFault (EMCY,
         restart) and CommandRejected; each trouble of the drive once, so that a stop can go on exchanging.
         """
+        if command.mode not in self._codes:
+            raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
         speed_raw = encode_speed(command.speed_rad_s, self._units)
         torque_raw = encode_torque(command.torque_nm, self._units)
         self._wait_for_tick()

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     import can
 
 Handler = Callable[[bytes], None]
+LONGEST_DRAIN_S = 0.25
+"""Of wall time. A cycle must not be held up for ever by a bus on which something babbles."""
 
 
 class CanLink:
@@ -69,14 +71,21 @@ class CanLink:
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
         handler = self.handlers.get(identifier)
-        if handler is not None:
+        # A remote frame (another master's node guarding) carries no state; 29-bit identifiers are no CANopen of ours.
+        if handler is not None and not (message.is_remote_frame or message.is_extended_id):
             handler(data)
         return identifier, data
 
     def drain(self) -> None:
-        """Handle all that has arrived, without waiting."""
+        """Handle all that has arrived, without waiting. Raises CommunicationLost if there is no end of it."""
+        deadline_s = time.monotonic() + LONGEST_DRAIN_S
         while self.receive(0.0) is not None:
-            pass
+            if time.monotonic() > deadline_s:
+                raise CommunicationLost(
+                    "frames come faster than they can be taken",
+                    where=self.name,
+                    next_step="Something babbles on the bus: look with candump, check bit rate and termination",
+                )
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Handle frames until ``done()`` or until ``timeout_s`` of wall time has passed; whether it was done."""

@@ -79,3 +79,11 @@ def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
             where=name(pdo.mapping),
             next_step="Some drives fix their mapping: this one can't be driven with torque and speed of one instant",
         )
+    # Bits 11 to 30 are the drive's own (bit 30: no remote frames).
+    cob_id, sync_type = objects.read(pdo.communication, 1), objects.read(pdo.communication, 2)
+    if cob_id & (DISABLED | 0x7FF) != identifier or sync_type != pdo.sync_type:
+        raise PreflightRefused(
+            f"the PDO reads back with COB-ID {cob_id:08X}h and transmission type {sync_type}",
+            where=name(pdo.communication),
+            next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
+        )

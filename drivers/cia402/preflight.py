@@ -181,6 +181,17 @@ def set_limits(
         )
 
 
+def clear_targets(table: Table, objects: Objects) -> None:
+    """No setpoint of an earlier run may act when the drive is enabled."""
+
+    def work() -> tuple[str, bool]:
+        for index, bits in ((0x6071, 16), (0x60FF, 32)):
+            objects.write(index, 0, 0, bits)
+        return "0", True
+
+    table.attempt("targets", "0", "6071h, 60FFh", work)
+
+
 def _limit(
     table: Table,
     objects: Objects,

@@ -6,6 +6,7 @@ waiting is replaced: it pulls frames off the link instead of sleeping on a queue
 
 from __future__ import annotations
 
+import queue
 from typing import Any
 
 import canopen
@@ -26,6 +27,23 @@ class _LinkNetwork(canopen.Network):  # type: ignore[misc]
         self._link.send(can_id, bytes(data))
 
 
+_ANSWERS = {0: 1, 1: 3, 2: 2, 3: 0}
+"""Command specifier of the request → that of its response (CiA 301): segment and initiate, download and upload."""
+_INITIATE = (1, 2)
+_ABORT = 0x80
+
+
+def is_answer(request: bytes, response: bytes) -> bool:
+    """Does this frame answer that request? Another client's answers and late ones must not pass for it."""
+    if len(response) != 8:
+        return False
+    command = request[0] >> 5
+    same_object = response[1:4] == request[1:4]
+    if response[0] == _ABORT:
+        return same_object or command not in _INITIATE
+    return response[0] >> 5 == _ANSWERS.get(command) and (same_object or command not in _INITIATE)
+
+
 class _PumpingClient(SdoClient):  # type: ignore[misc]
     """Waits for a response by pulling frames off the link."""
 
@@ -36,10 +54,17 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         super().__init__(0x600 + node, 0x580 + node, canopen.ObjectDictionary())
         self.network = _LinkNetwork(link)
         self._link = link
+        self._asked = bytes(8)
         link.handlers[self.tx_cobid] = self._take
 
+    def send_request(self, request: bytes) -> None:
+        self._link.drain()  # what still lies on the bus answers an older request, whose time is over
+        self.responses: queue.Queue[bytes] = queue.Queue()
+        self._asked = bytes(request)
+        super().send_request(request)
+
     def _take(self, data: bytes) -> None:
-        if len(data) == 8:  # anything shorter is no SDO (CiA 301) and would only confuse the transfer
+        if is_answer(self._asked, data):
             self.responses.put(data)
 
     def read_response(self) -> Any:
@@ -79,9 +104,12 @@ class Objects:
             return None
 
     def write(self, index: int, subindex: int, value: int, bits: int) -> None:
-        signed = value < 0
         try:
-            self._client.download(index, subindex, value.to_bytes(bits // 8, "little", signed=signed))
+            data = value.to_bytes(bits // 8, "little", signed=value < 0)
+        except OverflowError as error:
+            raise ObjectRefused(f"{value} doesn't fit into {bits} bits", where=name(index, subindex)) from error
+        try:
+            self._client.download(index, subindex, data)
         except SdoAbortedError as error:
             raise ObjectRefused(
                 f"the drive did not take {value} for the object: {error}", where=name(index, subindex)
@@ -91,11 +119,12 @@ class Objects:
 
     def change(self, index: int, subindex: int, value: int, bits: int) -> int:
         """Write, remember what stood there before, and read back what stands there now."""
-        before = self.read(index, subindex)
+        signed = value < 0
+        before = self.read(index, subindex, signed=signed)
         if before != value:
             self._written.setdefault((index, subindex), (before, bits))
             self.write(index, subindex, value, bits)
-        return self.read(index, subindex)
+        return self.read(index, subindex, signed=signed)
 
     def restore(self) -> tuple[str, ...]:
         """Give every changed object its former value back, the last change first; what could not be given back."""

@@ -70,7 +70,9 @@ class Watch:
 
     def on_heartbeat(self, data: bytes) -> None:
         """700h + node: the NMT state, or 0 for boot-up."""
-        state = data[0] & 0x7F if data else -1
+        if not data:
+            return
+        state = data[0] & 0x7F
         self._heard_s = self._clock.now_s()
         if not self.expect_operational:
             return

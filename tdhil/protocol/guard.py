@@ -18,6 +18,9 @@ from drivers.errors import CommandRejected, CommunicationLost, DriveFault, Limit
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
 
+LONGEST_AGE_S = 0.25
+"""Feedback may be missing for this long at most; the drive goes on by itself meanwhile, at what it was last told."""
+
 
 class Guard:
     """Holds the machine's limits over one run. ``model`` and ``expected`` are set by the stages as they learn."""
@@ -38,7 +41,8 @@ class Guard:
         self._reverse_rad_s = max(5.0 * speed_resolution_rad_s, 0.02 * limits.speed_max_rad_s)
         # The reported torque is noisy and may overshoot; what was commanded is held exactly.
         self._torque_seen_nm = 1.25 * limits.torque_nm + 10.0 * torque_resolution_nm
-        self._stale_limit = max(3, math.ceil(0.05 / period_s))
+        # Half of what the drive's watchdog grants the host, and never on account of two lost frames.
+        self._stale_limit = max(3, math.ceil(min(LONGEST_AGE_S, 0.5 * limits.watchdog_s) / period_s))
         self._stale = 0
         self._started_s: float | None = None
         self.expected: PowerState | None = None
@@ -74,6 +78,12 @@ class Guard:
                 next_step="Look into the drive's fault list; STO, a fault or a second master may have done it",
             )
         speed = sample.speed_rad_s
+        if not (math.isfinite(speed) and math.isfinite(sample.torque_nm)):
+            raise DriveFault(
+                f"the feedback is not finite (speed {speed}, torque {sample.torque_nm})",
+                where=f"guard at {sample.time_s:.3f} s",
+                next_step="Do word order and scaling in the profile fit this drive?",
+            )
         if speed > self._limits.speed_max_rad_s or (
             self._limits.allow_reverse and speed < -self._limits.speed_max_rad_s
         ):
@@ -102,6 +112,11 @@ class Guard:
             )
         if command.mode is Mode.TORQUE and self.model is not None:
             self._check_prediction(self.model, command, speed, sample.time_s)
+
+    @staticmethod
+    def foresight_s(assumptions: ControlAssumptions) -> float:
+        """What a plan must keep free: the guard adds this times the acceleration to the speed."""
+        return (assumptions.reaction_s + assumptions.largest_speed_lag_s) / assumptions.smallest_inertia_share
 
     def predicted_speed(self, model: RigGuess, torque_nm: float, speed_rad_s: float) -> float:
         """Where the shaft may be, rad/s, before the host can act on what it now sees."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
 from drivers.drive import Command, Drive, Identity, Limits, Mode, Outcome, Preflight, ReportingFilters, Sample
@@ -120,6 +120,8 @@ class Runner:
                 report = self._stop.run()
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
+            with suppress(Exception):
+                self._log.configure(counters=asdict(self._drive.counters))
             try:
                 self._drive.close()
             except Exception as error:
@@ -224,7 +226,9 @@ class Runner:
             offsets_rad_s=offsets,
             periods=request.periods,
         )
-        room = excitation.MachineLimits(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm)
+        room = excitation.MachineLimits(
+            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
+        )
         last = bench.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
         keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
@@ -261,11 +265,14 @@ class Runner:
     def _stage(self, name: str, expected_s: float) -> Iterator[None]:
         start_s = self._drive.clock.now_s()
         before = self._drive.counters
-        self._display.stage_started(name, expected_s)
         try:
+            self._display.stage_started(name, expected_s)
             yield
         except BaseException as error:
-            self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "aborted", _short(error)))
+            try:
+                self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "aborted", _short(error)))
+            except Exception as also:  # the first cause stays the cause
+                error.add_note(f"and the end of the stage was not taken: {also}")
             raise
         after = self._drive.counters
         lost, cycles = after.missed - before.missed, after.cycles - before.cycles
@@ -279,8 +286,8 @@ class Runner:
 
     def _end_stage(self, stage: Stage) -> None:
         self._stages.append(stage)
-        self._display.stage_ended(stage)
         self._log.stage(stage)
+        self._display.stage_ended(stage)
 
     def _idle(self, bench: Bench) -> None:
         bench.cycle(Command(Mode.SPEED, 0.0, 0.0))

@@ -13,6 +13,7 @@ is what the report says.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.drive import Command, Mode, PowerState, Sample
@@ -23,8 +24,11 @@ from tdhil.protocol.settings import ControlAssumptions, MachineLimits
 AT_REST_SHARE = 0.005
 """Standstill is a speed below this share of the speed limit, or three quanta if that is more."""
 
-ENOUGH_SILENT_CYCLES = 25
-"""After so many failing exchanges in a row the drive can't be reached and its watchdog is what stops the shaft."""
+LONGEST_GAP_S = 0.2
+"""Standstill must have been watched without a longer gap in the feedback."""
+
+SILENT_S, SILENT_CYCLES = 1.0, 25
+"""After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
 
 _NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT, PowerState.NOT_READY)
 
@@ -58,6 +62,7 @@ class StopSequence:
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
         self._trouble: list[str] = []
         self._silent = 0
+        self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
         self._report: StopReport | None = None
 
     def run(self) -> StopReport:
@@ -76,20 +81,23 @@ class StopSequence:
                 sample = self._exchange(command)
                 if sample is not None and sample.mode is Mode.SPEED:
                     break
-        self._bench.drive.quick_stop()
+        asked = self._ask(self._bench.drive.quick_stop)
         # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
         slowest_s = 3.0 * self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2 + 2.0 * self._settle_s + 1.0
         quiet_since_s: float | None = None
+        heard_s = 0.0
         for _ in range(self._bench.cycles(slowest_s)):
+            asked = asked or self._ask(self._bench.drive.quick_stop)
             sample = self._exchange(command)
             if sample is None:
-                quiet_since_s = None
-                if self._silent >= ENOUGH_SILENT_CYCLES:
+                if self._silent >= self._enough_silent:
                     return None
                 continue
-            if not sample.fresh or abs(sample.speed_rad_s) > self._at_rest_rad_s:
+            # Single lost frames don't unsay what the others showed; a longer gap does.
+            unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
+            if abs(sample.speed_rad_s) > self._at_rest_rad_s:
                 quiet_since_s = None
-            elif quiet_since_s is None:
+            elif quiet_since_s is None or unheard_s > LONGEST_GAP_S:
                 quiet_since_s = sample.time_s
             elif sample.time_s - quiet_since_s >= self._settle_s and (sample.standstill or sample.state in _NO_TORQUE):
                 return sample.time_s
@@ -97,24 +105,37 @@ class StopSequence:
         return None
 
     def _disable(self) -> bool:
-        self._bench.drive.disable()
+        asked = self._ask(self._bench.drive.disable)
         command = Command(Mode.SPEED, 0.0, 0.0)
         for _ in range(self._bench.cycles(3.0)):
+            asked = asked or self._ask(self._bench.drive.disable)
             sample = self._exchange(command)
             if sample is not None and sample.fresh and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
-            if self._silent >= ENOUGH_SILENT_CYCLES:
+            if self._silent >= self._enough_silent:
                 break
         self._trouble.append("the drive did not confirm that it is disabled")
         return False
+
+    def _ask(self, request: Callable[[], None]) -> bool:
+        """Whether the drive took a request; one that fails is made again in the next cycle."""
+        try:
+            request()
+        except Exception as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return False
+        return True
+
+    def _note(self, error: Exception) -> None:
+        if len(self._trouble) < 20:
+            self._trouble.append(str(error))
 
     def _exchange(self, command: Command) -> Sample | None:
         try:
             sample = self._bench.stop_cycle(command)
         except Exception as error:  # whatever it is, the stop goes on
             self._silent += 1
-            if len(self._trouble) < 20:
-                self._trouble.append(str(error))
+            self._note(error)
             return None
         self._silent = 0 if sample.fresh else self._silent + 1
         return sample if sample.fresh else None

@@ -44,6 +44,7 @@ def result_document(
         "simulated": recording.simulated,
         "complete": recording.complete,
         "log": log,
+        "cycles": run.get("counters"),
         "stages": [
             {"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
             | ({"detail": stage.detail} if stage.detail else {})
