@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -95,7 +96,9 @@ def _run(
     from tdhil.commands.log_file import make_room
     from tdhil.commands.peer import open_drive
     from tdhil.commands.stop_signals import stop_on_signals
+    from tdhil.errors import exit_code
     from tdhil.protocol.runner import Runner
+    from tdhil.record.errors import LogError
     from tdhil.record.run_log import RunLog
     from tdhil.record.writer import RunWriter
     from tdhil.report.live import LiveDisplay
@@ -119,9 +122,19 @@ def _run(
                 partial(confirm_motion, yes=bool(options["yes"]), console=console, pause_display=display.pause),
                 reset_fault=namespace.reset_fault,
             ).run()
-        return _finish(outcome, log, str(path), bool(options["json"]), console)
-    finally:
+        code = _finish(outcome, log, str(path), bool(options["json"]), console)
+    except BaseException:
+        with suppress(LogError):  # the first cause stays the cause
+            log.close()
+        raise
+    try:
         log.close()
+    except LogError as error:
+        # Stdout has its one document already; and where the log was what ended the run, all is said.
+        if not isinstance(outcome.cause, LogError):
+            console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
+        code = code or int(exit_code(error))
+    return code
 
 
 def _task(options: Resolved, rig: Rig | None, log: RunLog, identity: Identity) -> Task:

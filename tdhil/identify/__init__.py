@@ -1,1 +1,30 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
+
+from tdhil.identify.identification import (
+    Estimate,
+    Identification,
+    InertiaEstimate,
+    LineFit,
+    PaperEstimate,
+    ResidualTest,
+    Verdict,
+)
+from tdhil.identify.identify import identify
+from tdhil.identify.options import Options
+from tdhil.identify.rough import RoughFriction, RoughInertia, rough_friction, rough_inertia
+
+__all__ = [
+    "Estimate",
+    "Identification",
+    "InertiaEstimate",
+    "LineFit",
+    "Options",
+    "PaperEstimate",
+    "ResidualTest",
+    "RoughFriction",
+    "RoughInertia",
+    "Verdict",
+    "identify",
+    "rough_friction",
+    "rough_inertia",
+]

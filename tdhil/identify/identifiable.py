@@ -1,0 +1,53 @@
+"""Can these lines tell the inertia at all? Count equations and unknowns before fitting.
+
+Each distinct excited frequency is two equations (real and imaginary part of T/ω); two mean speeds add one (B), each
+lag stated by the drive or the rig one. Unknown are five: J, B, the two lags, and the skew. At a second mean speed the
+same frequency says the same again: it helps the scatter, not the count.
+"""
+
+from tdhil.identify.friction import ViscousTie
+from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.quality import Refusal
+from tdhil.identify.rigid import SKEW, SPEED_LAG, TORQUE_LAG
+from tdhil.record.recording import LagPrior
+
+UNKNOWNS = 5
+_LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisecond at best
+
+
+def lag_priors(prior: LagPrior) -> tuple[GaussianPrior, ...]:
+    """What is known of the two lags."""
+    known = []
+    if prior.speed_lag_s is not None:
+        known.append(GaussianPrior(SPEED_LAG, prior.speed_lag_s, max(prior.speed_lag_sd_s, _LEAST_SD_S)))
+    if prior.torque_lag_s is not None:
+        known.append(GaussianPrior(TORQUE_LAG, prior.torque_lag_s, max(prior.torque_lag_sd_s, _LEAST_SD_S)))
+    return tuple(known)
+
+
+def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | None, sd_s: float) -> tuple[
+    GaussianPrior, ...
+]:
+    """If only the skew is missing from the count, and both lags are known: torque and speed come in one frame."""
+    known = len(priors) + (tie is not None) + 2 * lines
+    if known < UNKNOWNS and len(priors) == 2:
+        return (*priors, GaussianPrior(SKEW, 0.0, max(sd_s, _LEAST_SD_S)))
+    return priors
+
+
+def refuse_count(lines: int, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:
+    """A refusal that names equations, unknowns and the motion that would do."""
+    equations = 2 * lines + (tie is not None) + len(priors)
+    if equations >= UNKNOWNS:
+        return None
+    sources = [f"{lines} excited {'line gives' if lines == 1 else 'lines give'} {2 * lines} equations"]
+    if tie is not None:
+        sources.append("two mean speeds give one")
+    if priors:
+        sources.append(f"what is known of the lags gives {len(priors)}")
+    missing = "more lines (a multisine)" if tie is not None else "more lines about two mean speeds (a multisine)"
+    return Refusal(
+        f"{', '.join(sources)}, but there are five unknowns: inertia, viscous friction, the lags of the reported speed "
+        "and torque, and their skew",
+        f"excite with {missing}, or state the drive's speed and torque filters with their uncertainty",
+    )

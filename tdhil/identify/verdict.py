@@ -1,0 +1,182 @@
+"""From numbers to a conclusion: which verdict, why, and what the number rests on."""
+
+import math
+from dataclasses import dataclass
+
+from tdhil.identify.friction import ViscousTie
+from tdhil.identify.identification import Identification, InertiaEstimate, PaperEstimate, Verdict
+from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.options import Options
+from tdhil.identify.profile import student_quantile
+from tdhil.identify.quality import Refusal
+from tdhil.identify.residual import REJECT_P, rejects
+from tdhil.identify.rigid import SKEW, SpeedReport
+from tdhil.identify.rigid_result import RigidResult, turned, widened
+from tdhil.record.recording import Recording
+
+_OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What was there to conclude from."""
+
+    paper: PaperEstimate | None
+    periods: int
+    samples: int
+    warnings: tuple[str, ...]
+
+
+def refused(
+    refusal: Refusal,
+    paper: PaperEstimate | None,
+    periods: int,
+    samples: int,
+    warnings: tuple[str, ...],
+) -> Identification:
+    """No number, a reason and advice."""
+    return Identification(
+        verdict=Verdict.NOT_IDENTIFIABLE,
+        model="none",
+        reason=refusal.reason,
+        advice=refusal.advice,
+        inertia=None,
+        viscous_nm_s_rad=None,
+        coulomb_nm=None,
+        speed_lag_s=None,
+        torque_lag_s=None,
+        skew_s=None,
+        paper=paper,
+        periods_used=periods,
+        samples_used=samples,
+        warnings=warnings,
+    )
+
+
+def conclude(
+    result: RigidResult | None,
+    recording: Recording,
+    options: Options,
+    evidence: Evidence,
+    tie: ViscousTie | None,
+    priors: tuple[GaussianPrior, ...],
+) -> Identification:
+    """The verdict on a fitted rigid model."""
+    rejected = result is not None and rejects(result.residual)
+    if result is None or not (rejected or _bounded(result)):
+        return refused(
+            Refusal(
+                "the data leave the inertia open: it can't be told from the lags of the reported signals",
+                "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
+            ),
+            evidence.paper,
+            evidence.periods,
+            evidence.samples,
+            evidence.warnings,
+        )
+    as_paper = options.model == "paper"
+    test = result.residual
+    inertia = None if rejected else _inertia(result, recording, options, evidence, priors)
+    relative = 0.5 * (inertia.high - inertia.low) / inertia.value if inertia is not None else math.inf
+    verdict = Verdict.VALID if relative <= options.tolerance else Verdict.VALID_WIDE
+    if inertia is None:
+        verdict = Verdict.MODEL_REJECTED
+    reason, advice = _words(verdict, result, options, tie, relative)
+    kept = not rejected
+    return Identification(
+        verdict=verdict,
+        model="paper" if as_paper else "rigid+lags",
+        reason=reason,
+        advice=advice,
+        inertia=inertia,
+        viscous_nm_s_rad=result.viscous if kept else None,
+        coulomb_nm=result.coulomb if kept else None,
+        speed_lag_s=result.speed_lag_s if kept and not as_paper else None,
+        torque_lag_s=result.torque_lag_s if kept and not as_paper else None,
+        skew_s=result.skew_s if kept and not as_paper else None,
+        paper=evidence.paper,
+        residual=test,
+        periods_used=evidence.periods,
+        samples_used=evidence.samples,
+        warnings=(*evidence.warnings, *_caveats(result, tie, as_paper)),
+    )
+
+
+def _bounded(result: RigidResult) -> bool:
+    low, value, high = result.inertia.low, result.inertia.value, result.inertia.high
+    if not all(math.isfinite(x) for x in (low, value, high)) or value <= 0.0:
+        return False
+    return 0.5 * (high - low) <= _OPEN * value
+
+
+def _inertia(
+    result: RigidResult,
+    recording: Recording,
+    options: Options,
+    evidence: Evidence,
+    priors: tuple[GaussianPrior, ...],
+) -> InertiaEstimate:
+    estimate = result.inertia
+    if options.model == "paper" and evidence.paper is not None:
+        estimate = turned(estimate, evidence.paper.stepped.inertia_kg_m2)
+    quantile = student_quantile(options.confidence, 1e6)
+    scale_sd = recording.torque_scale_rel_sd
+    below = widened(estimate.value, estimate.value - estimate.low, scale_sd, quantile)
+    above = widened(estimate.value, estimate.high - estimate.value, scale_sd, quantile)
+    return InertiaEstimate(
+        value=estimate.value,
+        low=estimate.low,
+        high=estimate.high,
+        low_total=estimate.value - below,
+        high_total=estimate.value + above,
+        confidence=options.confidence,
+        conditional_on=_conditions(result, options, recording, priors),
+    )
+
+
+def _conditions(
+    result: RigidResult, options: Options, recording: Recording, priors: tuple[GaussianPrior, ...]
+) -> tuple[str, ...]:
+    conditions = ["torque scale exact"]
+    if options.model == "paper":
+        return (*conditions, "no reporting lags")
+    if result.structures == (SpeedReport.FIRST_ORDER,):
+        conditions.append("first-order reporting lags")
+    else:
+        names = ", ".join(report.value for report in result.structures)
+        conditions.append(f"reporting lags: torque first order; speed {names}")
+    if recording.lag_prior.speed_lag_s is not None or recording.lag_prior.torque_lag_s is not None:
+        conditions.append(f"reporting lags as stated{f' by {s}' if (s := recording.lag_prior.source) else ''}")
+    conditions += [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in priors if p.index == SKEW]
+    return tuple(conditions)
+
+
+def _words(
+    verdict: Verdict, result: RigidResult, options: Options, tie: ViscousTie | None, relative: float
+) -> tuple[str, str]:
+    rigid = "a rigid shaft seen through reporting lags"
+    what = "the paper's model, without lags," if options.model == "paper" else rigid
+    p_value = result.residual.p_value if result.residual is not None else None
+    if verdict is Verdict.MODEL_REJECTED:
+        advice = (
+            "identify with the rigid model, which includes reporting lags"
+            if options.model == "paper"
+            else "look for a compliant load, play, or friction that changes with speed or time; try lower lines"
+        )
+        return f"the residuals contradict {what} (p = {p_value:.1g})", advice
+    fits = f"{what} explains the data" + (f" (p = {p_value:.2g})" if p_value is not None else ", untested")
+    if verdict is Verdict.VALID:
+        return fits, "identical filters on reported speed and torque, or known ones, would sharpen this further"
+    advice = "excite with more amplitude or for longer" + (", and about two mean speeds" if tie is None else "")
+    return f"{fits}, but the interval is ±{relative:.1%}, wider than ±{options.tolerance:.1%}", advice
+
+
+def _caveats(result: RigidResult, tie: ViscousTie | None, as_paper: bool) -> tuple[str, ...]:
+    found = []
+    if tie is None:
+        found.append("only one mean speed: viscous friction rests on the lines, not on levels")
+    if not as_paper and result.structures and result.structures[0] is not SpeedReport.FIRST_ORDER:
+        found.append(f"a first-order speed lag does not fit; used: {result.structures[0].value}")
+    if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
+        found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
+    return tuple(found)

@@ -1,0 +1,264 @@
+"""Scale an excitation to the rig's speed window and torque limit, or refuse it before anything moves."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tdhil.protocol.excitation import multisine, sine, step
+from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, PlanRefused, RigGuess
+from tdhil.protocol.excitation.periodic import PeriodicReference
+from tdhil.protocol.excitation.shape import Shape, begun_at_rest
+from tdhil.protocol.excitation.transition import Transition, make_transition
+from tdhil.record.recording import Segment
+
+ExcitationKind = Literal["multisine", "sine", "step"]
+
+_OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
+_SETTLE_S = 10.0         # at least this long before the first period that counts
+_SINGLE_TONE_S = 100.0   # shortest useful measurement of one tone
+
+
+@dataclass(frozen=True)
+class ExcitationWish:
+    """What the user asks for; None means that the plan chooses.
+
+    ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
+    deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
+    settling included.
+    """
+
+    kind: ExcitationKind = "multisine"
+    mode: DriveMode = "torque"
+    frequency_hz: float | None = None
+    amplitude_rad_s: float | None = None
+    offsets_rad_s: tuple[float, ...] | None = None
+    periods: int | None = None
+
+
+@dataclass(frozen=True)
+class PlannedSegment:
+    """One mean speed: its reference from the segment's start, how long it lasts, and what it should reach."""
+
+    reference: PeriodicReference
+    periods: int
+    settle_periods: int
+    speed_min_rad_s: float    # predicted, if the rough inertia were right
+    speed_max_rad_s: float
+    torque_min_nm: float
+    torque_max_nm: float
+
+    @property
+    def duration_s(self) -> float:
+        return self.periods * self.reference.period_s
+
+    def recorded(self, start_s: float, end_s: float | None = None) -> Segment:
+        """The segment as a recording keeps it; ``end_s`` is rounded down to the last whole period that was run."""
+        end = start_s + self.duration_s if end_s is None else end_s
+        period = self.reference.period_s
+        whole = min(self.periods, max(0, math.floor((end - start_s) / period + 1e-6)))
+        return Segment(
+            start_s=start_s,
+            end_s=start_s + whole * period,
+            period_s=period,
+            settle_periods=self.settle_periods,
+            offset_rad_s=self.reference.offset_rad_s,
+            lines_hz=self.reference.lines_hz,
+            amplitudes_rad_s=self.reference.amplitudes_rad_s,
+            phases_rad=self.reference.phases_rad,
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The whole of stage 5's motion, in order; transitions lead from each segment to the next."""
+
+    kind: ExcitationKind
+    mode: DriveMode
+    segments: tuple[PlannedSegment, ...]
+    limits: MachineLimits
+    guess: RigGuess
+
+    @property
+    def speed_min_rad_s(self) -> float:
+        return min(segment.speed_min_rad_s for segment in self.segments)
+
+    @property
+    def speed_max_rad_s(self) -> float:
+        return max(segment.speed_max_rad_s for segment in self.segments)
+
+    @property
+    def torque_min_nm(self) -> float:
+        return min(segment.torque_min_nm for segment in self.segments)
+
+    @property
+    def torque_max_nm(self) -> float:
+        return max(segment.torque_max_nm for segment in self.segments)
+
+    @property
+    def duration_s(self) -> float:
+        """Segments and the transitions between them; the first transition, from wherever the shaft is, comes on top."""
+        between = sum(
+            self.transition(before.reference.start_speed_rad_s, index + 1).duration_s
+            for index, before in enumerate(self.segments[:-1])
+        )
+        return between + sum(segment.duration_s for segment in self.segments)
+
+    def transition(self, from_rad_s: float, index: int) -> Transition:
+        """From a speed to the start of segment ``index``."""
+        to = self.segments[index].reference.start_speed_rad_s
+        return make_transition(from_rad_s, to, self.limits, self.guess, self.mode)
+
+
+def make_plan(limits: MachineLimits, guess: RigGuess, wish: ExcitationWish | None = None) -> Plan:
+    """A plan that stays within the limits even if the rough inertia is wrong by its stated error.
+
+    Raises PlanRefused, naming the limit, if what was asked for does not fit.
+    """
+    wish = wish or ExcitationWish()
+    shape, frequency = _shape_and_frequency(wish)
+    period = 1.0 / frequency
+    shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
+    fit = _Fit.of(shape, period, limits, guess, wish.mode)
+    amplitude, offsets = _amplitude_and_offsets(fit, wish)
+    settle = max(1, math.ceil(_SETTLE_S / period - 1e-9))
+    periods = _periods(wish, period, settle)
+    return Plan(
+        wish.kind,
+        wish.mode,
+        tuple(fit.segment(offset, amplitude, periods, settle) for offset in offsets),
+        limits,
+        guess,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A shape of peak 1 with its peaks, against the limits."""
+
+    shape: Shape
+    period_s: float
+    limits: MachineLimits
+    guess: RigGuess
+    mode: DriveMode
+    up: float            # speed above and below its mean, per unit of amplitude
+    down: float
+    torque_up: float     # torque above and below its mean, N·m per rad/s of amplitude
+    torque_down: float
+    foreseen: float      # like ``up``, as far ahead as the guard looks
+
+    @classmethod
+    def of(cls, shape: Shape, period_s: float, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
+        speed = shape.deviation()
+        ahead = shape.foreseen_deviation(period_s, limits.foresight_s if mode == "torque" else 0.0)
+        torque = shape.torque_deviation(period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
+        peaks = (float(np.max(speed)), float(-np.min(speed)), float(np.max(torque)), float(-np.min(torque)))
+        return cls(shape, period_s, limits, guess, mode, *peaks, foreseen=max(peaks[0], float(np.max(ahead))))
+
+    @property
+    def swing(self) -> float:
+        return self.guess.speed_swing_factor(self.mode)
+
+    def largest_at(self, offset_rad_s: float) -> tuple[float, str]:
+        """The greatest amplitude that fits about a mean speed, and the limit that sets it."""
+        torque_factor = self.guess.torque_swing_factor(self.mode)
+        steady = self.guess.steady_torque_nm(offset_rad_s)
+        usable = self.limits.usable_torque_nm
+        candidates = [
+            ((self.limits.usable_high_rad_s - offset_rad_s) / (self.foreseen * self.swing), "speed window (upper end)"),
+            ((offset_rad_s - self.limits.usable_low_rad_s) / (self.down * self.swing), "speed window (lower end)"),
+            ((usable - steady) / (self.torque_up * torque_factor), "torque limit"),
+            ((usable + steady) / (self.torque_down * torque_factor), "torque limit"),
+        ]
+        return min(candidates, key=lambda candidate: candidate[0])
+
+    def segment(self, offset_rad_s: float, amplitude_rad_s: float, periods: int, settle: int) -> PlannedSegment:
+        reference = PeriodicReference(
+            offset_rad_s=offset_rad_s,
+            period_s=self.period_s,
+            lines_hz=tuple(harmonic / self.period_s for harmonic in self.shape.harmonics),
+            amplitudes_rad_s=tuple(amplitude_rad_s * a for a in self.shape.amplitudes),
+            phases_rad=self.shape.phases_rad,
+            guess=self.guess,
+        )
+        return PlannedSegment(
+            reference=reference,
+            periods=periods,
+            settle_periods=settle,
+            speed_min_rad_s=offset_rad_s - amplitude_rad_s * self.down,
+            speed_max_rad_s=offset_rad_s + amplitude_rad_s * self.up,
+            torque_min_nm=reference.mean_torque_nm - amplitude_rad_s * self.torque_down,
+            torque_max_nm=reference.mean_torque_nm + amplitude_rad_s * self.torque_up,
+        )
+
+
+def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
+    shapes = {
+        "multisine": (multisine.multisine_shape, multisine.DEFAULT_FREQUENCY_HZ),
+        "sine": (sine.sine_shape, sine.DEFAULT_FREQUENCY_HZ),
+        "step": (step.step_shape, step.DEFAULT_FREQUENCY_HZ),
+    }
+    if wish.kind not in shapes:
+        raise PlanRefused(f"unknown excitation {wish.kind!r}; there are {', '.join(shapes)}")
+    make, default = shapes[wish.kind]
+    frequency = default if wish.frequency_hz is None else wish.frequency_hz
+    if not (math.isfinite(frequency) and frequency > 0.0):
+        raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
+    return make(), frequency
+
+
+def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
+    if wish.periods is not None:
+        if wish.periods < settle + 1:
+            raise PlanRefused(f"{wish.periods} periods are too few: {settle} go to settling")
+        return wish.periods
+    if wish.kind == "sine":
+        return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))
+    # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
+    counted = (multisine.DEFAULT_PERIODS - 1) / multisine.DEFAULT_FREQUENCY_HZ
+    return settle + max(6, math.ceil(counted / period_s - 1e-9))
+
+
+def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tuple[float, ...]]:
+    if wish.amplitude_rad_s is not None and not (math.isfinite(wish.amplitude_rad_s) and wish.amplitude_rad_s > 0.0):
+        raise PlanRefused(f"amplitude must be positive, not {wish.amplitude_rad_s:g} rad/s")
+    if wish.offsets_rad_s is not None and not wish.offsets_rad_s:
+        raise PlanRefused("at least one offset is needed")
+    offsets = wish.offsets_rad_s or _default_offsets(fit, wish)
+    largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets)
+    if largest <= 0.0:
+        raise PlanRefused(f"{limit} leaves no room for any excitation about {where:g} rad/s")
+    amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
+    if amplitude > largest * (1.0 + 1e-9):
+        raise PlanRefused(
+            f"{limit}: an amplitude of {amplitude:g} rad/s about {where:g} rad/s does not fit; "
+            f"{largest:.3g} rad/s would"
+        )
+    return amplitude, tuple(offsets)
+
+
+def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
+    """Two mean speeds (one for a single tone), as far apart as the swing allows.
+
+    The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit
+    allows at the upper end; whatever it does not need goes to the distance, which is what tells B.
+    """
+    low, high = fit.limits.usable_low_rad_s, fit.limits.usable_high_rad_s
+    span = (fit.foreseen + fit.down) * fit.swing
+    if wish.kind == "sine":
+        return (low + (high - low) * fit.down / (fit.foreseen + fit.down),)
+    amplitude = (1.0 - _OFFSET_SHARE) * (high - low) / span
+    torque_room = fit.limits.usable_torque_nm - max(fit.guess.steady_torque_nm(low), fit.guess.steady_torque_nm(high))
+    torque_swing = max(fit.torque_up, fit.torque_down) * fit.guess.torque_swing_factor(fit.mode)
+    if torque_room <= 0.0:
+        raise PlanRefused(
+            f"torque limit: steady friction leaves nothing of the {fit.limits.usable_torque_nm:g} N·m "
+            "that a plan may use"
+        )
+    amplitude = min(amplitude, torque_room / torque_swing)
+    if wish.amplitude_rad_s is not None:
+        amplitude = min(amplitude, wish.amplitude_rad_s) if wish.amplitude_rad_s > 0.0 else amplitude
+    first = low + amplitude * fit.down * fit.swing
+    second = high - amplitude * fit.foreseen * fit.swing
+    return first, second

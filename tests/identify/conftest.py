@@ -1,0 +1,27 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))     # for shaft_bench: tests are imported by path, not as a package
+
+SEEDS = list(range(24))
+
+
+@pytest.fixture(scope="session")
+def default_run():
+    """The default plan on the field-like rig, 24 seeds at once: rig, motion, plan, what truly happened."""
+    from planned_motions import planned
+    from shaft_bench import Rig, turn_shaft
+
+    motion, plan = planned()
+    rig = Rig()
+    return rig, motion, plan, turn_shaft(rig, motion, SEEDS)
+
+
+@pytest.fixture(scope="session")
+def one_recording(default_run):
+    from shaft_bench import recordings
+
+    rig, motion, _, shaft = default_run
+    return recordings(rig, motion, shaft, SEEDS[:1])[0]
