@@ -1,0 +1,75 @@
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))     # for the helpers: tests are imported by path, not as a package
+
+
+@pytest.fixture
+def fake_time(monkeypatch):
+    """Fake time in every file of the driver that looks at the clock; nothing outside it notices."""
+    from scripted_drive import FakeTime
+
+    import drivers.cia402.drive  # noqa: F401  (all of its files are then loaded)
+
+    fake = FakeTime()
+    for name, module in list(sys.modules.items()):
+        if name.split(".")[0] == "drivers" and getattr(module, "time", None) is time:
+            monkeypatch.setattr(module, "time", fake)
+    return fake
+
+
+@pytest.fixture
+def wire(fake_time):
+    """A fake bus with nobody on it."""
+    from scripted_drive import ScriptedBus
+
+    return ScriptedBus(fake_time)
+
+
+@pytest.fixture
+def peer(wire):
+    """A scripted drive on the fake bus."""
+    from scripted_drive import ScriptedDrive
+
+    return ScriptedDrive(wire)
+
+
+@pytest.fixture(scope="session")
+def profile():
+    from profiles.library import load_profile
+
+    return load_profile("generic/cia402")
+
+
+def _canopen():
+    from drive_benches import CanopenBench
+
+    return CanopenBench
+
+
+MAKERS = {"canopen": _canopen}
+
+
+@pytest.fixture(params=sorted(MAKERS))
+def make_bench(request):
+    """Makes benches of one kind of drive (see drive_benches); a further kind joins the contract by its line above."""
+    made = []
+
+    def make(*args, **options):
+        made.append(MAKERS[request.param]()(*args, **options))
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.close()
+
+
+@pytest.fixture
+def run(make_bench):
+    """A run on a quiet rig."""
+    from drive_benches import Run
+
+    return Run(make_bench())

@@ -1,0 +1,184 @@
+"""One bench for each kind of drive that must keep the contract: the drive, and independent eyes on the other side.
+
+A bench has ``drive`` (not yet connected), ``frames`` (what its tap saw), ``limits``, ``true_speed_rad_s``, and
+
+- ``settings()``: what stands in the drive, read by a client of the tests' own;
+- ``decode(frames)``: the feedback in the tapped frames as [(status, speed, torque, demand, mode)], one a cycle;
+- ``setpoints(frames)``: the setpoints in them as [(speed, torque)].
+"""
+
+import math
+import struct
+from collections import deque
+
+import can
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import SteppedClock
+from drivers.drive import Command, Limits, Mode, PowerState
+from profiles.library import load_profile
+from sim_bus.params import FAITHFUL, QUIET, RigParams
+from sim_bus.simulator import EmbeddedSimulator
+
+LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+RPM = math.pi / 30.0
+
+
+class TamperedBus:
+    """A python-can bus between driver and wire: drops, delays and puts in frames on their way to the driver."""
+
+    def __init__(self, bus):
+        self._bus = bus
+        self.channel_info = bus.channel_info
+        self.coming = deque()
+        self.change = lambda message: [message]       # what a frame becomes
+        self.on_sync = lambda: None
+        self.send_error = self.receive_error = None
+
+    def put(self, identifier, data):
+        self.coming.append(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def send(self, message):
+        if self.send_error is not None:
+            raise self.send_error
+        self._bus.send(message)
+        if message.arbitration_id == 0x080:
+            self.on_sync()
+
+    def recv(self, timeout):
+        if self.receive_error is not None:
+            raise self.receive_error
+        if self.coming:
+            return self.coming.popleft()
+        message = self._bus.recv(timeout)
+        if message is None:
+            return None
+        self.coming.extend(self.change(message))
+        return self.recv(0.0)
+
+    def shutdown(self):
+        self._bus.shutdown()
+
+
+class CanopenBench:
+    """Cia402Drive on the embedded simulator, stepped, over python-can's virtual bus."""
+
+    SETTINGS = ((0x1006, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0))
+    TARGETS = ((0x6060, 0), (0x6071, 0), (0x60FF, 0))
+    MAPPING = tuple(
+        (index + number, sub)
+        for number in range(2) for index, subs in ((0x1400, (1, 2)), (0x1600, range(5)), (0x1800, (1, 2)),
+                                                   (0x1A00, range(5))) for sub in subs
+    )
+    WATCHDOG = (0x1016, 1)
+
+    def __init__(self, params=None, *, seed=0, **options):
+        self.limits = LIMITS
+        self.rated_nm = 1000.0
+        self.speed_lsb, self.torque_lsb = 0.1 * RPM, 1.0
+        self.simulated = EmbeddedSimulator(params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed).open()
+        self._second = can.Bus(interface="virtual", channel=self.simulated.channel)
+        self.bus = TamperedBus(can.Bus(interface="virtual", channel=self.simulated.channel))
+        self.frames = []
+        self.drive = Cia402Drive(
+            self.bus, load_profile("generic/cia402"), SteppedClock(), node=1, tap=self.frames.append, **options
+        )
+
+    @property
+    def true_speed_rad_s(self):
+        return self.simulated.simulator.speed_rad_s
+
+    def close(self):
+        self._second.shutdown()
+        self.bus.shutdown()
+        self.simulated.close()
+
+    def foreign(self, identifier, data):
+        """A frame of somebody else on the bus."""
+        self._second.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+    def heard(self):
+        """All that the second station has heard since it was last asked."""
+        frames = []
+        while (message := self._second.recv(0.0)) is not None:
+            frames.append((message.arbitration_id, bytes(message.data)))
+        return frames
+
+    def read(self, index, sub=0):
+        self.heard()
+        self.foreign(0x601, struct.pack("<BHB4x", 0x40, index, sub))
+        while (message := self._second.recv(2.0)) is not None:
+            data = bytes(message.data)
+            if message.arbitration_id == 0x581 and data[1:4] == struct.pack("<HB", index, sub):
+                assert data[0] & 0xE3 == 0x43, data.hex()
+                return int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little")
+        raise AssertionError("the simulated drive does not answer")
+
+    def settings(self, keys=SETTINGS):
+        return {f"{index:04X}h:{sub}": self.read(index, sub) for index, sub in keys}
+
+    def decode(self, frames):
+        found, mode, demand = [], 0, None
+        for frame in frames:
+            if frame.outgoing:
+                continue
+            if frame.identifier == 0x281:
+                mode, demand = struct.unpack("<bh", frame.data)
+            elif frame.identifier == 0x181:
+                status, torque, speed = struct.unpack("<Hhi", frame.data)
+                shown = {9: Mode.SPEED, 3: Mode.SPEED, 10: Mode.TORQUE, 4: Mode.TORQUE}.get(mode)
+                found.append((
+                    status, speed * 0.1 * RPM, torque * 1.0, None if demand is None else demand * 1.0, shown,
+                ))
+        return found
+
+    def setpoints(self, frames):
+        words = [struct.unpack("<Hhi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
+        return [(speed * 0.1 * RPM, torque * 1.0) for _, torque, speed in words]
+
+
+class Run:
+    """Steps through the contract on a bench, with every sample kept."""
+
+    def __init__(self, bench):
+        self.bench, self.drive = bench, bench.drive
+        self.samples = []
+
+    def ready(self):
+        self.drive.connect()
+        found = self.drive.preflight(self.bench.limits)
+        assert found.refused == ()
+        return found
+
+    def cycle(self, mode=Mode.SPEED, speed=0.0, torque=0.0):
+        sample = self.drive.exchange(Command(mode, speed, torque))
+        self.samples.append(sample)
+        return sample
+
+    def go(self, duration_s, mode=Mode.SPEED, speed=0.0, torque=0.0):
+        """Cycles for a while; the last sample."""
+        for _ in range(round(duration_s / self.drive.period_s)):
+            self.cycle(mode, speed, torque)
+        return self.samples[-1]
+
+    def until(self, wanted, within_s, mode=Mode.SPEED, speed=0.0, torque=0.0):
+        """Cycles until a sample is as wanted; that sample."""
+        for _ in range(round(within_s / self.drive.period_s)):
+            if wanted(self.cycle(mode, speed, torque)):
+                return self.samples[-1]
+        raise AssertionError(f"not within {within_s} s; last: {self.samples[-1]}")
+
+    def enable(self, mode=Mode.SPEED):
+        self.drive.enable(mode)
+        return self.until(lambda sample: sample.state is PowerState.ENABLED and sample.mode is mode, 1.0, mode)
+
+    def turning(self, speed=5.0):
+        self.ready()
+        self.enable()
+        return self.go(6.0, speed=speed)
+
+    def stop(self):
+        self.drive.quick_stop()
+        self.until(lambda sample: sample.standstill, 30.0)
+        self.drive.disable()
+        self.until(lambda sample: sample.state is PowerState.OFF, 1.0)

@@ -1,0 +1,284 @@
+"""What every `drivers.drive.Drive` must do, whatever its bus: the contract, once, for each bench in conftest."""
+
+import itertools
+import math
+import time
+
+import pytest
+from drive_benches import Run
+
+from drivers.drive import Command, Counters, Mode, Outcome, PowerState
+from drivers.errors import CommandRejected, PreflightRefused, TdhilError
+from sim_bus.params import RigParams
+
+VISCOUS, COULOMB, INERTIA = 8.0, 60.0, 104.0       # the simulated rig
+
+
+def test_identity_and_preflight(run):
+    identity = run.drive.connect()
+    assert identity.simulated
+    assert identity.name
+    found = run.drive.preflight(run.bench.limits)
+    assert found.refused == ()
+    assert found.identity == identity
+    assert found.modes == {Mode.SPEED, Mode.TORQUE}
+    assert found.rated_torque_nm == pytest.approx(run.bench.rated_nm)
+    assert found.torque_resolution_nm == pytest.approx(run.bench.torque_lsb)
+    assert found.speed_resolution_rad_s == pytest.approx(run.bench.speed_lsb)
+    assert found.watchdog_s == run.bench.limits.watchdog_s
+    assert found.safe_action == "quick_stop"
+    assert all(check.where for check in found.checks if check.outcome is not Outcome.NOTE)
+
+
+def test_preflight_needs_connect(run):
+    with pytest.raises(PreflightRefused):
+        run.drive.preflight(run.bench.limits)
+
+
+def test_nothing_moves_before_it_is_enabled(run):
+    run.ready()
+    last = run.go(0.5, speed=5.0, torque=200.0)
+    assert last.state is PowerState.OFF
+    assert run.bench.true_speed_rad_s == 0.0
+
+
+def test_the_whole_order(run):
+    run.ready()
+    run.enable()
+    run.go(3.0, speed=2.0)
+    run.stop()
+    states = [sample.state for sample in run.samples]
+    order = list(dict.fromkeys(states))
+    assert order == [PowerState.OFF, PowerState.READY, PowerState.ENABLED, PowerState.QUICK_STOP]
+    assert states[-1] is PowerState.OFF
+    run.drive.close()
+    assert run.bench.true_speed_rad_s == 0.0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_torque_drives_speed_of_its_own_sign(run, sign):
+    run.ready()
+    run.enable(Mode.TORQUE)
+    begin = run.samples[-1]
+    last = run.go(2.0, Mode.TORQUE, torque=sign * 150.0)
+    assert last.torque_nm == pytest.approx(sign * 150.0, abs=run.bench.torque_lsb)
+    # J dω/dt = T − T_c − B ω, solved by hand
+    elapsed_s = last.time_s - begin.time_s
+    wanted = sign * (150.0 - COULOMB) / VISCOUS * (1.0 - math.exp(-VISCOUS * elapsed_s / INERTIA))
+    assert last.speed_rad_s == pytest.approx(wanted, rel=0.02)
+
+
+@pytest.mark.parametrize("speed", [5.0, -3.0, 12.5])
+def test_the_steady_speed_is_the_one_commanded(run, speed):
+    run.ready()
+    run.enable()
+    last = run.go(12.0, speed=speed)
+    assert last.speed_rad_s == pytest.approx(speed, abs=1.1 * run.bench.speed_lsb)
+    assert run.bench.true_speed_rad_s == pytest.approx(speed, abs=1.1 * run.bench.speed_lsb)
+    friction = math.copysign(COULOMB, speed) + VISCOUS * speed
+    assert last.torque_nm == pytest.approx(friction, abs=2.0 * run.bench.torque_lsb)
+
+
+def test_switching_modes_both_ways_is_bumpless_and_confirmed(run):
+    steady = run.turning(5.0)
+    seed = steady.torque_nm
+    run.until(lambda sample: sample.mode is Mode.TORQUE, 1.0, Mode.TORQUE, 5.0, seed)
+    run.go(1.0, Mode.TORQUE, 5.0, seed)
+    run.until(lambda sample: sample.mode is Mode.SPEED, 1.0, Mode.SPEED, run.samples[-1].speed_rad_s, seed)
+    run.go(1.0, Mode.SPEED, run.samples[-1].speed_rad_s, seed)
+    after = [sample for sample in run.samples if sample.time_s > steady.time_s]
+    assert {sample.state for sample in after} == {PowerState.ENABLED}
+    assert max(abs(sample.torque_nm - seed) for sample in after) < 8.0
+    assert max(abs(sample.speed_rad_s - 5.0) for sample in after) < 0.05
+
+
+def test_the_mode_that_is_shown_is_the_drives(run):
+    run.ready()
+    run.enable(Mode.TORQUE)
+    assert run.go(0.1, Mode.TORQUE).mode is Mode.TORQUE
+    assert run.go(0.2, Mode.SPEED).mode is Mode.SPEED
+
+
+def test_the_limits_stand_in_the_drive_and_act(run):
+    run.ready()
+    run.enable(Mode.TORQUE)
+    run.go(3.0, Mode.TORQUE, torque=390.0)
+    assert max(sample.torque_nm for sample in run.samples) == pytest.approx(300.0, abs=run.bench.torque_lsb)
+    assert run.samples[-1].limit_active
+    run.go(1.0, Mode.SPEED, speed=run.samples[-1].speed_rad_s)
+    last = run.go(25.0, Mode.SPEED, speed=19.0)
+    assert last.limit_active
+    assert last.speed_rad_s == pytest.approx(run.bench.limits.speed_rad_s, rel=0.01)
+
+
+@pytest.mark.parametrize("mode", [Mode.SPEED, Mode.TORQUE])
+def test_a_quick_stop_brakes_on_the_ramp_and_holds(run, mode):
+    steady = run.turning(8.0)
+    if mode is Mode.TORQUE:
+        run.go(0.5, mode, 8.0, steady.torque_nm)
+    run.drive.quick_stop()
+    begin = len(run.samples)
+    run.until(lambda sample: sample.standstill, 20.0, mode, 8.0, steady.torque_nm)
+    fall = [sample for sample in run.samples[begin:] if 1.0 < sample.speed_rad_s < 7.0]
+    ramp = (fall[0].speed_rad_s - fall[-1].speed_rad_s) / (fall[-1].time_s - fall[0].time_s)
+    assert ramp == pytest.approx(run.bench.limits.quick_stop_rad_s2, rel=0.05)
+    assert {sample.state for sample in fall} == {PowerState.QUICK_STOP}
+    # setpoints that go on coming move nothing
+    last = run.go(1.0, mode, 8.0, 200.0)
+    assert last.state is PowerState.QUICK_STOP
+    assert last.standstill
+    assert abs(run.bench.true_speed_rad_s) < 0.01
+
+
+def test_a_quick_stop_is_not_ended_by_itself(run):
+    run.turning(2.0)
+    run.drive.quick_stop()
+    run.go(6.0, speed=2.0)
+    run.drive.disable()
+    run.go(1.0, speed=2.0)
+    assert run.samples[-1].state is PowerState.OFF
+    assert abs(run.bench.true_speed_rad_s) < 0.01
+
+
+@pytest.mark.parametrize("command", [
+    Command(Mode.SPEED, math.nan, 0.0), Command(Mode.SPEED, 0.0, math.nan), Command(Mode.SPEED, math.inf, 0.0),
+    Command(Mode.TORQUE, 0.0, -math.inf), Command(Mode.SPEED, 1e300, 0.0), Command(Mode.TORQUE, 0.0, 1e9),
+])
+def test_what_is_no_setpoint_never_reaches_the_bus(run, command):
+    run.ready()
+    run.enable()
+    frames, counters, now_s = len(run.bench.frames), run.drive.counters, run.drive.clock.now_s()
+    with pytest.raises(CommandRejected):
+        run.drive.exchange(command)
+    assert (len(run.bench.frames), run.drive.counters, run.drive.clock.now_s()) == (frames, counters, now_s)
+    assert run.cycle(speed=1.0).time_s == pytest.approx(now_s + run.drive.period_s)
+
+
+def test_an_exchange_without_preflight_is_an_error_of_ours(run):
+    run.drive.connect()
+    frames = len(run.bench.frames)
+    with pytest.raises(TdhilError):
+        run.cycle()
+    assert len(run.bench.frames) == frames
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 250.0, 1000.0])
+def test_samples_are_one_period_apart(make_bench, rate_hz):
+    run = Run(make_bench(rate_hz=rate_hz))
+    run.ready()
+    run.go(1.0)
+    assert run.drive.period_s == pytest.approx(1.0 / rate_hz)
+    times = [sample.time_s for sample in run.samples]
+    assert all(later - sooner == pytest.approx(1.0 / rate_hz, abs=1e-9)
+               for sooner, later in itertools.pairwise(times))
+    assert {(sample.age_s, sample.half_width_s, sample.fresh) for sample in run.samples} == {(0.0, 0.0, True)}
+
+
+def test_counters(run):
+    run.ready()
+    assert run.drive.counters == Counters()
+    run.go(0.4)
+    assert run.drive.counters == Counters(cycles=100)
+
+
+def test_the_frames_on_the_bus_say_what_the_samples_say(make_bench):
+    """With lags, noise and quanta, decoded by formats typed in the tests."""
+    run = Run(make_bench(RigParams(), seed=3))
+    run.turning(4.0)
+    run.go(1.0, Mode.TORQUE, 4.0, 90.0)
+    run.stop()
+    decoded = run.bench.decode(run.bench.frames)
+    assert len(decoded) == len(run.samples)
+    for sample, (status, speed, torque, demand, mode) in zip(run.samples, decoded, strict=True):
+        assert (sample.status, sample.mode) == (status, mode)
+        assert (sample.speed_rad_s, sample.torque_nm) == (pytest.approx(speed), pytest.approx(torque))
+        assert sample.torque_demand_nm == (None if demand is None else pytest.approx(demand))
+
+
+def test_the_frames_on_the_bus_carry_the_setpoints(run):
+    run.ready()
+    run.enable()
+    begin = len(run.bench.frames)
+    wanted = [(0.01 * k, -0.5 * k) for k in range(100)]
+    for speed, torque in wanted:
+        run.cycle(Mode.SPEED, speed, torque)
+    sent = run.bench.setpoints(run.bench.frames[begin:])
+    assert len(sent) == len(wanted)
+    for (speed, torque), (speed_sent, torque_sent) in zip(wanted, sent, strict=True):
+        assert abs(speed - speed_sent) <= 0.5001 * run.bench.speed_lsb
+        assert abs(torque - torque_sent) <= 0.5001 * run.bench.torque_lsb
+
+
+def test_the_tap_sees_every_frame_in_order(run):
+    """What a second station on the bus hears, the driver's own frames and the drive's, is what was tapped."""
+    run.bench.heard()
+    run.turning(1.0)
+    run.drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
+    heard = run.bench.heard()
+    tapped = [(frame.identifier, frame.data) for frame in run.bench.frames]
+    ours = [(frame.identifier, frame.data) for frame in run.bench.frames if frame.outgoing]
+    theirs = [(frame.identifier, frame.data) for frame in run.bench.frames if not frame.outgoing]
+    ids = {identifier for identifier, _ in ours}
+    assert [frame for frame in heard if frame[0] in ids] == ours
+    # The drive may have said more since the last exchange.
+    others = [frame for frame in heard if frame[0] not in ids]
+    assert theirs == others[: len(theirs)]
+    assert len(others) - len(theirs) <= 2
+    assert len(tapped) > 4000
+    times = [frame.time_s for frame in run.bench.frames]
+    assert times == sorted(times)
+
+
+def test_nothing_is_sent_behind_the_loops_back(run):
+    run.turning(1.0)
+    time.sleep(0.02)
+    run.bench.heard()
+    frames = len(run.bench.frames)
+    time.sleep(0.2)
+    assert run.bench.heard() == []
+    assert len(run.bench.frames) == frames
+
+
+def test_settings_are_given_back(run):
+    before = run.bench.settings()
+    run.turning(2.0)
+    assert run.bench.settings() != before
+    run.stop()
+    run.drive.close()
+    assert run.bench.settings() == before
+
+
+def test_a_drive_that_may_still_turn_keeps_its_watchdog(run):
+    run.turning(2.0)
+    armed = run.bench.settings((run.bench.WATCHDOG,))
+    run.drive.close()
+    assert run.bench.settings((run.bench.WATCHDOG,)) == armed
+    assert set(armed.values()) != {0}
+
+
+@pytest.mark.xfail(reason="close gives back no PDO mapping, mode and targets: see Cia402Drive.close", strict=True)
+def test_mapping_and_mode_are_given_back_too(run):
+    others = run.bench.MAPPING + run.bench.TARGETS
+    before = run.bench.settings(others)
+    run.ready()
+    run.drive.close()
+    assert run.bench.settings(others) == before
+
+
+def test_closing_without_having_moved(run):
+    before = run.bench.settings()
+    run.ready()
+    run.drive.close()
+    assert run.bench.settings() == before
+
+
+def test_a_seed_repeats_a_run(make_bench):
+    def once(seed):
+        run = Run(make_bench(RigParams(), seed=seed))
+        run.turning(3.0)
+        run.go(1.0, Mode.TORQUE, 3.0, 100.0)
+        return run.samples
+
+    first = once(7)
+    assert once(7) == first
+    assert once(8) != first

@@ -1,0 +1,350 @@
+"""What is refused before anything moves. Each row by itself, and never one row at the cost of those after it."""
+
+import pytest
+from power_machine import ENABLED, FAULT, OFF
+from scripted_drive import ScriptedDrive, u
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import MonotonicClock, SteppedClock
+from drivers.drive import Command, Limits, Mode, Outcome
+from drivers.errors import CommunicationLost, PreflightRefused
+
+LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+ROWS = [
+    "identity", "state", "modes of operation", "rated torque", "torque limit", "speed limit", "quick-stop ramp",
+    "quick-stop option", "targets", "mode display for 9", "mode display for 10", "PDO mapping", "cycle", "stepped time",
+    "drive's heartbeat", "watchdog reaction", "watchdog",
+]
+
+
+@pytest.fixture
+def make(wire, profile):
+    def make(clock=None, changed=profile, **options):
+        return Cia402Drive(wire, changed, clock or SteppedClock(), node=1, **options)
+
+    return make
+
+
+def preflight(drive):
+    drive.connect()
+    return drive.preflight(LIMITS)
+
+
+def refused(found):
+    return {check.name: check for check in found.refused}
+
+
+def changed(profile, section, **values):
+    return profile.model_copy(update={section: getattr(profile, section).model_copy(update=values)})
+
+
+def test_a_drive_as_it_should_be(make, peer):
+    found = preflight(make())
+    assert [check.name for check in found.checks] == ROWS
+    assert found.refused == ()
+    assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
+    assert {check.name for check in found.checks if check.outcome is Outcome.NOTE} == {"identity"}
+    assert peer.operational
+
+
+def test_what_then_stands_in_the_drive(make, peer):
+    preflight(make())
+    assert peer.value(0x6072) == 300                     # ‰ of 1000 N·m
+    assert peer.value(0x6080) == 96                      # 10 rad/s = 95.49 rpm, the next one up
+    assert peer.value(0x6085) == 191                     # 2 rad/s² = 190.99 · 0.1 rpm/s
+    assert peer.value(0x605A) == 6
+    assert peer.value(0x6007) == 3
+    assert peer.value(0x1016, 1) == 0x007F0190
+    assert peer.value(0x1006) == 4000
+    assert peer.value(0x1017) == 100
+    assert peer.value(0x6071) == peer.value(0x60FF) == 0
+
+
+def test_nothing_is_switched_on_meanwhile(make, peer, wire):
+    preflight(make())
+    assert peer.machine.state == OFF
+    assert not [entry for entry in peer.writes if entry[0] == 0x6040]
+    assert wire.of(0x201) == wire.of(0x080) == []
+
+
+def test_the_watchdog_is_fed_before_it_is_read_back(make, peer, wire):
+    """Supervision begins with the first heartbeat."""
+    preflight(make(host_node=99))
+    frames = [(identifier, data.hex()) for identifier, data in wire.sent]
+    armed = frames.index((0x601, "2316100190016300"))
+    fed = frames.index((0x763, "05"))
+    assert armed < fed
+    assert (0x601, "4016100100000000") in frames[fed:]
+
+
+@pytest.mark.parametrize(("field", "row"), [
+    ("vendor", "identity: vendor"), ("product", "identity: product"), ("revision", "identity: revision"),
+])
+def test_another_drive(make, peer, profile, field, row):
+    found = preflight(make(changed=changed(profile, "identity", **{field: 0x99})))
+    assert list(refused(found)) == [row]
+    check = refused(found)[row]
+    assert (check.wanted, check.where) == ("99h", "1018h")
+    assert "--profile" in check.next_step
+    assert [row.name for row in found.checks][1:] == ROWS[1:]
+
+
+def test_the_right_drive(make, peer, profile):
+    found = preflight(make(changed=changed(profile, "identity", vendor=0x11, product=0x22, revision=0x33)))
+    assert found.refused == ()
+
+
+def test_a_fault_at_the_start_is_refused_and_left_alone(make, peer):
+    peer.machine.state = FAULT
+    drive = make()
+    found = preflight(drive)
+    assert list(refused(found)) == ["state"]
+    assert "7305h" in refused(found)["state"].found
+    assert "--reset-fault" in refused(found)["state"].next_step
+    drive.enable(Mode.SPEED)
+    for _ in range(20):
+        drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    assert peer.machine.state == FAULT
+    assert all(word & 0x80 == 0 for word, _, _ in peer.setpoints)
+
+
+@pytest.mark.parametrize("before", [0x00, 0x80, 0x8F])
+def test_a_reset_that_was_asked_for_is_an_edge(make, peer, before):
+    peer.machine.state, peer.machine.word = FAULT, before
+    drive = make()
+    drive.connect()
+    drive.reset_fault()
+    assert peer.machine.state == OFF
+    words = [int.from_bytes(data, "little") for index, _, data in peer.writes if index == 0x6040]
+    assert [word >> 7 & 1 for word in words] == [0, 1, 0]
+    assert all(word & 0x0F == 0 for word in words)
+    assert drive.preflight(LIMITS).refused == ()
+
+
+def test_a_drive_that_another_master_runs(make, peer):
+    peer.machine.state = ENABLED
+    assert "Another master" in refused(preflight(make()))["state"].next_step
+
+
+def test_no_rated_torque(make, peer):
+    del peer.objects[0x6076, 0]
+    found = preflight(make())
+    check = refused(found)["rated torque"]
+    assert check.where == "6076h"
+    assert "rig.yaml" in check.next_step
+    assert [check.name for check in found.checks] == ROWS
+
+
+def test_rated_torque_from_the_rig(make, peer, profile):
+    del peer.objects[0x6076, 0]
+    found = preflight(make(rated_torque_nm=500.0))
+    assert found.refused == ()
+    assert (found.rated_torque_nm, found.torque_resolution_nm) == (500.0, 0.5)
+    assert peer.value(0x6072) == 600
+
+
+@pytest.mark.parametrize(("rig", "good"), [(1000.0, True), (1000.9, True), (1002.0, False), (500.0, False)])
+def test_rated_torque_from_both(make, peer, rig, good):
+    found = preflight(make(rated_torque_nm=rig))
+    assert ("rated torque" not in refused(found)) == good
+
+
+LIMIT_OBJECTS = [(0x6072, "torque limit"), (0x6080, "speed limit"), (0x6085, "quick-stop ramp"),
+                 (0x605A, "quick-stop option"), (0x1006, "cycle"), (0x1017, "drive's heartbeat"),
+                 (0x6007, "watchdog reaction")]
+
+
+@pytest.mark.parametrize(("index", "row"), LIMIT_OBJECTS)
+def test_accepted_but_not_taken_over(make, peer, index, row):
+    peer.deaf_to.add((index, 0))
+    found = preflight(make())
+    assert list(refused(found)) == [row]
+    assert refused(found)[row].where == f"{index:04X}h"
+    assert [check.name for check in found.checks] == ROWS
+
+
+@pytest.mark.parametrize(("index", "row"), [pair for pair in LIMIT_OBJECTS if pair[0] not in (0x1006, 0x1017)])
+def test_refused_by_the_drive(make, peer, index, row):
+    peer.refuse_write[index, 0] = 0x06090031
+    found = preflight(make())
+    assert list(refused(found)) == [row]
+    assert "06090031" in refused(found)[row].found.upper()
+    assert [check.name for check in found.checks] == ROWS
+
+
+def test_limits_that_are_there_already(make, peer):
+    peer.objects[0x6072, 0] = u(300, 2)
+    assert preflight(make()).refused == ()
+    assert not [entry for entry in peer.writes if entry[0] == 0x6072]
+
+
+@pytest.mark.parametrize("index", [0x6071, 0x60FF])
+def test_a_target_that_cannot_be_cleared(make, peer, index):
+    peer.refuse_write[index, 0] = 0x06020000
+    found = preflight(make())
+    assert refused(found)["targets"].where == f"{index:04X}h"
+    assert [check.name for check in found.checks] == ROWS
+
+
+def test_the_mode_display_does_not_follow(make, peer, fake_time):
+    peer.deaf_to.add((0x6061, 0))
+    begin_s = fake_time.now_s
+    found = preflight(make())
+    assert list(refused(found)) == ["mode display for 9", "mode display for 10"]
+    assert refused(found)["mode display for 9"].found == "3"
+    assert fake_time.now_s - begin_s < 5.0
+
+
+def test_a_mode_display_that_follows_late(make, peer, wire):
+    peer.deaf_to.add((0x6061, 0))
+    reads = []
+
+    def follow(request):
+        if request[:3] == b"\x40\x61\x60":
+            reads.append(request)
+            if len(reads) % 4 == 0:
+                peer.objects[0x6061, 0] = peer.objects[0x6060, 0]
+
+    peer.before_answer = follow
+    assert preflight(make()).refused == ()
+
+
+def bits(*modes):
+    return u(sum(1 << mode - 1 for mode in modes), 4)
+
+
+@pytest.mark.parametrize(("modes", "chosen"), [
+    ((3, 4, 9, 10), {Mode.SPEED: 9, Mode.TORQUE: 10}), ((3, 4), {Mode.SPEED: 3, Mode.TORQUE: 4}),
+    ((9, 4), {Mode.SPEED: 9, Mode.TORQUE: 4}), ((1, 3, 8), {Mode.SPEED: 3}),
+])
+def test_modes_that_the_drive_has(make, peer, wire, modes, chosen):
+    peer.objects[0x6502, 0] = bits(*modes)
+    drive = make()
+    found = preflight(drive)
+    assert found.refused == ()
+    assert found.modes == set(chosen)
+    for mode, code in chosen.items():
+        wire.sent.clear()
+        drive.exchange(Command(mode, 0.0, 0.0))
+        assert wire.of(0x301) == [bytes([code])]
+
+
+def test_no_speed_mode(make, peer):
+    peer.objects[0x6502, 0] = bits(1, 4, 6)
+    found = preflight(make())
+    assert list(refused(found)) == ["modes of operation"]
+    assert refused(found)["modes of operation"].where == "6502h"
+
+
+def test_a_mode_that_was_not_found_cannot_be_asked_for(make, peer):
+    peer.objects[0x6502, 0] = bits(3)
+    drive = make()
+    preflight(drive)
+    with pytest.raises(PreflightRefused, match="torque"):
+        drive.enable(Mode.TORQUE)
+
+
+@pytest.mark.parametrize("how", ["absent", "refused", "deaf"])
+def test_a_watchdog_that_cannot_be_armed(make, peer, how):
+    if how == "absent":
+        del peer.objects[0x1016, 1]
+    elif how == "refused":
+        peer.refuse_write[0x1016, 1] = 0x06040043
+    else:
+        peer.deaf_to.add((0x1016, 1))
+    found = preflight(make())
+    assert list(refused(found)) == ["watchdog"]
+    assert refused(found)["watchdog"].where == "1016h:1"
+    assert "host" in refused(found)["watchdog"].next_step
+
+
+def test_a_drive_without_a_watchdog(make, peer, profile):
+    found = preflight(make(changed=changed(profile, "watchdog", kind="none", reaction="none")))
+    assert list(refused(found)) == ["watchdog"]
+    assert found.safe_action == "none"
+
+
+@pytest.mark.parametrize("marker", [None, b"some other drive", b"tdhil simulated drive 2"])
+def test_stepped_time_is_for_simulated_drives(make, wire, marker):
+    peer = ScriptedDrive(wire, marker=False)
+    if marker is not None:
+        peer.objects[0x5FFE, 1] = marker
+    with pytest.raises(PreflightRefused, match="marker") as caught:
+        make().connect()
+    assert caught.value.where == "5FFEh:1"
+    assert "--stepped" in caught.value.next_step
+
+
+def test_a_real_drive_is_never_written_to_in_the_manufacturers_range(make, wire):
+    peer = ScriptedDrive(wire, marker=False)
+    found = preflight(make(MonotonicClock()))
+    assert found.refused == ()
+    assert not found.identity.simulated
+    assert "stepped time" not in [check.name for check in found.checks]
+    assert not [entry for entry in peer.writes if 0x2000 <= entry[0] < 0x6000]
+
+
+def test_a_simulated_drive_may_keep_its_own_time(make, peer):
+    found = preflight(make(MonotonicClock()))
+    assert found.identity.simulated
+    assert not [entry for entry in peer.writes if entry[0] == 0x5FFE]
+
+
+@pytest.mark.parametrize(("index", "row"), [(0x1006, "cycle"), (0x1017, "drive's heartbeat")])
+def test_what_a_drive_may_lack(make, peer, index, row):
+    del peer.objects[index, 0]
+    found = preflight(make())
+    assert found.refused == ()
+    assert next(check for check in found.checks if check.name == row).outcome is Outcome.NOTE
+
+
+def test_a_drive_without_a_demand_is_mapped_without_it(make, peer):
+    del peer.objects[0x6074, 0]
+    assert preflight(make()).refused == ()
+    assert peer.value(0x1A01) == 1
+
+
+def test_a_drive_with_a_fixed_mapping(make, peer):
+    peer.refuse_write[0x1A00, 0] = 0x06010002
+    found = preflight(make())
+    assert list(refused(found)) == ["PDO mapping"]
+    assert refused(found)["PDO mapping"].where == "1A00h"
+
+
+def test_everything_wrong_at_once(make, peer, profile):
+    peer.machine.state = FAULT
+    peer.objects[0x6502, 0] = bits(4)
+    del peer.objects[0x6076, 0]
+    peer.deaf_to |= {(index, 0) for index in (0x6080, 0x6085, 0x605A, 0x6061, 0x1006, 0x1017, 0x6007)}
+    peer.refuse_write |= {(0x1016, 1): 0x06040043, (0x6071, 0): 0x06020000, (0x1600, 0): 0x06010002}
+    found = preflight(make(changed=changed(profile, "identity", vendor=0x99)))
+    rows = [check.name for check in found.checks]
+    by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4"}
+    assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
+    good = {"stepped time"}
+    assert set(refused(found)) == set(rows) - good
+    assert all(check.where for check in found.refused)
+
+
+@pytest.mark.parametrize("step", ["connect", "preflight"])
+def test_nobody_there(make, peer, step):
+    drive = make()
+    if step == "preflight":
+        drive.connect()
+    peer.silent = True
+    with pytest.raises(CommunicationLost, match="does not answer") as caught:
+        drive.connect() if step == "connect" else drive.preflight(LIMITS)
+    assert "bit rate" in caught.value.next_step
+
+
+def test_what_was_refused_is_given_back_on_close(make, peer):
+    before = dict(peer.objects)
+    peer.deaf_to.add((0x6061, 0))
+    drive = make()
+    preflight(drive)
+    drive.close()
+    kept = [key for key in before if 0x1400 <= key[0] < 0x1C00 or key[0] in (0x6060, 0x6071, 0x60FF)]
+    assert {key: value for key, value in peer.objects.items() if key not in kept} == {
+        key: value for key, value in before.items() if key not in kept
+    }
+    assert not peer.operational
