@@ -18,16 +18,24 @@ class Clock(Protocol):
     def wait_until(self, time_s: float) -> float: ...
 
 
+def _boot_time_s() -> float:
+    """Monotonic, and it goes on while a laptop sleeps: a loop that slept through must notice that it did."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+_now_s = _boot_time_s if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
+
+
 class MonotonicClock:
-    """The machine's monotonic clock; its zero is the moment it was made."""
+    """The machine's monotonic clock, time asleep included; its zero is the moment it was made."""
 
     stepped = False
 
     def __init__(self) -> None:
-        self._zero_s = time.monotonic()
+        self._zero_s = _now_s()
 
     def now_s(self) -> float:
-        return time.monotonic() - self._zero_s
+        return _now_s() - self._zero_s
 
     def wait_until(self, time_s: float) -> float:
         left_s = time_s - self.now_s()

@@ -12,6 +12,9 @@ from drivers.errors import ObjectRefused
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile, Watchdog
 
+LEAST_CYCLES = 5
+"""The watchdog must not bite on account of a lost frame or two."""
+
 
 def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile) -> bool:
     """Map both pairs of PDOs; whether the slow one carries the torque demand 6074h too."""
@@ -47,7 +50,14 @@ def set_timing(table: Table, objects: Objects, period_s: float, heartbeat_s: flo
 
 
 def arm_watchdog(
-    table: Table, objects: Objects, entry: Watchdog, host_node: int, watchdog_s: float, beat: Callable[[], None]
+    table: Table,
+    objects: Objects,
+    entry: Watchdog,
+    *,
+    host_node: int,
+    watchdog_s: float,
+    period_s: float,
+    beat: Callable[[], None],
 ) -> None:
     """1016h and its reaction, written and read back. Supervision begins with the first beat, so one is sent."""
     if entry.kind == "none":
@@ -65,6 +75,12 @@ def arm_watchdog(
 
         table.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
     time_ms = round(watchdog_s * 1000)
+    if not 1 <= time_ms <= 0xFFFF or watchdog_s < LEAST_CYCLES * period_s:
+        table.row(
+            "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
+            f"Give it at least {LEAST_CYCLES * period_s:g} s, or a higher rate",
+        )
+        return
     value = consumer_heartbeat(host_node, time_ms)
 
     def arm() -> tuple[str, bool]:

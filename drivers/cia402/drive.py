@@ -108,6 +108,7 @@ class Cia402Drive:
         self._link.handlers[self._tpdo1_id] = self._on_feedback
         self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
         self._identity: Identity | None = None
+        self._taken = False
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
         self._modes: dict[int, Mode] = {}
@@ -137,7 +138,12 @@ class Cia402Drive:
 
     def connect(self) -> Identity:
         """Find the node, put it into pre-operational, read who it is (1018h) and whether it is simulated."""
-        self._objects.read(0x1000)
+        try:
+            self._objects.read(0x1000)
+        except CommunicationLost as error:
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
+        checks.refuse_if_driven(self._objects)
+        self._taken = True
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
         vendor, product, revision, serial = (self._objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
         try:
@@ -173,7 +179,13 @@ class Cia402Drive:
         heard = arming.set_timing(table, objects, self.period_s, HEARTBEAT_S, self.clock.stepped)
         self._watchdog_s = limits.watchdog_s
         arming.arm_watchdog(
-            table, objects, self._profile.watchdog, self._host_node, limits.watchdog_s, self._send_heartbeat
+            table,
+            objects,
+            self._profile.watchdog,
+            host_node=self._host_node,
+            watchdog_s=limits.watchdog_s,
+            period_s=self.period_s,
+            beat=self._send_heartbeat,
         )
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
@@ -234,6 +246,8 @@ class Cia402Drive:
         speed_raw = encode_speed(command.speed_rad_s, self._units)
         torque_raw = encode_torque(command.torque_nm, self._units)
         self._wait_for_tick()
+        # What came since the last cycle is looked at before this cycle's setpoint goes out.
+        self._watch.check()
         now_s = self.clock.now_s()
         if now_s >= self._next_heartbeat_s:
             self._send_heartbeat()
@@ -251,10 +265,18 @@ class Cia402Drive:
         if fresh:
             self._status, self._torque_raw, self._speed_raw = TPDO1.unpack(self._feedback)
             self._state = decode(self._status)
+            self._follow_state()
         else:
             self._missed += 1
         self._watch.check()
         return self._sample(now_s, age_s, fresh)
+
+    def _follow_state(self) -> None:
+        """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us."""
+        if self._wish is Wish.ENABLED and self._state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            self._wish = Wish.OFF
+        elif self._wish is Wish.ENABLED and self._state is State.QUICK_STOP_ACTIVE:
+            self._wish = Wish.QUICK_STOP
 
     def _wait_for_tick(self) -> None:
         clock = self.clock
@@ -337,14 +359,14 @@ class Cia402Drive:
     # -- afterwards ------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Give the drive its former settings back and let go of the bus.
+        """Give the drive its former settings back and let go of the bus; targets stay at zero.
 
         Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that
         follows makes it act.
         """
         self._watch.stop()
         try:
-            if self._state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+            if self._taken and self._state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
                 self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
                 self._objects.restore()
         except CommunicationLost:

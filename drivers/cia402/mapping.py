@@ -62,17 +62,16 @@ def layout(with_demand: bool) -> tuple[Pdo, Pdo, Pdo, Pdo]:
 
 
 def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
-    """Map one PDO and read it back. Raises ObjectRefused, or PreflightRefused if it doesn't read back."""
+    """Map one PDO and read it back; `Objects.restore` gives the former mapping back.
+
+    Raises ObjectRefused, or PreflightRefused if it doesn't read back.
+    """
     identifier = pdo.identifier(node)
-    objects.write(pdo.communication, 1, DISABLED | identifier, 32)
-    objects.write(pdo.mapping, 0, 0, 8)
-    for position, mapped in enumerate(pdo.mapped, start=1):
-        objects.write(pdo.mapping, position, mapping_entry(mapped), 32)
-    objects.write(pdo.mapping, 0, len(pdo.mapped), 8)
-    objects.write(pdo.communication, 2, pdo.sync_type, 8)
-    objects.write(pdo.communication, 1, identifier, 32)
     wanted = [mapping_entry(mapped) for mapped in pdo.mapped]
-    found = [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
+    former = (_entries(objects, pdo), objects.read(pdo.communication, 2), objects.read(pdo.communication, 1))
+    objects.on_restore(lambda: _write(objects, pdo, *former))
+    _write(objects, pdo, wanted, pdo.sync_type, identifier)
+    found = _entries(objects, pdo)
     if found != wanted:
         raise PreflightRefused(
             f"the PDO mapping reads back as {[f'{entry:08X}h' for entry in found]}",
@@ -87,3 +86,19 @@ def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
             where=name(pdo.communication),
             next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
         )
+
+
+def _entries(objects: Objects, pdo: Pdo) -> list[int]:
+    """What is mapped; entries beyond the count are nobody's business."""
+    return [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
+
+
+def _write(objects: Objects, pdo: Pdo, entries: list[int], sync_type: int, cob_id: int) -> None:
+    objects.write(pdo.communication, 1, DISABLED | cob_id, 32)
+    objects.write(pdo.mapping, 0, 0, 8)
+    for position, entry in enumerate(entries, start=1):
+        objects.write(pdo.mapping, position, entry, 32)
+    objects.write(pdo.mapping, 0, len(entries), 8)
+    objects.write(pdo.communication, 2, sync_type, 8)
+    if not cob_id & DISABLED:
+        objects.write(pdo.communication, 1, cob_id, 32)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from drivers.cia402.filters import read_filters
 from drivers.cia402.objects import MODE_NAMES, RPM, Units
@@ -17,15 +16,8 @@ from drivers.drive import Check, Identity, Limits, Mode, Outcome, Preflight
 from drivers.errors import PreflightRefused
 from profiles.schema import CanopenProfile
 
-
-@dataclass(frozen=True)
-class Findings:
-    """What preflight leaves to the cyclic part of the driver."""
-
-    preflight: Preflight
-    units: Units
-    mode_codes: dict[Mode, int] = field(default_factory=dict)
-    has_demand: bool = False
+STILL_LSB = 5
+"""Velocity counts that are the noise of a shaft at rest."""
 
 
 class Table:
@@ -83,15 +75,29 @@ def check_identity(table: Table, identity: Identity, profile: CanopenProfile) ->
 
 
 def check_state(table: Table, objects: Objects) -> None:
-    """A drive in fault is refused, and never reset silently."""
+    """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop."""
     state = decode(objects.read(0x6041))
     faulty = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
     code = objects.read_if_there(0x603F)
     found = state.value + (f", error code {code:04X}h" if faulty and code is not None else "")
-    table.row(
-        "state", "no fault, not enabled", found, not faulty and state is not State.OPERATION_ENABLED, "6041h",
-        "Clear the fault's cause, then start with --reset-fault" if faulty else "Another master drives it: take it off",
-    )
+    braking = False
+    if state is State.QUICK_STOP_ACTIVE:
+        # Disabling would let it coast: it must have come to rest under its own quick stop.
+        speed_lsb = objects.read(0x606C, signed=True)
+        braking = abs(speed_lsb) > STILL_LSB
+        found += f", velocity {speed_lsb}"
+    mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
+    table.row("state", "no fault, at rest", found, not faulty and not braking, "6041h", mend)
+
+
+def refuse_if_driven(objects: Objects) -> None:
+    """Before anything is sent that could change what a turning shaft does. Raises PreflightRefused."""
+    if decode(objects.read(0x6041)) is State.OPERATION_ENABLED:
+        raise PreflightRefused(
+            "the drive is enabled already: another master drives it",
+            where="6041h",
+            next_step="Take that master off the bus, or disable the drive there; nothing was written to it",
+        )
 
 
 def choose_modes(table: Table, objects: Objects, profile: CanopenProfile) -> dict[Mode, int]:
@@ -115,7 +121,7 @@ def check_mode_display(table: Table, objects: Objects, code: int, wait: Callable
     """6060h is written while nothing is enabled; 6061h must follow."""
 
     def work() -> tuple[str, bool]:
-        objects.write(0x6060, 0, code, 8)
+        objects.change(0x6060, 0, code, 8)
         shown = objects.read(0x6061, signed=True)
         for _ in range(20):
             if shown == code:

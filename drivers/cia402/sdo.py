@@ -7,6 +7,7 @@ waiting is replaced: it pulls frames off the link instead of sleeping on a queue
 from __future__ import annotations
 
 import queue
+from collections.abc import Callable
 from typing import Any
 
 import canopen
@@ -83,7 +84,8 @@ class Objects:
     def __init__(self, link: CanLink, node: int) -> None:
         self._client = _PumpingClient(link, node)
         self._node = node
-        self._written: dict[tuple[int, int], tuple[int, int]] = {}
+        self._undo: list[Callable[[], None]] = []
+        self._changed: set[tuple[int, int]] = set()
 
     def read_bytes(self, index: int, subindex: int = 0) -> bytes:
         try:
@@ -122,21 +124,28 @@ class Objects:
         signed = value < 0
         before = self.read(index, subindex, signed=signed)
         if before != value:
-            self._written.setdefault((index, subindex), (before, bits))
+            if (index, subindex) not in self._changed:
+                self._changed.add((index, subindex))
+                self.on_restore(lambda: self.write(index, subindex, before, bits))
             self.write(index, subindex, value, bits)
         return self.read(index, subindex, signed=signed)
 
+    def on_restore(self, undo: Callable[[], None]) -> None:
+        """Have ``undo`` called by `restore`."""
+        self._undo.append(undo)
+
     def restore(self) -> tuple[str, ...]:
-        """Give every changed object its former value back, the last change first; what could not be given back."""
+        """Undo every change, the last one first; what could not be given back."""
         failed = []
-        for (index, subindex), (value, bits) in reversed(self._written.items()):
+        self._changed.clear()
+        while self._undo:
             try:
-                self.write(index, subindex, value, bits)
-            except (ObjectRefused, CommunicationLost) as error:
+                self._undo.pop()()
+            except ObjectRefused as error:
                 failed.append(str(error))
-                if isinstance(error, CommunicationLost):
-                    break
-        self._written.clear()
+            except CommunicationLost as error:
+                failed.append(str(error))
+                self._undo.clear()
         return tuple(failed)
 
     def _silent(self, index: int, subindex: int) -> CommunicationLost:

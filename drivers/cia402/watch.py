@@ -1,7 +1,7 @@
 """What the drive says unasked: heartbeat, boot-up and emergency messages.
 
-The first trouble is kept until it has been raised once; a stop sequence that goes on exchanging is then not
-disturbed by it again.
+Each kind of trouble is kept until it has been raised, once, in the order in which they came; a stop sequence that
+goes on exchanging is then not disturbed by it again.
 """
 
 from drivers.clock import Clock
@@ -60,7 +60,7 @@ class Watch:
         self._node = node
         self._clock = clock
         self._heard_s: float | None = None
-        self._trouble: TdhilError | None = None
+        self._troubles: list[TdhilError] = []
         self._raised: set[str] = set()
         self._started_s = 0.0
         self._operational = False
@@ -115,7 +115,7 @@ class Watch:
             )
 
     def check(self) -> None:
-        """Raise the first trouble not raised yet."""
+        """Raise the oldest trouble not raised yet."""
         if self.allowed_silence_s and self._heard_s is not None:
             silent_s = self._clock.now_s() - self._heard_s
             if silent_s > self.allowed_silence_s:
@@ -127,9 +127,8 @@ class Watch:
                         next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
                     ),
                 )
-        if self._trouble is not None:
-            trouble, self._trouble = self._trouble, None
-            raise trouble
+        if self._troubles:
+            raise self._troubles.pop(0)
 
     def start(self, allowed_silence_s: float) -> None:
         """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
@@ -146,4 +145,4 @@ class Watch:
     def _keep(self, kind: str, trouble: TdhilError) -> None:
         if kind not in self._raised:
             self._raised.add(kind)
-            self._trouble = self._trouble or trouble
+            self._troubles.append(trouble)

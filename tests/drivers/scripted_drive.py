@@ -17,8 +17,14 @@ RPDO1, TPDO1, TPDO2 = struct.Struct("<Hhi"), struct.Struct("<Hhi"), struct.Struc
 class FakeTime:
     """Stands in for the module `time` in the driver's files: it moves when somebody waits."""
 
+    CLOCK_BOOTTIME = 7
+
     def __init__(self) -> None:
         self.now_s = 1000.0
+
+    def clock_gettime(self, clock: int) -> float:
+        assert clock == self.CLOCK_BOOTTIME
+        return self.now_s
 
     def monotonic(self) -> float:
         return self.now_s

@@ -1,7 +1,7 @@
 """What is refused before anything moves. Each row by itself, and never one row at the cost of those after it."""
 
 import pytest
-from power_machine import ENABLED, FAULT, OFF
+from power_machine import ENABLED, FAULT, OFF, STOPPING
 from scripted_drive import ScriptedDrive, u
 
 from drivers.cia402.drive import Cia402Drive
@@ -123,7 +123,19 @@ def test_a_reset_that_was_asked_for_is_an_edge(make, peer, before):
 
 def test_a_drive_that_another_master_runs(make, peer):
     peer.machine.state = ENABLED
-    assert "Another master" in refused(preflight(make()))["state"].next_step
+    drive = make()
+    with pytest.raises(PreflightRefused, match="another master"):
+        drive.connect()
+    drive.close()
+    assert peer.writes == []
+    assert not peer.operational
+
+
+@pytest.mark.parametrize(("velocity", "good"), [(0, True), (4, True), (300, False), (-300, False)])
+def test_a_drive_that_still_brakes_after_a_stop_is_left_alone(make, peer, velocity, good):
+    peer.machine.state = STOPPING
+    peer.objects[0x606C, 0] = velocity.to_bytes(4, "little", signed=True)
+    assert ("state" not in refused(preflight(make()))) == good
 
 
 def test_no_rated_torque(make, peer):
@@ -332,7 +344,7 @@ def test_nobody_there(make, peer, step):
     if step == "preflight":
         drive.connect()
     peer.silent = True
-    with pytest.raises(CommunicationLost, match="does not answer") as caught:
+    with pytest.raises(PreflightRefused if step == "connect" else CommunicationLost, match="does not answer") as caught:
         drive.connect() if step == "connect" else drive.preflight(LIMITS)
     assert "bit rate" in caught.value.next_step
 
