@@ -71,11 +71,15 @@ def friction_torque(params: Params, state: State, drive_nm: float = 0.0) -> floa
     return copysign(params.coulomb_nm, state.speed_rad_s)
 
 
+_TINY = 1e-15
+
+
 def _response(params: Params, dt_s: float) -> float:
     """(1 − e^−x)/B: speed gained in ``dt_s`` per unit of net torque, rad/(s·N·m)."""
     viscous = params.viscous_nm_s_rad
     inertia = params.inertia_kg_m2
-    return -expm1(-viscous * dt_s / inertia) / viscous if viscous > 0.0 else dt_s / inertia
+    # Below this share the exponential is its first term to the last bit, and the quotient would underflow.
+    return -expm1(-viscous * dt_s / inertia) / viscous if viscous * dt_s > _TINY * inertia else dt_s / inertia
 
 
 def _coulomb(params: Params, speed: float, drive: float, dt_s: float) -> tuple[float, float]:
@@ -93,7 +97,8 @@ def _coulomb(params: Params, speed: float, drive: float, dt_s: float) -> tuple[f
     if end * side >= 0.0:
         return end, 0.5 * (speed + end) * dt_s
     inertia = params.inertia_kg_m2
-    crossing = log1p(-speed * viscous / net) * inertia / viscous if viscous > 0.0 else -speed * inertia / net
+    damped = abs(speed) * viscous > _TINY * abs(net)
+    crossing = log1p(-speed * viscous / net) * inertia / viscous if damped else -speed * inertia / net
     travel = 0.5 * speed * crossing
     if -dry <= drive <= dry:
         return 0.0, travel

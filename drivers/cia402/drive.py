@@ -68,6 +68,8 @@ HEARTBEAT_S = 0.1
 """Both ways; the host's comes faster where the watchdog is shorter than five of them."""
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
+STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
+"""Wall time that feedback may take in stepped time, and after a cycle that brought none."""
 _NO_WORD = b""
 _PROFILE_VELOCITY = 3
 _REPEAT_MODE_CYCLES = 25
@@ -125,6 +127,7 @@ class Cia402Drive:
         self._sent_code = 0
         self._since_mode_sent = 0
         self._feedback = _NO_WORD
+        self._heard = True
         self._next_tick_s = 0.0
         self._next_heartbeat_s = 0.0
         self._cycles = self._missed = self._late = self._overruns = 0
@@ -261,7 +264,7 @@ class Cia402Drive:
         self._link.send(SYNC, _NO_WORD)
         age_s = self._await_feedback(now_s)
         self._cycles += 1
-        fresh = bool(self._feedback)
+        fresh = self._heard = bool(self._feedback)
         if fresh:
             self._status, self._torque_raw, self._speed_raw = TPDO1.unpack(self._feedback)
             self._state = decode(self._status)
@@ -312,7 +315,8 @@ class Cia402Drive:
         clock = self.clock
         link = self._link
         if clock.stepped:
-            deadline_s = time.monotonic() + 0.5
+            # In stepped time nothing is late, it is lost; a peer that has fallen silent must not hold the host up.
+            deadline_s = time.monotonic() + (STEPPED_WAIT_S if self._heard else STEPPED_WAIT_SILENT_S)
             while not self._feedback and (left_s := deadline_s - time.monotonic()) > 0.0:
                 link.receive(left_s)
             return 0.0

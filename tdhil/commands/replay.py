@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.commands.conclude import conclude, print_result
-from tdhil.errors import ExitCode
+from tdhil.errors import ExitCode, UsageError
+from tdhil.record.errors import LogError
+
+
+class NothingRecoverable(LogError):
+    """A log of which nothing can be read."""
+
+    exit_code = ExitCode.NOTHING_RECOVERABLE
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +29,12 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.record.reader import read_run
     from tdhil.report.live import stderr_console
 
-    found = read_run(namespace.log)
+    if not namespace.log.is_file():
+        raise UsageError("there is no such log", where=str(namespace.log), next_step="Name a run.mcap of this tool")
+    try:
+        found = read_run(namespace.log)
+    except LogError as error:
+        raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
     configuration: dict[str, Any] = found.configuration
     document, code = conclude(found.recording, configuration, str(namespace.log))
     console = stderr_console()

@@ -6,9 +6,10 @@ import argparse
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The simulator's own options."""
+    """What to pretend to be, and the simulator's own options."""
     from sim_bus.__main__ import add_arguments as add_simulator_arguments
     from sim_bus.__main__ import run
 
+    parser.add_argument("kind", choices=("canopen",), help="the bus on which the drive is simulated")
     add_simulator_arguments(parser)
     parser.set_defaults(run=run)

@@ -5,7 +5,7 @@ lag τ and a reaction time t_r the shaft will have reached, before anything the 
 
     ω_pred = ω_reported + |T_net| / J_min · (t_r + τ_max)        T_net = T − T_c − B ω
 
-and it is ω_pred that must stay inside the window (a quantum of speed at 250 Hz is already 2.6 rad/s², so
+and it is ω_pred that must stay below the window's upper end (a quantum of speed at 250 Hz is already 2.6 rad/s², so
 differentiating the reported speed instead would see nothing but noise).
 """
 

@@ -1,0 +1,98 @@
+"""Examples load, are complete, and the page on rig.yaml knows every key."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from profiles.strict_yaml import load_with_lines
+from sim_bus.params import RigParams
+from sim_bus.params import load_rig as load_plant
+from tdhil.options import OPTIONS
+from tdhil.rig import Rig, load_rig, require_limits
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "rig.yaml"
+PLANT = ROOT / "examples" / "plant.yaml"
+
+
+def keys(model: type[BaseModel], prefix: str = "") -> dict[str, Any]:
+    """Dotted key → default, `PydanticUndefined` where the key is required."""
+    found: dict[str, Any] = {}
+    for name, field in model.model_fields.items():
+        key = prefix + (field.alias or name)
+        inner = next((part for part in (field.annotation, *getattr(field.annotation, "__args__", ()))
+                      if isinstance(part, type) and issubclass(part, BaseModel)), None)
+        found |= keys(inner, f"{key}.") if inner else {key: field.default}
+    return found
+
+
+def rows() -> dict[str, list[str]]:
+    text = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
+    found = re.findall(r"^\| `([a-z_.0-9]+)` \| (.*) \|$", text, re.MULTILINE)
+    assert len(found) == len({key for key, _ in found})
+    return {key: [cell.strip() for cell in rest.split(" | ")] for key, rest in found}
+
+
+def test_rig_example_is_a_bench_that_may_move():
+    rig = load_rig(EXAMPLE)
+    require_limits(rig)
+    assert rig.bus.interface == "socketcan"
+    assert rig.run.simulate is None
+    assert rig.run.yes is None
+
+
+def test_rig_example_shows_every_key_but_those_for_trying_things_out():
+    text = EXAMPLE.read_text(encoding="utf-8")
+    missing = {key for key in keys(Rig) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
+    assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
+                       "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped", "run.yes",
+                       "run.json", "run.plant"}
+
+
+def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
+    text = re.sub(r"^# ?( *[a-z_0-9]+: +[0-9].*)$", lambda found: _indented(found[1]), EXAMPLE.read_text("utf-8"),
+                  flags=re.MULTILINE)
+    path = tmp_path / "rig.yaml"
+    path.write_text(text.replace("load: none", "load: string"), encoding="utf-8")
+    rig = load_rig(path)
+    assert rig.make_up_torque_nm == 9000
+    assert rig.drive_data.torque_lag_sd_s == 0.01
+
+
+def _indented(line: str) -> str:
+    return ("  " if "lag" in line else "") + line
+
+
+def test_plant_example_is_the_default_rig_and_complete():
+    assert load_plant(PLANT) == RigParams()
+    lines = load_with_lines(PLANT, RigParams).lines
+    assert {".".join(map(str, path)) for path in lines} >= set(keys(RigParams))
+
+
+def test_page_has_every_key_and_no_other():
+    assert set(rows()) == set(keys(Rig))
+
+
+@pytest.mark.parametrize("key", sorted(keys(Rig)))
+def test_page_says_the_true_default(key):
+    default = keys(Rig)[key]
+    shown = rows()[key][0]
+    built_in = next((option.default for option in OPTIONS if option.at == key), None)
+    if default is PydanticUndefined:
+        assert shown == "needed"
+    elif default is not None or built_in is not None:
+        value = built_in if default is None else default
+        assert shown == (str(value).lower() if isinstance(value, bool) else str(value))
+    else:
+        assert not re.match(r"[0-9]", shown)
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.flag)
+def test_page_names_the_option(option):
+    assert f"`{option.flag}`" in rows()[option.at][1]

@@ -1,0 +1,73 @@
+"""The drawing of the house is true, starting is cheap, and nothing of one machine stands in the tree."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("numpy", "scipy", "can", "canopen", "rich", "pydantic", "google.protobuf", "mcap", "pymodbus", "yaml")
+HOME = re.compile(rb"(?<![\w.~$}/*])/(?:home|Users|root|work)/[\w.]+")
+SKIPPED = {"__pycache__", "build", "dist", "node_modules"}
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("importlinter") is None,
+                    reason="import-linter is not installed (pip install '.[lint]'); .ci/run checks the contracts too")
+def test_import_contracts_hold():
+    check = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(cache_dir=None))"
+    done = run("-c", check)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 broken" in done.stdout
+
+
+def test_help_lists_the_commands():
+    done = run("-m", "tdhil", "--help")
+    assert done.returncode == 0
+    assert {"identify", "replay", "simulate"} <= set(done.stdout.split())
+    assert "no emergency stop" in " ".join(done.stdout.split())
+
+
+def test_help_imports_nothing_heavy():
+    script = (
+        "import sys\n"
+        "from tdhil.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        f"print('loaded:', *[name for name in {HEAVY!r} if name in sys.modules])\n"
+    )
+    done = run("-c", script)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1].split() == ["loaded:"]
+
+
+@pytest.mark.parametrize("command", ["identify", "replay", "simulate"])
+def test_help_of_a_command_comes_quickly(command):
+    done = run("-X", "importtime", "-m", "tdhil", command, "--help")
+    assert done.returncode == 0
+    imported = {line.rsplit("|", 1)[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "argparse" in imported
+    assert imported.isdisjoint({"scipy", "canopen", "mcap", "matplotlib"})
+
+
+def test_no_path_of_a_home_stands_in_the_tree():
+    found = []
+    for folder, folders, names in os.walk(ROOT):
+        folders[:] = [name for name in folders
+                      if name not in SKIPPED and (not name.startswith(".") or name == ".ci")
+                      and not name.endswith(".egg-info")]
+        for name in names:
+            path = Path(folder) / name
+            if path.suffix in {".mcap", ".pyc"} or not path.is_file():
+                continue
+            found += [f"{path.relative_to(ROOT)}: {hit.decode()}" for hit in HOME.findall(path.read_bytes())]
+    assert found == []

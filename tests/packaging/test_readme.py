@@ -1,0 +1,97 @@
+"""The README can be believed: its commands parse, its files load, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tdhil.cli import build_parser
+from tdhil.errors import ExitCode
+from tdhil.rig import load_rig, require_limits
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+
+
+def blocks(language: str) -> list[str]:
+    found = re.findall(rf"^( *)```{language}\n(.*?)^ *```$", README, re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
+
+
+def tdhil_commands() -> list[str]:
+    lines = "\n".join(blocks("sh")).replace("\\\n", " ").replace("&&\n", "&& ").splitlines()
+    parts = [part.strip() for line in lines for part in line.split("&&")]
+    return [part for part in parts if re.match(r"(\S*/)?tdhil ", part)]
+
+
+def test_there_are_commands_to_check():
+    commands = tdhil_commands()
+    for name in ("identify", "replay", "simulate"):
+        assert any(f"tdhil {name}" in command for command in commands)
+
+
+@pytest.mark.parametrize("command", tdhil_commands())
+def test_command_parses(command):
+    words = shlex.split(command, comments=True)[1:]
+    if ">" in words:
+        words = words[: words.index(">")]
+    namespace = build_parser(words[0]).parse_args(words)
+    assert callable(namespace.run)
+
+
+def test_the_help_of_the_options_it_names():
+    text = build_parser("identify").format_help() + _help_of("identify")
+    for option in set(re.findall(r"`(--[a-z-]+)[ `|]", README)) - {"--hub"}:
+        assert option in text, option
+
+
+def _help_of(command: str) -> str:
+    parser = build_parser(command)
+    (commands,) = [action for action in parser._actions if action.dest == "command"]
+    return commands.choices[command].format_help()  # type: ignore[index,union-attr]
+
+
+def test_rig_yaml_loads(tmp_path):
+    (text,) = blocks("yaml")
+    path = tmp_path / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    assert require_limits(load_rig(path)).torque_nm == 400
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), target
+
+
+def test_code_fits_80_columns():
+    assert [line for language in ("sh", "yaml", "text") for block in blocks(language)
+            for line in block.splitlines() if len(line) > 80] == []
+
+
+def test_every_exit_code_is_explained():
+    table = README.split("| exit | |")[1].split("\n\n")[0]
+    explained = {int(number) for row in re.findall(r"^\| ([0-9, ]+) \|", table, re.MULTILINE)
+                 for number in row.split(",")}
+    assert explained == {int(code) for code in ExitCode}
+
+
+@pytest.mark.parametrize("name", ["try", "test"])
+def test_marked_command_is_one_command(name):
+    (text,) = re.findall(rf"^<!-- command: {name} -->\n```sh\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+    assert subprocess.run(["bash", "-n", "-c", text]).returncode == 0
+    assert not re.search(r"(?<!&&)(?<!\\)\n(?!\Z)", text), "lines must be joined, so that a failure ends it"
+
+
+def test_ci_runs_the_very_same_command():
+    if not (path := ROOT / ".ci" / "run").exists():
+        pytest.skip("a source distribution has no .ci/run")
+    script = path.read_text(encoding="utf-8")
+    assert "command_of test" in script
+    assert "pip install -q -e '.[test]'" not in script

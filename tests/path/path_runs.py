@@ -1,0 +1,339 @@
+"""Runs of the whole path: the command line in this process or in one of its own, against a simulated drive.
+
+Nothing here asserts on wall time; the waits only bound what would otherwise hang.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tdhil.cli import main
+
+STAGES = ("setup", "speed", "torque", "hold", "acquire")
+HANGS_S = 120.0           # wall time after which something is taken to hang
+HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
+
+# What the simulated rig is run with where nothing else is said (tdhil.rig, sim_bus.params).
+WATCHDOG_S = 0.5
+QUICK_STOP_RAD_S2 = 2.0
+TORQUE_NM = 400.0
+INERTIA, SPEED_GAIN = 104.0, 300.0
+SETTLING_S = 5.0 * INERTIA / SPEED_GAIN
+"""How long the drive's own speed loop trails behind the end of its ramp: five times J/K_p."""
+
+
+@dataclass
+class Finished:
+    """How a run ended."""
+
+    code: int
+    out: str
+    err: str
+    log: Path | None = None
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """Stdout as one JSON document and nothing else."""
+        found = json.loads(self.out)
+        assert isinstance(found, dict)
+        return found
+
+    @property
+    def outcomes(self) -> list[tuple[str, str]]:
+        return [(stage["name"], stage["outcome"]) for stage in self.document["stages"]]
+
+
+def clean_environment() -> dict[str, str]:
+    """Without the user's CAN settings, and without terminal sizes that aren't ours."""
+    dropped = ("CAN_", "COLUMNS", "LINES", "NO_COLOR", "FORCE_COLOR")
+    return {name: value for name, value in os.environ.items() if not name.startswith(dropped)}
+
+
+def tdhil(*arguments: object) -> Finished:
+    """`tdhil …` in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+    return Finished(code, out.getvalue(), err.getvalue())
+
+
+def identify(folder: Path, *arguments: object, log: str = "run.mcap") -> Finished:
+    """`tdhil identify --json …` in this process, with its log in ``folder``."""
+    path = folder / log
+    finished = tdhil("identify", "--json", "--log", path, *arguments)
+    finished.log = path
+    return finished
+
+
+# -- the shaft trace -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Shaft:
+    """The true shaft: N rows of plant time, speed and torque, with states and events."""
+
+    time_s: np.ndarray
+    speed_rad_s: np.ndarray
+    torque_nm: np.ndarray
+    state: list[str]
+    event: list[str]
+
+    @classmethod
+    def read(cls, path: Path) -> Shaft:
+        rows = [line.split(",") for line in path.read_text().split("\n")[1:-1]]
+        rows = [row for row in rows if len(row) == 5]
+        numbers = np.array([[float(cell) for cell in row[:3]] for row in rows]).reshape(-1, 3)
+        return cls(numbers[:, 0], numbers[:, 1], numbers[:, 2], [row[3] for row in rows], [row[4] for row in rows])
+
+    def events(self, text: str) -> list[float]:
+        """Plant times of the events that contain a text."""
+        return [float(t) for t, event in zip(self.time_s, self.event, strict=True) if text in event]
+
+    def at_rest_from(self) -> float:
+        """Plant time from which the shaft stands still to the end of the trace."""
+        turning = np.flatnonzero(np.abs(self.speed_rad_s) > 0.02)
+        return float(self.time_s[turning[-1]]) if len(turning) else 0.0
+
+    def speed_at(self, time_s: float) -> float:
+        return float(np.interp(time_s, self.time_s, self.speed_rad_s))
+
+    def assert_never_let_go(self) -> None:
+        """No row in which the shaft turns without the drive holding it."""
+        free = [state not in HELD for state in self.state]
+        assert not np.any(np.abs(self.speed_rad_s[np.array(free)]) > 0.05), "a turning shaft was disabled"
+
+    def assert_enabled(self, expected: bool) -> None:
+        assert ("operation enabled" in self.state) is expected
+
+    def assert_at_rest(self) -> None:
+        """At rest at the end, for at least a second, and never let go before."""
+        assert self.at_rest_from() <= self.time_s[-1] - 1.0
+        self.assert_never_let_go()
+
+    def assert_stopped_within_settings(self) -> float:
+        """A quick stop by the host brought it to rest on the ramp that the settings give; when that began."""
+        begun_s = self.events("state: quick stop active")[-1]
+        allowed_s = abs(self.speed_at(begun_s)) / QUICK_STOP_RAD_S2 + SETTLING_S
+        assert self.at_rest_from() - begun_s <= allowed_s
+        self.assert_at_rest()
+        return begun_s
+
+
+def tail_time(trace: Path) -> float:
+    """Plant time of the last whole row."""
+    size = trace.stat().st_size
+    with trace.open("rb") as file:
+        file.seek(max(0, size - 300))
+        lines = file.read().decode().split("\n")
+    return next((float(line.split(",")[0]) for line in reversed(lines[1:-1])), 0.0)
+
+
+def wait_for(what: str, done: Callable[[], bool], alive: subprocess.Popen | None = None) -> bool:
+    """Poll until done; False if ``alive`` ended before. A hang is an error."""
+    end = time.monotonic() + HANGS_S
+    while not done():
+        if alive is not None and alive.poll() is not None:
+            return done()
+        assert time.monotonic() < end, f"hangs: {what}"
+        time.sleep(0.005)
+    return True
+
+
+PLAIN = ("-m", "sim_bus")
+PATIENT = (Path(__file__).with_name("simulator.py"), "patient")
+REAL = (Path(__file__).with_name("simulator.py"), "patient,real")
+
+
+# -- processes -----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def process(*command: object, **options: Any) -> Iterator[subprocess.Popen]:
+    """A child that doesn't outlive the test."""
+    child = subprocess.Popen(
+        [str(part) for part in command], env=clean_environment() | options.pop("env", {}), text=True, **options
+    )
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        for stream in (child.stdin, child.stdout, child.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@dataclass
+class Peer:
+    """A simulated drive in a process of its own, and how it is reached."""
+
+    options: tuple[str, ...]
+    trace: Path
+    child: subprocess.Popen
+
+    @property
+    def shaft(self) -> Shaft:
+        """What the shaft has done so far."""
+        return Shaft.read(self.trace)
+
+
+@contextlib.contextmanager
+def peer(folder: Path, *arguments: object, program: tuple[object, ...] = PATIENT) -> Iterator[Peer]:
+    """A simulator with a socketcand hub of its own, unless ``arguments`` name another bus."""
+    trace = folder / "shaft.csv"
+    own_hub = "-i" not in arguments
+    hub = ("--hub", "127.0.0.1:0") if own_hub else ()
+    with process(
+        sys.executable, *program, "canopen", *hub, "--trace", trace, *arguments, stdout=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None
+        ready = child.stdout.readline()
+        assert ready.startswith("ready: "), ready
+        if own_hub:
+            found = re.search(r"socketcand (\S+):(\d+) channel (\S+) node", ready)
+            assert found
+            host, port, channel = found.groups()
+            options = ("-i", "socketcand", "-c", channel, "--bus-kwargs", f"host={host}", f"port={port}",
+                       "tcp_tune=True")
+        else:
+            options = tuple(str(argument) for argument in arguments[:4])     # -i … -c …
+        yield Peer(options, trace, child)
+
+
+@dataclass
+class Host:
+    """`tdhil identify` in a process of its own, whose stderr is followed."""
+
+    child: subprocess.Popen
+    log: Path
+    lines: list[str] = field(default_factory=list)
+
+    @property
+    def err(self) -> str:
+        return "\n".join(self.lines)
+
+    def wait_for_line(self, text: str) -> bool:
+        """False if the process ended without it."""
+        return wait_for(f"line {text!r}", lambda: any(text in line for line in self.lines), self.child)
+
+    def signal(self, number: int) -> None:
+        if self.child.poll() is None:
+            self.child.send_signal(number)
+
+    def finish(self) -> Finished:
+        assert self.child.stdout is not None
+        out = self.child.stdout.read()
+        code = self.child.wait(HANGS_S)
+        self._follower.join(HANGS_S)
+        return Finished(code, out, self.err, self.log)
+
+    def follow(self) -> None:
+        def read() -> None:
+            assert self.child.stderr is not None
+            with contextlib.suppress(ValueError):       # closed under it at the end of a failed test
+                for line in self.child.stderr:
+                    self.lines.append(line.rstrip("\n"))
+
+        self._follower = threading.Thread(target=read, daemon=True)
+        self._follower.start()
+
+
+@contextlib.contextmanager
+def host(folder: Path, *arguments: object, **options: Any) -> Iterator[Host]:
+    """`python -m tdhil identify --json …`, its log in ``folder``."""
+    log = folder / "run.mcap"
+    with process(
+        sys.executable, "-m", "tdhil", "identify", "--json", "--log", log, *arguments,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=options.pop("stdin", subprocess.DEVNULL), **options,
+    ) as child:
+        running = Host(child, log)
+        running.follow()
+        yield running
+
+
+class Terminal:
+    """A program on a terminal of its own, 80 columns wide."""
+
+    def __init__(self, *command: object, columns: int = 80, cwd: Path | None = None) -> None:
+        import fcntl
+        import pty
+        import struct
+        import termios
+
+        self.master, slave = pty.openpty()
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+        self.child = subprocess.Popen(
+            [str(part) for part in command], stdin=slave, stdout=slave, stderr=slave, cwd=cwd,
+            env=clean_environment() | {"TERM": "xterm-256color"}, start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509
+        )
+        os.close(slave)
+        self.output = b""
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.child.kill()
+        self.child.wait()
+        os.close(self.master)
+
+    def read_until(self, wanted: str) -> bool:
+        """Follow the output until it shows a text; False where the program ended without it."""
+        end = time.monotonic() + HANGS_S
+        while wanted not in self.plain:
+            assert time.monotonic() < end, f"hangs before {wanted!r}:\n{self.plain}"
+            if not self._read():
+                return wanted in self.plain
+        return True
+
+    def finish(self) -> int:
+        """Follow it to its end; the exit code."""
+        end = time.monotonic() + HANGS_S
+        while self._read():
+            assert time.monotonic() < end, f"hangs:\n{self.plain}"
+        return self.child.wait(HANGS_S)
+
+    def type(self, keys: str) -> None:
+        os.write(self.master, keys.encode())
+
+    def signal(self, number: int) -> None:
+        self.child.send_signal(number)
+
+    @property
+    def plain(self) -> str:
+        """What was shown, without escape sequences."""
+        return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.output.decode("utf-8", "replace"))
+
+    def _read(self) -> bool:
+        ready, _, _ = select.select([self.master], [], [], 0.1)
+        if not ready:
+            return self.child.poll() is None
+        try:
+            data = os.read(self.master, 65536)
+        except OSError:           # the last one to hold the terminal has gone
+            return False
+        self.output += data
+        return bool(data)
+
+
+INTERRUPTING = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}

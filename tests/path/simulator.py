@@ -1,0 +1,32 @@
+"""`python -m sim_bus`, changed as a test needs it: ``simulator.py patient,real canopen …``
+
+patient   a host that is silent for less than a minute of wall time is waited for: on a loaded machine a second is
+          nothing, and the runs here must repeat. The end of a connection acts at once all the same.
+real      without the simulator's marker object: what the host then sees can't be told from a real drive.
+"""
+
+import functools
+import sys
+
+from profiles.marker import MARKER_INDEX
+from sim_bus import cia402_node, command, simulator
+
+
+def be_patient() -> None:
+    simulator.Simulator = functools.partial(simulator.Simulator, silence_s=60.0)  # type: ignore[assignment,misc]
+
+
+def be_real() -> None:
+    plain = cia402_node.Cia402Node.__init__
+
+    def without_marker(self, *arguments, **options):
+        plain(self, *arguments, **options)
+        del self.store.object_dictionary[MARKER_INDEX]
+
+    cia402_node.Cia402Node.__init__ = without_marker
+
+
+if __name__ == "__main__":
+    for change in sys.argv[1].split(","):
+        {"patient": be_patient, "real": be_real}[change]()
+    sys.exit(command.main(sys.argv[2:]))

@@ -1,0 +1,302 @@
+"""The command line as its users and their scripts meet it: stdout, stderr, exit codes, sources of options."""
+
+import json
+import subprocess
+import sys
+
+import can
+import pytest
+from path_runs import Shaft, Terminal, clean_environment, identify, tdhil
+
+from sim_bus.params import RigParams
+from sim_bus.simulator import EmbeddedSimulator
+from tdhil.record.reader import read_run, read_samples
+
+SHORT = ("--simulate", "--seed", 1, "--periods", 3)
+KEYS = {
+    "verdict", "model", "inertia_kg_m2", "inertia_main_shaft_kg_m2", "reference_inertia_kg_m2", "viscous_nm_s_rad",
+    "coulomb_nm", "speed_lag_s", "torque_lag_s", "skew_s", "paper", "simulated", "log", "stages",
+}
+ESTIMATE = {"value", "low", "high"}
+
+
+def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrun: {json: true, seed: 1, periods: 3}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        done = tdhil("identify", "--simulate", "--rig", rig)      # json, seed and periods: rig.yaml's word
+    assert done.code == 0, done.err
+    document = done.document
+    assert document.keys() >= KEYS
+    inertia = document["inertia_kg_m2"]
+    assert inertia.keys() >= {*ESTIMATE, "low_total", "high_total", "confidence", "conditional_on"}
+    assert inertia["low_total"] < inertia["low"] < inertia["value"] < inertia["high"] < inertia["high_total"]
+    assert inertia["confidence"] == 0.95
+    main_shaft = document["inertia_main_shaft_kg_m2"]
+    assert {name: 4.0 * inertia[name] for name in main_shaft} == main_shaft
+    assert document["reference_inertia_kg_m2"] == 104.0
+    for name in ("viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "skew_s"):
+        assert document[name].keys() >= ESTIMATE
+    assert document["paper"].keys() >= {"inertia_kg_m2", "intercept_nm", "r2", "raw_rate"}
+    assert document["paper"]["raw_rate"].keys() >= {"inertia_kg_m2", "intercept_nm", "r2"}
+    assert all(stage.keys() >= {"name", "outcome", "duration_s"} for stage in document["stages"])
+    assert document["log"] == "run.mcap"
+    assert (tmp_path / "run.mcap").exists()
+    assert "rig.yaml:3" in done.err                               # which value came from where
+
+
+def test_a_seed_repeats_result_and_samples(tmp_path):
+    runs = [identify(tmp_path, *SHORT, log=name) for name in ("a.mcap", "b.mcap")]
+    assert runs[0].document | {"log": ""} == runs[1].document | {"log": ""}
+    assert list(read_samples(runs[0].log)) == list(read_samples(runs[1].log))
+    assert runs[0].log.read_bytes() != b""
+
+
+def test_without_a_seed_one_is_drawn_and_named(tmp_path):
+    runs = [identify(tmp_path, "--amplitude", 9, log=name) for name in ("a.mcap", "b.mcap")]
+    seeds = [read_run(done.log).configuration["seed"] for done in runs]
+    assert seeds[0] != seeds[1]
+    for done, seed in zip(runs, seeds, strict=True):
+        assert f"seed {seed}" in done.err.replace("\n", " ")
+        assert "no CAN bus is configured" in done.err.replace("\n", " ")
+    again = identify(tmp_path, "--amplitude", 9, "--seed", seeds[0], log="c.mcap")
+    assert list(read_samples(again.log)) == list(read_samples(runs[0].log))
+
+
+def test_an_older_log_is_kept(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(b"an older run")
+    done = identify(tmp_path, "--simulate", "--amplitude", 9)
+    (kept,) = [path for path in tmp_path.glob("run-*.mcap") if path.read_bytes() == b"an older run"]
+    assert kept.name in done.err.replace("\n", "")
+    assert read_run(done.log).complete
+
+
+# -- what is wrong with the command line ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--nodee", "5"), "--nodee"),
+        (("--excitation", "sinus"), "sinus"),
+        (("--node", "five"), "--node"),
+        (("--profile", "generic/cia40"), "generic/cia402"),
+        (("--profile", "no/such.yaml"), "no/such.yaml"),
+        (("--node", "300"), "--node"),
+        (("--periods", "0"), "--periods"),
+        (("--frequency", "-1"), "--frequency"),
+        (("--frequency", "nan"), "--frequency"),
+        (("--amplitude", "inf"), "--amplitude"),
+        (("--confidence", "95"), "--confidence"),
+        (("--real-time", "--stepped"), "exclude"),
+        (("--drive", "modbus"), "--drive"),
+        (("--rig", "no-rig.yaml"), "no-rig.yaml"),
+        (("--plant", "no-plant.yaml"), "no-plant.yaml"),
+        (("-i", "nosuch"), "nosuch"),
+        (("-i", "socketcan"), "channel"),
+    ],
+)
+def test_a_wrong_command_line_ends_with_2_and_names_what_is_wrong(tmp_path, arguments, said):
+    done = tdhil("identify", "--log", tmp_path / "run.mcap", *arguments)
+    assert done.code == 2, done.err
+    assert said in done.err
+    assert "Traceback" not in done.err
+    assert done.out == ""
+
+
+def test_a_bad_rig_shows_every_problem_with_its_line(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(
+        "node: 1\n"
+        "node: 2\n"
+        "rate_hz: 1e3\n"
+        "allow_reverse: off\n"
+        "limits:\n"
+        "  speed_max: 10.0\n"
+        "  speed_min_rad_s: 0.5\n"
+        "run:\n"
+        "  periods: 010\n"
+    )
+    done = tdhil("identify", "--simulate", "--rig", rig)
+    assert done.code == 2
+    assert "Traceback" not in done.err
+    for line in (2, 6, 9):
+        assert f"rig.yaml:{line}" in done.err, done.err
+    assert "speed_max" in done.err
+
+
+def test_errors_are_json_too_where_json_was_asked_for(tmp_path):
+    done = identify(tmp_path, "--profile", "generic/cia40")
+    assert done.code == done.document["exit_code"] == 2
+    assert "generic/cia402" in done.document["error"]["message"]
+
+
+@pytest.mark.parametrize("content", [b"", b"not a log", b"\x89MCAP0\r\n"])
+def test_nothing_to_replay_is_told(tmp_path, content):
+    log = tmp_path / "run.mcap"
+    log.write_bytes(content)
+    done = tdhil("replay", log)
+    assert done.code == 10
+    assert "Traceback" not in done.err
+    assert "run.mcap" in done.err
+    assert done.out == ""
+
+
+def test_a_log_that_is_not_there_is_a_wrong_command_line(tmp_path):
+    done = tdhil("replay", "--json", tmp_path / "none.mcap")
+    assert done.code == done.document["exit_code"] == 2
+    assert "none.mcap" in done.err
+
+
+def test_no_server_to_talk_to(tmp_path):
+    done = identify(tmp_path, "-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1", "port=1")
+    assert done.code == 5
+    assert "127.0.0.1:1" in done.err
+    assert done.document["exit_code"] == 5
+
+
+# -- buses, from wherever they are named ---------------------------------------------------------------------
+
+
+def test_the_environment_names_the_bus(tmp_path, monkeypatch):
+    with EmbeddedSimulator(RigParams(), seed=1, stepped=True) as simulated:
+        monkeypatch.setenv("CAN_INTERFACE", "virtual")
+        monkeypatch.setenv("CAN_CHANNEL", simulated.channel)
+        done = identify(tmp_path, "--stepped", "--amplitude", 9)
+    assert done.code == 4, done.err                                # it got as far as the plan
+    assert done.outcomes[1] == ("speed", "ok")
+    lines = [" ".join(line.split()) for line in done.err.splitlines()]
+    assert "bus interface virtual (CAN_INTERFACE)" in lines
+    assert any(line.startswith("bus channel tdhil-") for line in lines)
+    assert read_run(done.log).configuration["bus"]["interface"] == {"value": "virtual", "source": "CAN_INTERFACE"}
+
+
+def test_a_bus_without_a_drive_is_communication_lost(tmp_path, monkeypatch):
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    done = identify(tmp_path)
+    assert done.code == 5
+    assert done.document["error"]["kind"] == "CommunicationLost"
+    assert "nothing has moved" in done.err
+
+
+def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    done = identify(tmp_path, "--simulate", "--amplitude", 9)
+    assert done.code == 4
+    assert "SIMULATED" in done.err
+
+
+@pytest.mark.parametrize(("node", "code"), [(5, 4), (6, 5)])
+def test_the_node_is_the_one_asked_for(tmp_path, node, code):
+    with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
+        done = identify(tmp_path, "-i", "virtual", "-c", simulated.channel, "--stepped", "--node", node,
+                        "--amplitude", 9)
+    assert done.code == code, done.err
+
+
+# -- runs that end otherwise ---------------------------------------------------------------------------------
+
+
+def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, "--amplitude", 9)
+    assert done.code == 4
+    assert "amplitude of 9 rad/s" in done.err
+    assert "the shaft is at rest" in done.document["stop"]
+    shaft = Shaft.read(trace)
+    shaft.assert_enabled(True)
+    shaft.assert_stopped_within_settings()
+
+
+def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
+    trace = tmp_path / "shaft.csv"
+    with EmbeddedSimulator(RigParams(), seed=1, trace=trace, stepped=True) as simulated:
+        simulated.simulator.node.application.fault()
+        options = ("-i", "virtual", "-c", simulated.channel, "--stepped")
+        done = identify(tmp_path, *options, log="a.mcap")
+        assert done.code == 4
+        assert "--reset-fault" in done.err
+        assert "nothing has moved" in done.err
+        bus = can.Bus(interface="virtual", channel=simulated.channel)      # keeps the channel for the second run
+        again = identify(tmp_path, *options, "--reset-fault", "--amplitude", 9, log="b.mcap")
+        bus.shutdown()
+    assert again.outcomes[:2] == [("setup", "ok"), ("speed", "ok")]
+    assert any(event.kind == "reset" for event in read_run(again.log).events)
+    assert "reset" not in {event.kind for event in read_run(done.log).events}
+    shaft = Shaft.read(trace)
+    enabled_s, reset_s = shaft.events("operation enabled")[0], shaft.events("state: switch on disabled")[0]
+    assert reset_s <= enabled_s
+
+
+def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path):
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--excitation", "sine", "--frequency", 0.5, "--periods", 20)
+    assert done.code == 9
+    document = done.document
+    assert document["verdict"] == "not_identifiable"
+    assert document["inertia_kg_m2"] is None
+    assert document["advice"]
+    assert document["paper"]["inertia_kg_m2"] == pytest.approx(137.0, rel=0.05)
+    card = tdhil("replay", done.log)
+    assert card.code == 9
+    assert "not_identifiable" in card.out
+    assert "paper" in card.out
+
+
+def test_speed_mode_skips_what_belongs_to_torque_mode(tmp_path):
+    done = identify(tmp_path, *SHORT, "--mode", "speed")
+    assert done.code in (0, 9), done.err
+    assert done.outcomes == [
+        ("setup", "ok"), ("speed", "ok"), ("torque", "skipped"), ("hold", "skipped"), ("acquire", "ok")
+    ]
+    assert read_run(done.log).recording.excitation.mode == "speed"
+    assert done.document["inertia_kg_m2"]["value"] == pytest.approx(104.0, rel=0.05)
+
+
+def test_another_plant_is_another_result(tmp_path):
+    plant = tmp_path / "plant.yaml"
+    plant.write_text("plant: {inertia_kg_m2: 60.0}\n")
+    done = identify(tmp_path, *SHORT, "--plant", plant)
+    assert done.code == 0, done.err
+    assert done.document["inertia_kg_m2"]["value"] == pytest.approx(60.0, rel=0.03)
+
+
+# -- the terminal --------------------------------------------------------------------------------------------
+
+
+def test_eighty_columns_are_enough(tmp_path):
+    command = (sys.executable, "-m", "tdhil", "identify", *SHORT)
+    with Terminal(*command, columns=80, cwd=tmp_path) as terminal:
+        assert terminal.finish() == 0
+        lines = [line for part in terminal.plain.split("\n") for line in part.rstrip("\r").split("\r")]
+    assert max(map(len, lines)) <= 80
+    shown = terminal.plain
+    for wanted in ("SIMULATED drive and rig: nothing real turns", "acquire", "rad/s", "left", "verdict", "kg·m²"):
+        assert wanted in shown
+    assert "moment of inertia at the motor shaft · SIMULATED" in shown
+
+
+def test_help_is_quick_because_it_loads_nothing(tmp_path):
+    code = (
+        "import sys, json\n"
+        "from tdhil.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        "heavy = {'numpy', 'scipy', 'can', 'canopen', 'pydantic', 'rich', 'mcap', 'yaml', 'pymodbus', 'matplotlib'}\n"
+        "print(json.dumps(sorted(heavy & set(sys.modules))), file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=clean_environment(), cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "identify" in done.stdout
+    assert "replay" in done.stdout
+    assert json.loads(done.stderr) == []
+
+
+def test_every_command_has_its_help():
+    for command in ("identify", "replay", "simulate"):
+        done = tdhil(command, "--help")
+        assert done.code == 0
+        assert done.out.startswith("usage: tdhil")
+    assert tdhil().code == 2
+    assert tdhil("--version").out.startswith("tdhil ")

@@ -1,0 +1,34 @@
+"""The five stages over a virtual bus in one process, and over two processes through the socketcand hub."""
+
+import pytest
+from five_stages import SEED, FiveStages, interrupted, over_a_peer
+from path_runs import Shaft, identify
+
+from tdhil.record.reader import read_samples
+
+
+def embedded(folder, *arguments):
+    trace = folder / "shaft.csv"
+    done = identify(folder, "--simulate", "--seed", SEED, "--trace", trace, *arguments)
+    return done, Shaft.read(trace)
+
+
+class TestFiveStages(FiveStages):
+    @pytest.fixture(params=["virtual", "socketcand"])
+    def bus(self, request):
+        return {"virtual": embedded, "socketcand": over_a_peer}[request.param]
+
+    @pytest.fixture
+    def interrupted_bus(self):
+        return interrupted
+
+
+def test_both_buses_give_the_same_result_and_the_same_samples(tmp_path):
+    """Stepped time and a seed: neither bus nor process may make a difference."""
+    found = []
+    for run in (embedded, over_a_peer):
+        folder = tmp_path / run.__name__
+        folder.mkdir()
+        done, _ = run(folder, "--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12)
+        found.append((done.document | {"log": ""}, list(read_samples(done.log))))
+    assert found[0] == found[1]

@@ -1,0 +1,171 @@
+"""A peer without the simulator's marker is taken for a real drive, which it can't be told from.
+
+Nothing moves without limits and somebody's word. Real time, since a real shaft knows no other: the runs are ended by
+a signal as soon as they have shown what they were to show. A slow cycle and a long watchdog, so that a loaded
+machine's pauses are none to the drive.
+"""
+
+import signal
+import sys
+import time
+
+import pytest
+from path_runs import REAL, Terminal, host, identify, peer, tail_time, wait_for
+
+WATCHDOG_S = 2.0
+RIG = f"""\
+rate_hz: 20
+limits:
+  speed_min_rad_s: 0.5
+  speed_max_rad_s: 10.0
+  torque_nm: 400.0
+  time_s: 900.0
+  quick_stop_rad_s2: 2.0
+  watchdog_s: {WATCHDOG_S}
+  probe_torque_nm: 200.0
+  probe_travel_rad: 3.0
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG)
+    return path
+
+
+@pytest.fixture
+def drive(tmp_path):
+    with peer(tmp_path, program=REAL) as running:
+        yield running
+
+
+def assert_untouched(drive):
+    """Never enabled, never moved."""
+    drive.child.terminate()
+    drive.child.wait()
+    shaft = drive.shaft
+    shaft.assert_enabled(False)
+    assert abs(shaft.speed_rad_s).max() == 0.0
+    return shaft
+
+
+def enabled(drive):
+    return b"operation enabled" in drive.trace.read_bytes()
+
+
+def at_rest_after(drive):
+    """What the shaft did, a little plant time after the host has gone."""
+    gone_s = tail_time(drive.trace)
+    wait_for("some more rows", lambda: tail_time(drive.trace) > gone_s + 1.5)
+    shaft = drive.shaft
+    shaft.assert_at_rest()
+    return shaft
+
+
+def test_without_a_rig_it_is_refused(tmp_path, drive):
+    for yes in ((), ("--yes",)):
+        done = identify(tmp_path, *drive.options, *yes)
+        assert done.code == 4
+        assert done.document["error"]["kind"] == "PreflightRefused"
+        for key in ("speed_max_rad_s", "torque_nm", "time_s", "--rig"):
+            assert key in done.err
+        assert "nothing has moved" in done.err
+        assert "SIMULATED" not in done.err
+    assert_untouched(drive)
+
+
+def test_a_rig_without_limits_is_refused(tmp_path, drive):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("node: 1\n")
+    done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
+    assert done.code == 4
+    assert "no machine limits" in done.err
+    assert_untouched(drive)
+
+
+def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
+    with host(tmp_path, *drive.options, "--rig", rig) as running:
+        done = running.finish()
+    assert done.code == 4
+    assert done.outcomes == [("setup", "aborted")]
+    assert "--yes" in done.err
+    assert "preflight" in done.err                    # the table was shown
+    assert "This run will move" in done.err
+    assert "SIMULATED" not in done.err
+    assert_untouched(drive)
+
+
+def test_stepped_time_is_refused(tmp_path, drive, rig):
+    done = identify(tmp_path, *drive.options, "--rig", rig, "--yes", "--stepped")
+    assert done.code == 4
+    assert "marker" in done.err
+    assert "real time" in done.err
+    shaft = assert_untouched(drive)
+    assert not shaft.events("heartbeat supervision began")
+
+
+def test_yes_replaces_the_prompt(tmp_path, drive, rig):
+    with host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
+        assert running.wait_for_line("stage speed …"), running.err
+        running.signal(signal.SIGTERM)
+        done = running.finish()
+    assert done.code == 143
+    assert "Confirmed by --yes." in done.err
+    assert "peak torque     400 N·m" in done.err
+    assert "SIMULATED" not in done.err
+    shaft = at_rest_after(drive)
+    shaft.assert_enabled(True)
+    assert shaft.speed_rad_s.max() > 0.1
+    assert not shaft.events("host heartbeat lost")
+
+
+@pytest.fixture
+def prompt(tmp_path, drive, rig):
+    """The run on a terminal, standing at the prompt."""
+    with Terminal(sys.executable, "-m", "tdhil", "identify", *drive.options, "--rig", rig, cwd=tmp_path) as terminal:
+        assert terminal.read_until("anything else to leave it alone:"), terminal.plain
+        yield terminal
+
+
+@pytest.mark.parametrize("answer", ["move", "MOVE it", ""])
+def test_a_wrong_word_moves_nothing(prompt, drive, answer):
+    prompt.type(answer + "\n")
+    assert prompt.finish() == 4
+    assert "not confirmed" in prompt.plain
+    assert "nothing has moved" in prompt.plain
+    assert_untouched(drive)
+
+
+def test_end_of_input_moves_nothing(prompt, drive):
+    prompt.type("\x04")
+    assert prompt.finish() == 4
+    assert_untouched(drive)
+
+
+def test_ctrl_c_at_the_prompt_moves_nothing(prompt, drive):
+    prompt.type("\x03")
+    assert prompt.finish() == 130
+    assert "Traceback" not in prompt.plain
+    assert_untouched(drive)
+
+
+def test_the_word_moves_the_shaft_and_the_prompt_fed_the_watchdog(prompt, drive):
+    assert not enabled(drive)
+    for asked in ("brake released", "pipe handler", "emergency stop", "watchdog        2 s in the drive"):
+        assert asked in prompt.plain
+    before_s = tail_time(drive.trace)
+    end = time.monotonic() + 60.0
+    while tail_time(drive.trace) < before_s + 1.5 * WATCHDOG_S and time.monotonic() < end:
+        prompt.read_until("anything else")            # somebody thinks for longer than the watchdog would wait
+        time.sleep(0.05)
+    assert not enabled(drive)
+    prompt.type("MOVE\n")
+    prompt.read_until("enabled, speed mode")          # stage speed, as the live display shows it
+    prompt.type("\x03")
+    assert prompt.finish() == 130
+    assert "the shaft is at rest" in prompt.plain
+    assert "SIMULATED" not in prompt.plain
+    shaft = at_rest_after(drive)
+    shaft.assert_enabled(True)
+    assert not shaft.events("host heartbeat lost")

@@ -1,0 +1,280 @@
+"""Whatever ends a run, the true shaft comes to rest within what the settings allow, and stays there.
+
+Two processes, stepped time. The times are the plant's own, from the simulator's trace: what the host believes and
+how long a test took on the wall don't count. A signal is sent when stderr names the stage; where the run was so quick
+that the signal came a stage late, it is run again.
+"""
+
+import os
+import signal
+from itertools import pairwise, product
+
+import pytest
+from path_runs import (
+    INERTIA,
+    INTERRUPTING,
+    PLAIN,
+    QUICK_STOP_RAD_S2,
+    SETTLING_S,
+    STAGES,
+    TORQUE_NM,
+    WATCHDOG_S,
+    Shaft,
+    host,
+    identify,
+    peer,
+    tail_time,
+    tdhil,
+    wait_for,
+)
+
+from tdhil.record.reader import read_run
+from tdhil.report.live import LiveDisplay
+
+CYCLE_S = 0.004
+LONG = ("--periods", 40)      # no stage 5 ends before the signal is there
+STEPPED = ("--stepped", "--seed", 1)
+TRIES = 4
+
+
+def reached(drive, running, stage):
+    """Wait until the shaft has been under way in a stage; False if the run was over before."""
+    if not running.wait_for_line(f"stage {stage} …"):
+        return False
+    if stage == "setup":
+        return wait_for("probe", lambda: b"operation enabled" in drive.trace.read_bytes(), running.child)
+    begun_s = tail_time(drive.trace)
+    return wait_for("a row", lambda: tail_time(drive.trace) > begun_s, running.child)
+
+
+def aborted_stage(log):
+    return [stage.name for stage in read_run(log).stages if stage.outcome == "aborted"]
+
+
+@pytest.mark.parametrize(
+    ("how", "stage"), [*product(["SIGINT", "SIGTERM", "SIGINT twice"], STAGES), ("SIGHUP", "speed")]
+)
+def test_a_signal_in_each_stage(tmp_path, how, stage):
+    number = signal.Signals[how.split()[0]]
+    for attempt in range(TRIES):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with peer(folder, *STEPPED) as drive, host(folder, *drive.options, "--stepped", *LONG) as running:
+            assert reached(drive, running, stage), running.err
+            running.signal(number)
+            if "twice" in how:
+                wait_for("stop", lambda drive=drive: b"quick stop active" in drive.trace.read_bytes(), running.child)
+                running.signal(number)
+            done = running.finish()
+            shaft = drive.shaft
+        assert done.code == INTERRUPTING[number], done.err
+        assert "Traceback" not in done.err
+        assert "the shaft is at rest" in done.document["stop"]
+        shaft.assert_enabled(True)
+        assert_stopped(shaft, done)
+        if aborted_stage(done.log) == [stage]:
+            return
+    pytest.fail(f"the signal never came in time for stage {stage}")
+
+
+def assert_stopped(shaft, done):
+    """From the wish to the quick stop a few cycles, from there the ramp; then rest, and torque off."""
+    begun_s = shaft.assert_stopped_within_settings()
+    (asked_s,) = [event.time_s for event in read_run(done.log).events if event.kind == "interrupted"]
+    assert begun_s - asked_s <= 3 * CYCLE_S
+    assert shaft.state[-1] == "switch on disabled"
+    assert done.document["error"]["kind"] == "Interrupted"
+    replayed = tdhil("replay", "--json", done.log)
+    assert replayed.code in (3, 9)
+    assert replayed.document["stages"] == done.document["stages"] or replayed.document["complete"]
+
+
+def test_ctrl_c_in_real_time(tmp_path):
+    """The embedded simulator against the wall clock; a slow cycle and a long watchdog bear a loaded machine."""
+    rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
+    rig.write_text(
+        "rate_hz: 20\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
+        " quick_stop_rad_s2: 2.0, watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+    )
+    with host(tmp_path, "--simulate", "--real-time", "--seed", 1, "--trace", trace, "--rig", rig) as running:
+        assert running.wait_for_line("stage speed …"), running.err
+        running.signal(signal.SIGINT)
+        done = running.finish()
+    assert done.code == 130, done.err
+    assert done.outcomes == [("setup", "ok"), ("speed", "aborted")]
+    shaft = Shaft.read(trace)
+    shaft.assert_enabled(True)
+    shaft.assert_stopped_within_settings()
+    assert read_run(done.log).complete
+
+
+@pytest.mark.parametrize("stage", ["speed", "hold", "acquire"])
+def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
+    with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
+        tmp_path, *drive.options, "--stepped", *LONG
+    ) as running:
+        assert reached(drive, running, stage), running.err
+        if stage == "speed":        # past its ramp up from rest
+            wait_for("speed", lambda: tail_time(drive.trace) > 12.0, running.child)
+        running.signal(signal.SIGKILL)
+        done = running.finish()
+        assert done.code == -signal.SIGKILL
+        wait_for("the end of the stop", lambda: rests_long(drive.trace))
+        shaft = drive.shaft
+    assert_stopped_by_watchdog(shaft)
+    replayed = tdhil("replay", "--json", done.log)
+    assert replayed.code in (3, 9), replayed.err
+    assert "Traceback" not in replayed.err
+    assert replayed.document["complete"] is False
+    if stage != "acquire":
+        assert replayed.document["inertia_kg_m2"] is None
+        assert replayed.code == 9
+
+
+def rests_long(trace):
+    """A second of standstill with the drive's own reaction before it."""
+    shaft = Shaft.read(trace)
+    lost = shaft.events("host heartbeat lost")
+    return bool(lost) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5 and shaft.at_rest_from() >= lost[0]
+
+
+def assert_stopped_by_watchdog(shaft, cycle_s=CYCLE_S):
+    (silent_s,) = shaft.events("running on in own time")
+    (lost_s,) = shaft.events("host heartbeat lost")
+    assert lost_s - silent_s <= WATCHDOG_S + cycle_s
+    # Until then the last setpoint goes on acting: at most the torque limit on the bare inertia.
+    fastest = shaft.speed_at(silent_s) + WATCHDOG_S * TORQUE_NM / INERTIA
+    after = shaft.time_s >= silent_s
+    assert shaft.speed_rad_s[after].max() <= fastest
+    assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
+    assert shaft.speed_rad_s[after].min() > -0.05
+    shaft.assert_at_rest()
+    assert shaft.state[-1] == "quick stop active"        # held, until somebody comes
+
+
+def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
+    with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
+        tmp_path, *drive.options, "--stepped", "--periods", 7
+    ) as running:
+        assert reached(drive, running, "acquire"), running.err
+        begun_s = tail_time(drive.trace)
+        # one mean speed of seven periods of 10 s, and half of the other
+        wait_for("periods", lambda: tail_time(drive.trace) > begun_s + 105.0, running.child)
+        running.signal(signal.SIGKILL)
+        done = running.finish()
+        assert done.code == -signal.SIGKILL
+        wait_for("the end of the stop", lambda: rests_long(drive.trace))
+        assert_stopped_by_watchdog(drive.shaft)
+    replayed = tdhil("replay", "--json", done.log)
+    document = replayed.document
+    assert replayed.code == 3, replayed.out
+    assert document["complete"] is False
+    assert document["verdict"] in ("valid", "valid_wide")
+    assert abs(document["inertia_kg_m2"]["value"] / INERTIA - 1.0) < 0.03
+    assert document["periods_used"] >= 6
+    assert document["log"] == str(done.log)
+    again = tdhil("replay", "--json", done.log)
+    assert again.document == document
+
+
+def test_a_frozen_host_is_no_watchdog_either(tmp_path):
+    """SIGSTOP: the connection stays open, nothing comes. On waking nothing stale may set the shaft in motion."""
+    with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
+        tmp_path, *drive.options, "--stepped", "--rate", 25, *LONG
+    ) as running:
+        assert reached(drive, running, "hold"), running.err
+        running.signal(signal.SIGSTOP)
+        wait_for("the end of the stop", lambda: rests_long(drive.trace))
+        assert_stopped_by_watchdog(drive.shaft, cycle_s=0.04)
+        rested_s = tail_time(drive.trace)
+        running.signal(signal.SIGCONT)
+        done = running.finish()
+        shaft = drive.shaft
+    assert done.code not in (0, 1), done.err
+    assert "Traceback" not in done.err
+    awake = shaft.time_s > rested_s
+    assert abs(shaft.speed_rad_s[awake]).max() < 0.02
+    assert "operation enabled" not in {state for state, now in zip(shaft.state, awake, strict=True) if now}
+
+
+# -- a mistake of ours, in each stage ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
+    def begin(self, name, expected_s, plain=LiveDisplay.stage_started):
+        self.under_way, self.cycles = name, 0
+        plain(self, name, expected_s)
+
+    def a_mistake_of_ours(self, command, sample):
+        self.cycles += 1
+        # In setup the shaft first moves after a second of standstill and some of the probe's ramp.
+        if self.under_way == stage and self.cycles == (600 if stage == "setup" else 100):
+            raise ZeroDivisionError("made for this test")
+
+    monkeypatch.setattr(LiveDisplay, "stage_started", begin)
+    monkeypatch.setattr(LiveDisplay, "cycle", a_mistake_of_ours)
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace)
+    assert done.code == 1
+    assert "ZeroDivisionError" in done.err
+    assert done.outcomes[-1] == (stage, "aborted")
+    assert done.document["error"] == {"kind": "ZeroDivisionError", "message": "made for this test"}
+    shaft = Shaft.read(trace)
+    shaft.assert_enabled(True)
+    begun_s = shaft.assert_stopped_within_settings()
+    (kept,) = [event for event in read_run(done.log).events if event.kind == "failure"]
+    assert "a_mistake_of_ours" in kept.traceback
+    assert begun_s - kept.time_s <= 3 * CYCLE_S
+    assert tdhil("replay", done.log).code in (3, 9)
+
+
+def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
+    """Disk full in mid-run: the stop runs all the same, and the JSON on stdout stays one document."""
+    import resource
+
+    def little_room():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
+
+    with peer(tmp_path, *STEPPED) as drive, host(
+        tmp_path, *drive.options, "--stepped", *LONG, preexec_fn=little_room
+    ) as running:
+        done = running.finish()
+        shaft = drive.shaft
+    assert done.code not in (0, 130, 143), done.err
+    assert "log" in done.err
+    assert done.document["error"]["kind"] == "LogError"
+    shaft.assert_enabled(True)
+    shaft.assert_stopped_within_settings()
+    assert tdhil("replay", done.log).code in (3, 9)
+
+
+def test_what_follows_the_shaft_is_in_order(tmp_path):
+    """Of one interrupted run: enabled, quick stop, disabled, and only then let go of the bus."""
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, "--amplitude", 9)
+    assert done.code == 4
+    shaft = Shaft.read(trace)
+    marks = [
+        shaft.events("state: operation enabled")[0],
+        shaft.events("state: quick stop active")[0],
+        shaft.events("state: switch on disabled")[-1],
+        shaft.events("NMT pre-operational")[-1],
+    ]
+    assert all(before <= behind for before, behind in pairwise(marks))
+    assert len(shaft.events("state: quick stop active")) == 1
+    shaft.assert_stopped_within_settings()
+
+
+def test_a_dead_simulator_ends_the_host(tmp_path):
+    """The other way round: the drive's side of the bus disappears."""
+    with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:
+        assert reached(drive, running, "speed"), running.err
+        os.kill(drive.child.pid, signal.SIGKILL)
+        done = running.finish()
+    assert done.code == 5, done.err
+    assert done.document["error"]["kind"] == "CommunicationLost"
+    assert "hard-wired emergency stop" in done.err
+    assert tdhil("replay", done.log).code in (3, 9)
+
+
