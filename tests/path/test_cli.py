@@ -172,11 +172,13 @@ def test_the_environment_names_the_bus(tmp_path, monkeypatch):
     assert read_run(done.log).configuration["bus"]["interface"] == {"value": "virtual", "source": "CAN_INTERFACE"}
 
 
-def test_a_bus_without_a_drive_is_communication_lost(tmp_path, monkeypatch):
+def test_a_bus_without_a_drive_is_refused_with_the_likely_causes(tmp_path, monkeypatch):
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
     done = identify(tmp_path)
-    assert done.code == 5
-    assert done.document["error"]["kind"] == "CommunicationLost"
+    assert done.code == 4
+    assert done.document["error"]["kind"] == "PreflightRefused"
+    assert "node-ID" in done.document["error"]["message"]
+    assert "bit rate" in done.document["error"]["message"]
     assert "nothing has moved" in done.err
 
 
@@ -187,12 +189,13 @@ def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
     assert "SIMULATED" in done.err
 
 
-@pytest.mark.parametrize(("node", "code"), [(5, 4), (6, 5)])
-def test_the_node_is_the_one_asked_for(tmp_path, node, code):
+@pytest.mark.parametrize(("node", "said"), [(5, "amplitude of 9 rad/s"), (6, "node 6 does not answer")])
+def test_the_node_is_the_one_asked_for(tmp_path, node, said):
     with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
         done = identify(tmp_path, "-i", "virtual", "-c", simulated.channel, "--stepped", "--node", node,
                         "--amplitude", 9)
-    assert done.code == code, done.err
+    assert done.code == 4, done.err
+    assert said in done.err
 
 
 # -- runs that end otherwise ---------------------------------------------------------------------------------
