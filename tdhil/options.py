@@ -44,6 +44,7 @@ OPTIONS = (
     Option("json", "--json", "run.json", False),
     Option("log", "--log", "run.log", "run.mcap"),
     Option("plant", "--plant", "run.plant", beside_rig=True),
+    Option("trace", "--trace", "run.trace"),
 )
 """None as a default: chosen by the drive's profile or by the plan of the run."""
 

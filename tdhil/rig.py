@@ -107,6 +107,7 @@ class Run(DataModel):
     json_: bool | None = Field(default=None, alias="json", description="one JSON document on stdout")
     log: str | None = Field(default=None, min_length=1, description="file to write, from the working directory")
     plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
+    trace: str | None = Field(default=None, min_length=1, description="CSV of the simulated rig's true shaft")
 
     @model_validator(mode="after")
     def _clock(self) -> Self:

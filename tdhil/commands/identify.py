@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     simulated.add_argument("--seed", type=int, metavar="N", help="repeats a simulated run")
     simulated.add_argument("--real-time", action="store_const", const=True, help="against the wall clock")
     simulated.add_argument("--stepped", action="store_const", const=True, help="step a simulator on the bus by SYNC")
-    simulated.add_argument("--trace", type=Path, metavar="shaft.csv", help="true shaft of the embedded rig")
+    simulated.add_argument("--trace", metavar="shaft.csv", help="true shaft of the embedded rig")
     add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
     parser.set_defaults(run=run)
 
@@ -109,9 +109,10 @@ def _run(
     writer = RunWriter(path, epoch_ns=peer.epoch_ns, block=peer.stepped)
     log = RunLog(writer, _configuration(options, bus, peer, rig))
     rated_nm = rig.drive_data.rated_torque_nm if rig is not None else None
+    trace = None if options["trace"] is None else Path(options["trace"])
     try:
         with stop_on_signals() as stop_request, open_drive(
-            peer, options, bus, rated_nm, log.frame, namespace.trace
+            peer, options, bus, rated_nm, log.frame, trace
         ) as drive, LiveDisplay(console, show_preflight=False) as display:
             outcome = Runner(
                 drive,

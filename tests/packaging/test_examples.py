@@ -52,7 +52,7 @@ def test_rig_example_shows_every_key_but_those_for_trying_things_out():
     missing = {key for key in keys(Rig) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
                        "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped", "run.yes",
-                       "run.json", "run.plant"}
+                       "run.json", "run.plant", "run.trace"}
 
 
 def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):

@@ -53,6 +53,7 @@ run:
   json: true
   log: here.mcap
   plant: plant.yaml
+  trace: shaft.csv
 """
 
 
