@@ -160,7 +160,10 @@ class Counters:
 
 
 class Drive(Protocol):
-    """One drive on one bus. Every method may raise `drivers.errors.TdhilError`."""
+    """One drive on one bus. Every method may raise `drivers.errors.TdhilError`.
+
+    ``close`` gives changed settings back and returns, a line each, those that it couldn't.
+    """
 
     @property
     def clock(self) -> Clock: ...
@@ -185,4 +188,4 @@ class Drive(Protocol):
 
     def disable(self) -> None: ...
 
-    def close(self) -> None: ...
+    def close(self) -> tuple[str, ...]: ...

@@ -362,21 +362,23 @@ class Cia402Drive:
 
     # -- afterwards ------------------------------------------------------------------------------------------
 
-    def close(self) -> None:
+    def close(self) -> tuple[str, ...]:
         """Give the drive its former settings back and let go of the bus; targets stay at zero.
 
         Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that
-        follows makes it act.
+        follows makes it act. What could not be given back is returned.
         """
         self._watch.stop()
+        left: tuple[str, ...] = ()
         try:
             if self._taken and self._state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
                 self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
-                self._objects.restore()
-        except CommunicationLost:
-            pass  # nothing can be given back to a drive that can't be reached
+                left = self._objects.restore()
+        except CommunicationLost as error:
+            left = (str(error),)
         finally:
             self._link.close()
+        return left
 
 
 __all__ = ["HOST_NODE", "PRE_OPERATIONAL", "Cia402Drive"]

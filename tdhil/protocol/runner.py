@@ -123,9 +123,13 @@ class Runner:
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
             try:
-                self._drive.close()
+                left = self._drive.close()
             except Exception as error:
                 cause = cause or error
+            else:
+                with suppress(Exception):
+                    for line in left:
+                        self._log.event(self._drive.clock.now_s(), "left", f"not given back: {line}")
         return RunOutcome(tuple(self._stages), cause, report, self._preflight)
 
     # -- the stages ------------------------------------------------------------------------------------------

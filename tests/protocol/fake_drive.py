@@ -60,6 +60,7 @@ class FakeDrive:
     cycles: int = 0
     missed: int = 0
     closed: bool = False
+    left: tuple[str, ...] = ()
 
     @property
     def counters(self) -> Counters:
@@ -96,9 +97,10 @@ class FakeDrive:
         self.calls.append("disable")
         self.wish = PowerState.OFF
 
-    def close(self) -> None:
+    def close(self) -> tuple[str, ...]:
         self.calls.append("close")
         self.closed = True
+        return self.left
 
     def exchange(self, command: Command) -> Sample:
         self.calls.append("exchange")

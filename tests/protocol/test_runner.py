@@ -487,3 +487,10 @@ def test_light_and_heavy_shafts_go_through_alike(world, inertia):
     result = here.runner(ExcitationRequest(periods=2)).run()
     assert result.cause is None, result.cause
     assert_at_rest(here, result)
+
+
+def test_settings_that_could_not_be_given_back_are_in_the_log(world):
+    here = world()
+    here.drive.left = ("6072h: no answer",)
+    assert here.runner().run().cause is None
+    assert any("6072h" in event[-1] and "not given back" in event[-1] for event in here.log.events)
