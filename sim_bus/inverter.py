@@ -11,24 +11,28 @@ Owns no clock and no thread: whoever calls `step` says how much time goes by.
 
 import numpy as np
 
-from sim_bus import plant
 from sim_bus.control import Controller, Regulation
 from sim_bus.noise import Disturbance, normals
 from sim_bus.params import RigParams
+from sim_bus.plant_kinds import MotorState, build
 from sim_bus.reporting import Reporting, lag_gain
 
 
 class Inverter:
     """Control, power stage and shaft of one simulated drive."""
 
-    __slots__ = ("_disturbance", "_dt_s", "_lagged_nm", "_normals", "_torque_gain", "control", "params", "reporting",
-                 "state", "torque_nm")
+    __slots__ = (
+        "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_torque_gain", "control", "params", "reporting",
+        "state", "torque_nm",
+    )
 
     def __init__(self, params: RigParams, rng: np.random.Generator) -> None:
         self.params = params
         self.control = Controller(params.drive)
         self.reporting = Reporting(params)
-        self.state = plant.State()
+        plant = build(params.plant)
+        self.state: MotorState = plant.rest()
+        self._move = plant.step
         self.torque_nm = 0.0
         """True torque on the shaft during the last step."""
         self._disturbance = Disturbance(params.noise)
@@ -39,7 +43,7 @@ class Inverter:
 
     @property
     def speed_rad_s(self) -> float:
-        """The shaft's true speed."""
+        """The motor shaft's true speed."""
         return self.state.speed_rad_s
 
     def step(self, dt_s: float) -> None:
@@ -57,7 +61,7 @@ class Inverter:
             self._lagged_nm += self._torque_gain * (demand - self._lagged_nm)
             torque = self._lagged_nm + disturbance.torque_sd_nm * ripple
         self.torque_nm = torque
-        self.state = state = plant.step(self.params.plant, self.state, torque, dt_s, disturbance.wander(load))
+        self.state = state = self._move(self.state, torque, dt_s, disturbance.wander(load))
         self.reporting.step(0.5 * (speed + state.speed_rad_s) + offset, torque, speed_noise, torque_noise)
 
     def steps(self, duration_s: float) -> tuple[int, float]:

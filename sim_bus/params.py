@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import Field
 
 from sim_bus.plant import Params as PlantParams
+from sim_bus.plant_kinds import AnyPlantParams
 from sim_bus.validated import NonNegative, Positive, Validated
 
 
@@ -51,7 +52,7 @@ class NoiseParams(Validated):
 class RigParams(Validated):
     """The simulated rig."""
 
-    plant: PlantParams = PlantParams()
+    plant: AnyPlantParams = PlantParams()
     drive: DriveParams = DriveParams()
     reporting: ReportingParams = ReportingParams()
     noise: NoiseParams = NoiseParams()

@@ -137,6 +137,6 @@ def test_friction_torque_and_loads() -> None:
 
 
 def test_parameters_are_checked() -> None:
-    for bad in ({"inertia_kg_m2": 0.0}, {"coulomb_nm": -1.0}, {"viscous_nm_s_rad": math.nan}, {"friction": "stribeck"}):
+    for bad in ({"inertia_kg_m2": 0.0}, {"coulomb_nm": -1.0}, {"viscous_nm_s_rad": math.nan}, {"friction": "karnopp"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             Params(**bad)  # type: ignore[arg-type]

@@ -1,0 +1,137 @@
+"""plant.yaml: every kind loads, says what is wrong, is documented, and turns behind the CANopen face."""
+
+import csv
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from profiles.errors import DataFileError
+from profiles.strict_yaml import parse_model
+from sim_bus.drill_string import StringParams
+from sim_bus.inverter import Inverter
+from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams, load_rig
+from sim_bus.plant import Params
+from sim_bus.plant_kinds import build
+from sim_bus.two_mass import TwoMassParams
+
+ROOT = Path(__file__).parents[2]
+KINDS = {"plant.yaml": Params, "plant_two_mass.yaml": TwoMassParams, "plant_string.yaml": StringParams,
+         "plant_stick_slip.yaml": StringParams}
+
+
+def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
+    """Dotted key → its defaults; more than one where the kinds of plant differ."""
+    found: dict[str, set[Any]] = {}
+    for name, field in model.model_fields.items():
+        parts = [part for part in (field.annotation, *get_args(field.annotation))
+                 if isinstance(part, type) and issubclass(part, BaseModel)]
+        for part in parts:
+            for key, values in defaults(part, f"{prefix}{name}.").items():
+                found.setdefault(key, set()).update(values)
+        if not parts:
+            found.setdefault(prefix + name, set()).add(field.default)
+    return found
+
+
+DEFAULTS = defaults(RigParams) | {"plant.kind": {"rigid"}}
+UNITS = {"_kg_m2": "kg·m²", "_nm_s_rad": "N·m·s/rad", "_nm_rad": "N·m/rad", "_nm": "N·m", "_rad_s": "rad/s", "_m": "m",
+         "_pa": "Pa", "_kg_m3": "kg/m³", "_nm_s_rad_m": "N·m·s/rad per m", "_a": "A", "_rpm": "1/min", "_s": "s",
+         "_permille": "‰"}
+
+
+def rows() -> dict[str, tuple[str, str]]:
+    text = (ROOT / "docs" / "plant.md").read_text(encoding="utf-8")
+    found = re.findall(r"^\| `([a-z_.0-9]+\.[a-z_.0-9]+)` \| ([^|]*) \| ([^|]*) \| .+ \|$", text, re.MULTILINE)
+    assert len(found) == len({key for key, *_ in found})
+    return {key: (unit, default) for key, unit, default in found}
+
+
+def test_page_has_every_key_and_no_other() -> None:
+    assert set(rows()) == set(DEFAULTS)
+
+
+@pytest.mark.parametrize("key", sorted(DEFAULTS))
+def test_page_says_the_true_default_and_unit(key: str) -> None:
+    unit, shown = rows()[key]
+    assert shown.split(" or ") == sorted((str(value) for value in DEFAULTS[key]), key=len)
+    ending = max((end for end in UNITS if key.endswith(end)), key=len, default=None)
+    assert unit == (UNITS[ending] if ending and key != "plant.bottom_end" else "–")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_examples_load_and_move(name: str) -> None:
+    rig = load_rig(ROOT / "examples" / name)
+    assert type(rig.plant) is KINDS[name]
+    drive = Inverter(rig, np.random.default_rng(1))
+    drive.control.speed(4.0, 1.0, 1.0)
+    for _ in range(5000):
+        drive.step(0.002)
+    assert drive.speed_rad_s == pytest.approx(4.0, abs=1.0)
+
+
+def test_no_example_is_missing_here() -> None:
+    assert {path.name for path in (ROOT / "examples").glob("plant*.yaml")} == set(KINDS)
+
+
+def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
+    rig = parse_model("plant:\n  inertia_kg_m2: 50\n  friction: dahl\n", "plant.yaml", RigParams)
+    assert rig.plant == Params(inertia_kg_m2=50.0, friction="dahl")
+    assert RigParams(plant={"coulomb_nm": 0.0}).plant == Params(coulomb_nm=0.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("kind: twomass", "plant.kind: rigid, two_mass or string is wanted, not twomass"),
+    ("kind: [two_mass]", "plant.kind: rigid, two_mass or string is wanted, not a list or section"),
+    ("stiffness_nm_rad: 3", "plant.stiffness_nm_rad: belongs to kind: two_mass, and this plant is rigid"),
+    ("kind: string\n  damping_nm_s_rad: 3", "plant.damping_nm_s_rad: belongs to kind: two_mass, and this plant is"),
+    ("bottom: {coulomb_nm: 3}", "plant.bottom: belongs to kind: two_mass or string, and this plant is rigid"),
+    ("kind: two_mass\n  stiffnes_nm_rad: 3", "unknown key 'stiffnes_nm_rad'; did you mean 'stiffness_nm_rad'?"),
+    ("kind: two_mass\n  bottom:\n    friction: lugr", "plant.bottom.friction: 'coulomb', 'stribeck', 'dahl' or"),
+    ("friction: stribeck\n  static_nm: 10", "plant.static_nm: breakaway torque can't be below coulomb_nm (60)"),
+    ("kind: string\n  length_m: 1", "plant.length_m: waves would take"),
+])
+def test_what_is_wrong_is_said_at_its_line(text: str, says: str) -> None:
+    with pytest.raises(DataFileError) as caught:
+        parse_model(f"plant:\n  {text}\n", "plant.yaml", RigParams)
+    assert says in str(caught.value)
+    assert f"plant.yaml:{2 + text.count(chr(10))}:" in str(caught.value)
+
+
+@pytest.mark.parametrize("params", [Params(), TwoMassParams(), StringParams()], ids=lambda params: params.kind)
+def test_every_plant_keeps_the_one_protocol(params: Any) -> None:
+    plant = build(params)
+    state = plant.rest()
+    assert (state.speed_rad_s, state.angle_rad) == (0.0, 0.0)
+    assert plant.step(state, params.coulomb_nm, 0.002, 0.0).speed_rad_s == 0.0
+    loaded, free = plant.step(state, 300.0, 0.002, 100.0), plant.step(state, 200.0, 0.002, 0.0)
+    assert loaded.speed_rad_s == free.speed_rad_s > 0.0
+    assert plant.step(free, 0.0, 0.002, 0.0).angle_rad == plant.step(free, 0.0, 0.002, 0.0).angle_rad > 0.0
+
+
+def test_two_masses_turn_behind_the_canopen_face(bench: Callable[..., Any], tmp_path: Path) -> None:
+    """Speed mode; the trace shows the motor's shaft, not the bottom's."""
+    drive = DriveParams(rated_torque_nm=10_000.0, torque_limit_nm=8000.0, speed_gain_nm_s_rad=3000.0,
+                        speed_integral_gain_nm_rad=2000.0)
+    rig = RigParams(plant=TwoMassParams(), noise=QUIET, reporting=FAITHFUL, drive=drive)
+    simulated, host = bench(rig, trace=tmp_path / "trace.csv")
+    host.set_up()
+    host.enable()
+    motor, bottom, reported = [0.0], [0.0], []
+    for _ in range(2000):
+        reported.append(host.cycle(velocity=300)[2] * 2.0 * np.pi / 600.0)
+        host.read(0x1000)                                     # answered after the step: nothing moves meanwhile
+        state = simulated.simulator.node.inverter.state
+        motor.append(state.speed_rad_s)
+        bottom.append(state.bottom_speed_rad_s)
+    assert motor[-1] == pytest.approx(np.pi, rel=0.05)
+    assert np.max(np.abs(np.subtract(motor, bottom))) > 1.0           # the run-up twists the string
+    assert np.allclose(reported[1:], motor[1:-1], atol=0.02)          # SYNC samples, then time goes on
+    simulated.close()
+    with (tmp_path / "trace.csv").open(encoding="utf-8") as stream:
+        traced = [float(row["speed_rad_s"]) for row in csv.DictReader(stream) if not row["event"]]
+    assert np.allclose(traced[-2000:], motor[1:], rtol=1e-5, atol=1e-7)
