@@ -15,6 +15,7 @@ _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
     "replay": "identify again from a log, with no bus and no other file",
     "simulate": "run the simulated rig as a process of its own",
+    "study": "run the paper's experiments again, beside what it published",
 }
 
 
@@ -72,6 +73,8 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.commands.identify import add_arguments
     elif name == "replay":
         from tdhil.commands.replay import add_arguments
+    elif name == "study":
+        from tdhil.commands.study import add_arguments
     else:
         from tdhil.commands.simulate import add_arguments
     return add_arguments

@@ -45,8 +45,14 @@ class StudyOutcome:
     statements: tuple[Statement, ...] = ()
     document: Mapping[str, Any] = field(default_factory=dict)      # for --json, beside tables and statements
     simulated_s: float = 0.0                                       # plant time, all runs added up
+    simulation_wall_s: float = 0.0                                 # what simulating that took; not in the document
     draw: Callable[[Figure], None] | None = None
     figure_size_in: tuple[float, float] = (8.0, 5.0)
+
+    @property
+    def cost_ms_per_simulated_s(self) -> float | None:
+        """Wall time for a second of plant time, one run; None where nothing was simulated."""
+        return 1000.0 * self.simulation_wall_s / self.simulated_s if self.simulated_s > 0.0 else None
 
 
 Progress = Callable[[float, str], None]
