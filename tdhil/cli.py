@@ -13,7 +13,7 @@ from tdhil import __version__
 
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
-    "replay": "identify again from a log, with no bus and no other file",
+    "replay": "identify again from a log, or from a trace that a drive's own tool exported",
     "simulate": "run the simulated rig as a process of its own",
     "study": "run the paper's experiments again, beside what it published",
 }

@@ -1,14 +1,20 @@
-"""`tdhil replay run.mcap`: what the live run concluded, again, from the log alone."""
+"""`tdhil replay`: a log of ours, or a trace exported from a drive's own tool, identified like a run."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
 from tdhil.commands.conclude import conclude, print_result
 from tdhil.errors import ExitCode, UsageError
 from tdhil.record.errors import LogError
+
+_TRACE_ONLY = (
+    "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
+    "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd",
+)
 
 
 class NothingRecoverable(LogError):
@@ -18,27 +24,142 @@ class NothingRecoverable(LogError):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of replay."""
-    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of a run, whole or cut short")
+    """Options of replay. None as a default: not given."""
+    # Optional for argparse only: behind --columns the file's name is taken for one more column (`_log`).
+    parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
+                        help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    parser.add_argument("--confidence", type=float, metavar="P", help="of the interval (default: the run's, or 0.95)")
+    parser.add_argument("--tolerance", type=float, metavar="SHARE",
+                        help="half-width of the interval that is enough (default: the run's, or 0.05)")
+    trace = parser.add_argument_group("a trace in CSV (a run.mcap brings all this along)")
+    trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",
+                       help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
+    trace.add_argument("--excitation", type=Path, metavar="excitation.yaml",
+                       help="the periodic motion that was run: period, lines, mean speeds, start times")
+    for flag, unit, text in (
+        ("--rated-torque", "NM", "what torque in %% or ‰ is a share of, N·m"),
+        ("--torque-limit", "NM", "the drive's torque limit, N·m: what is cut off there is refused"),
+        ("--gear", "RATIO", "i = ω_motor/ω_main (default 1)"),
+        ("--torque-scale-sd", "SHARE", "how right the drive's torque is, 1 sd (default 0.03)"),
+        ("--speed-lag", "S", "time constant of the filter on the reported speed"),
+        ("--speed-lag-sd", "S", "its standard deviation (default a tenth of it)"),
+        ("--torque-lag", "S", "time constant of the filter on the reported torque"),
+        ("--torque-lag-sd", "S", "its standard deviation (default a tenth of it)"),
+    ):
+        trace.add_argument(flag, type=float, metavar=unit, help=text)
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Read, identify, print."""
+    path = _log(namespace)
+    _check(namespace)
+    if not path.is_file():
+        raise UsageError("there is no such log", where=str(path),
+                         next_step="Name a run.mcap of this tool, or a trace in CSV")
+    return _run_log(namespace, path) if _is_log(path) else _run_trace(namespace, path)
+
+
+def _run_log(namespace: argparse.Namespace, path: Path) -> int:
     from tdhil.record.reader import read_run
     from tdhil.report.live import stderr_console
 
-    if not namespace.log.is_file():
-        raise UsageError("there is no such log", where=str(namespace.log), next_step="Name a run.mcap of this tool")
+    for name in _TRACE_ONLY:
+        if getattr(namespace, name) is not None:
+            raise UsageError("is for a trace in CSV; this log brings its own", where=f"--{name.replace('_', '-')}")
     try:
-        found = read_run(namespace.log)
+        found = read_run(path)
     except LogError as error:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
     configuration: dict[str, Any] = found.configuration
-    document, code = conclude(found.recording, configuration, str(namespace.log))
+    asked = _asked(namespace)
+    if asked:
+        configuration = configuration | {"identify": {**configuration.get("identify", {}), **asked}}
+    document, code = conclude(found.recording, configuration, str(path))
     console = stderr_console()
     for problem in found.problems:
-        console.print(f"tdhil: {namespace.log}: {problem}", style="yellow", markup=False)
+        console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
     print_result(document, namespace.json)
     return int(code if found.recording.complete or code is not ExitCode.OK else ExitCode.PARTIAL)
+
+
+def _run_trace(namespace: argparse.Namespace, path: Path) -> int:
+    from tdhil.commands.task import ASSUMED_TORQUE_SCALE_REL_SD
+    from tdhil.record.csv_choice import USUAL, parse_columns
+    from tdhil.record.csv_recording import Bench, read_recording
+
+    scale = namespace.torque_scale_sd
+    bench = Bench(
+        rated_torque_nm=namespace.rated_torque,
+        torque_limit_nm=namespace.torque_limit,
+        torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
+        gear_ratio=1.0 if namespace.gear is None else namespace.gear,
+        lag_prior=_lag_prior(namespace),
+    )
+    choices = USUAL if namespace.columns is None else parse_columns(namespace.columns)
+    recording, warnings = read_recording(path, choices, namespace.excitation, bench)
+    if scale is None:
+        warnings = (*warnings, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
+    asked = {"tolerance": 0.05, "confidence": 0.95} | _asked(namespace)
+    document, code = conclude(recording, {"identify": asked}, str(path), warnings)
+    print_result(document, namespace.json)
+    return int(code)
+
+
+def _lag_prior(namespace: argparse.Namespace) -> Any:
+    from tdhil.commands.task import UNKNOWN_LAG_SD_SHARE
+    from tdhil.record.recording import LagPrior
+
+    sds = []
+    for lag, sd in ((namespace.speed_lag, namespace.speed_lag_sd), (namespace.torque_lag, namespace.torque_lag_sd)):
+        sds.append((lag or 0.0) * UNKNOWN_LAG_SD_SHARE if sd is None else sd)
+    known = namespace.speed_lag is not None or namespace.torque_lag is not None
+    return LagPrior(namespace.speed_lag, sds[0], namespace.torque_lag, sds[1], "the command line" if known else "")
+
+
+def _log(namespace: argparse.Namespace) -> Path:
+    if namespace.log is None and namespace.columns and "=" not in namespace.columns[-1]:
+        namespace.log = Path(namespace.columns.pop())
+    if namespace.log is None:
+        raise UsageError("which log? None is named", next_step="Such as: tdhil replay run.mcap")
+    log: Path = namespace.log
+    return log
+
+
+def _is_log(path: Path) -> bool:
+    """MCAP by its first bytes, also if there are no more than some of them."""
+    from tdhil.record.container import MAGIC
+
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise NothingRecoverable(f"can't be read ({error.strerror or error})", where=str(path)) from error
+    return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
+
+
+def _asked(namespace: argparse.Namespace) -> dict[str, float]:
+    names = ("confidence", "tolerance")
+    return {name: getattr(namespace, name) for name in names if getattr(namespace, name) is not None}
+
+
+def _check(namespace: argparse.Namespace) -> None:
+    """Numbers that no trace could make sense of. UsageError names the option."""
+    for name, low, high, wanted in (
+        ("confidence", 0.5, 1.0, "at least 0.5 and below 1"),
+        ("tolerance", 1e-9, math.inf, "a positive share"),
+        ("rated_torque", 1e-9, math.inf, "a positive number of N·m"),
+        ("torque_limit", 1e-9, math.inf, "a positive number of N·m"),
+        ("gear", 1e-9, math.inf, "a positive number"),
+        ("torque_scale_sd", 0.0, 1.0, "a share from 0 to below 1"),
+        *((lag, 0.0, math.inf, "a time in s, not negative")
+          for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd")),
+    ):
+        value = getattr(namespace, name)
+        if value is not None and not low <= value < high:      # NaN neither
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}")
+    for lag in ("speed_lag", "torque_lag"):
+        if getattr(namespace, lag) is None and getattr(namespace, f"{lag}_sd") is not None:
+            flag = lag.replace("_", "-")
+            raise UsageError(f"needs --{flag}, the value that it is the deviation of", where=f"--{flag}-sd")

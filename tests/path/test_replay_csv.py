@@ -1,0 +1,203 @@
+"""`tdhil replay trace.csv`: the same inertia from a run's log and from its samples in other people's dialects."""
+
+import math
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from path_runs import identify, tdhil
+
+from tdhil.record.csv_excitation import load_excitation
+from tdhil.record.reader import read_run
+
+RPM = 2.0 * math.pi / 60.0
+DOC = Path(__file__).parents[2] / "docs" / "csv.md"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run, its Recording, and its excitation as a file."""
+    folder = tmp_path_factory.mktemp("run")
+    done = identify(folder, "--simulate", "--seed", 1, "--periods", 3)
+    assert done.code == 0, done.err
+    recording = read_run(done.log).recording
+    segments = [
+        {"start_s": s.start_s, "periods": round((s.end_s - s.start_s) / s.period_s), "period_s": s.period_s,
+         "settle_periods": s.settle_periods, "offset_rad_s": s.offset_rad_s, "lines_hz": list(s.lines_hz)}
+        for s in recording.excitation.segments
+    ]
+    path = folder / "excitation.yaml"
+    path.write_text(yaml.safe_dump({"kind": "multisine", "mode": recording.excitation.mode, "segments": segments}))
+    return done.document, recording, path, done.log
+
+
+def plain(t, w, m):
+    return "time_s,speed_rad_s,torque_nm\n", "%.17g,%.17g,%.17g", (t, w, m), "utf-8", ()
+
+
+def percent(t, w, m):
+    options = ("--columns", "time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%", "--rated-torque", 480)
+    return "t_s,n_rpm,m_pct\n", "%.6f,%.7f,%.7f", (t, w / RPM, m / 4.8), "utf-8-sig", options
+
+
+def german(t, w, m):
+    head = "Gerät;7\n\nZeit;Drehzahl;Moment\nms;1/min;kNm\n"
+    options = ("--columns", "time=zeit", "speed=drehzahl", "torque=moment")
+    return head, "%.4f;%.7f;%.9f", (t * 1e3, w / RPM, m / 1e3), "latin-1", options
+
+
+def american(t, w, m):
+    options = ("--columns", "torque=Tq:lbf.ft", "speed=Spd")
+    return "Time [us]\tTq\tSpd (deg/s)\n", "%.1f\t%.8f\t%.8f", (t * 1e6, m / 1.3558179483314004, np.degrees(w)), \
+        "utf-16", options
+
+
+@pytest.mark.parametrize("dialect", [plain, percent, german, american])
+def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
+    document, recording, excitation, _ = run
+    fresh = recording.fresh
+    torque = recording.torque_nm[fresh] - recording.torque_offset_nm
+    head, row, columns, encoding, options = dialect(recording.time_s[fresh], recording.speed_rad_s[fresh], torque)
+    body = "\n".join(row % values for values in zip(*columns, strict=True))
+    path = tmp_path / "trace.csv"
+    path.write_text(head + (body.replace(".", ",") if dialect is german else body), encoding=encoding)
+    done = tdhil("replay", path, "--json", "--excitation", excitation, *options)
+    assert done.code == 0, done.err
+    found = done.document
+    assert found.keys() == document.keys()
+    assert found["log"] == str(path)
+    for name in ("value", "low", "high"):
+        assert found["inertia_kg_m2"][name] == pytest.approx(document["inertia_kg_m2"][name], rel=2e-4)
+    assert found["verdict"] == document["verdict"]
+    assert found["paper"]["inertia_kg_m2"] == pytest.approx(document["paper"]["inertia_kg_m2"], rel=1e-3)
+    assert found["samples_used"] == document["samples_used"]
+    assert any("torque scale" in warning for warning in found["warnings"])
+    assert any("decimal comma" in warning for warning in found["warnings"]) == (dialect is german)
+
+
+@pytest.fixture
+def trace(run, tmp_path):
+    _, recording, _, _ = run
+    path = tmp_path / "run.mcap"          # the name says nothing
+    rows = zip(recording.time_s[::10], recording.speed_rad_s[::10], recording.torque_nm[::10], strict=True)
+    path.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{t:.5f},{w:.6f},{m:.4f}\n" for t, w, m in rows))
+    return path
+
+
+def test_without_an_excitation_it_is_not_identifiable_and_says_what_to_add(trace):
+    done = tdhil("replay", trace, "--json")
+    assert done.code == 9
+    found = done.document
+    assert found["verdict"] == "not_identifiable"
+    assert found["inertia_kg_m2"] is None
+    assert "no periodic excitation is known" in found["reason"]
+    assert "--excitation excitation.yaml" in found["advice"]
+    assert found["paper"]["inertia_kg_m2"] > 0
+    card = tdhil("replay", trace)
+    assert card.code == 9
+    assert "--excitation" in card.out
+    assert "the paper's method" in card.out
+
+
+def test_what_is_known_of_the_bench_is_used(run, trace):
+    _, _, excitation, _ = run
+    arguments = ("replay", "--json", trace, "--excitation", excitation)
+    alone = tdhil(*arguments).document
+    found = tdhil(*arguments, "--gear", 2, "--torque-scale-sd", 0, "--speed-lag", 0.4, "--speed-lag-sd", 0.01,
+                  "--torque-lag", 0.15, "--confidence", 0.9, "--tolerance", 0.0001).document
+    inertia = found["inertia_kg_m2"]
+    assert found["verdict"] == "valid_wide"
+    assert inertia["confidence"] == 0.9
+    assert (inertia["low_total"], inertia["high_total"]) == (inertia["low"], inertia["high"])
+    assert found["inertia_main_shaft_kg_m2"]["value"] == 4 * inertia["value"]
+    assert any("the command line" in condition for condition in inertia["conditional_on"])
+    assert not any("torque scale" in warning for warning in found["warnings"])
+    narrower = inertia["high"] - inertia["low"]
+    assert narrower < alone["inertia_kg_m2"]["high"] - alone["inertia_kg_m2"]["low"]
+    clipped = tdhil(*arguments, "--torque-limit", 50)
+    assert clipped.code == 9
+    assert "limit of 50 N·m" in clipped.document["reason"]
+
+
+def test_a_log_is_known_by_its_content(run, tmp_path):
+    document, _, excitation, log = run
+    renamed = tmp_path / "trace.csv"
+    renamed.write_bytes(log.read_bytes())
+    assert tdhil("replay", "--json", renamed).document == document | {"log": str(renamed)}
+    sure = tdhil("replay", "--json", renamed, "--confidence", 0.99).document
+    assert sure["inertia_kg_m2"]["low"] < document["inertia_kg_m2"]["low"]
+    assert sure["inertia_kg_m2"]["confidence"] == 0.99
+    wrong = tdhil("replay", renamed, "--excitation", excitation)
+    assert wrong.code == 2
+    assert "--excitation" in wrong.err
+
+
+@pytest.mark.parametrize(("arguments", "said"), [
+    (("--columns", "speed=n_rmp:rpm"), "no column 'n_rmp'"),
+    (("--columns", "speed=n:rmp"), "'rmp' is no unit of speed"),
+    (("--columns", "torque=torque_nm:%"), "--rated-torque"),
+    (("--rated-torque", "0"), "--rated-torque"),
+    (("--gear", "nan"), "--gear"),
+    (("--confidence", "95"), "--confidence"),
+    (("--tolerance", "0"), "--tolerance"),
+    (("--torque-scale-sd", "2"), "--torque-scale-sd"),
+    (("--speed-lag", "-1"), "--speed-lag"),
+    (("--torque-lag-sd", "0.1"), "--torque-lag"),
+    (("--excitation", "none.yaml"), "none.yaml"),
+])
+def test_a_wrong_option_ends_with_2_and_names_what_is_wrong(trace, arguments, said):
+    done = tdhil("replay", trace, *arguments)
+    assert done.code == 2, done.err
+    assert said in done.err
+    assert "Traceback" not in done.err
+    assert done.out == ""
+
+
+def test_the_file_may_stand_behind_the_columns(trace):
+    done = tdhil("replay", "--json", "--columns", "time=TIME_S", "speed=speed_rad_s", trace)
+    assert done.code == 9
+    assert done.document["log"] == str(trace)
+    nothing = tdhil("replay", "--json")
+    assert nothing.code == nothing.document["exit_code"] == 2
+
+
+def test_an_unusable_file_ends_with_10_in_one_line(tmp_path):
+    path = tmp_path / "trace.csv"
+    path.write_text("time_s,speed_rad_s,torque_nm\n" + "0,1,2\n" * 100)
+    done = tdhil("replay", "--json", path)
+    assert done.code == done.document["exit_code"] == 10
+    assert f"{path}:3: the time repeats itself" in done.err
+    assert done.err.count("\n") == 1
+
+
+# -- docs/csv.md ---------------------------------------------------------------------------------------------
+
+
+def test_the_page_s_examples_do_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = DOC.read_text(encoding="utf-8")
+    files = re.findall(r"^<!-- file: (\S+)[^\n]*-->\n```\w+\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    assert {name for name, _ in files} == {"trace.csv", "percent.csv", "german.csv", "excitation.yaml"}
+    for name, content in files:
+        Path(name).write_text(content, encoding="utf-8")
+    excitation, levels = load_excitation(Path("excitation.yaml"), np.array([0.0, 300.0]))
+    assert [segment.end_s for segment in excitation.segments] == [152.0, 300.0]
+    assert levels == ()
+    commands = re.findall(r"^tdhil (.*)$", text, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands[:3]:
+        done = tdhil(*shlex.split(command), "--json")
+        assert done.code == 9, done.err
+        assert "too few" in done.document["reason"]
+    late = tdhil(*shlex.split(commands[3]))
+    assert late.code == 2
+    assert "excitation.yaml:4: segment 1 lasts from 12 to 152 s, but the trace" in late.err
+
+
+def test_the_page_names_every_option():
+    shown = tdhil("replay", "--help").out
+    for option in set(re.findall(r"--[a-z][a-z-]+", DOC.read_text(encoding="utf-8"))):
+        assert option in shown, option
