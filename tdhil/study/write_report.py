@@ -99,7 +99,7 @@ th { background: #f4f4f4; font-weight: 600 }
 <h1>Paper and program, side by side</h1>
 <p>Xu et al., <i>Appl. Sci.</i> 2026, 16, 2012, beside what comes out here. {{ tally }}. Everything here is SIMULATED;
 figures 19 to 23 through the drive's own bus protocol.</p>
-<nav>{% for c in chapters %}<a href="#{{ c.name }}">{{ c.name }}</a>{% endfor %}</nav>
+<nav>{% for c in chapters %}<a href="#{{ c.name }}">{{ c.name }}</a> {% endfor %}</nav>
 {% for c in chapters %}
 <h2 id="{{ c.name }}">{{ c.name }}{% if c.outcome %}: {{ c.outcome.title }}{% endif %}</h2>
 {% if not c.outcome %}<p class="red">No result: {{ c.failure }}</p>{% else %}
