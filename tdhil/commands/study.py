@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from tdhil.study.write_report import Chapter
 
 LIST, ALL = "list", "paper"
+OURS = ("coverage",)
+"""Studies that are no experiment of the paper's, and take long."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,13 +44,14 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def all_studies() -> dict[str, Study]:
-    """Every study by its name, tables first, figures in the paper's order."""
+    """Every study by its name, tables first, figures in the paper's order; ours last."""
     from tdhil.commands.field_bench import SimulatedFieldBench
+    from tdhil.study.coverage import COVERAGE
     from tdhil.study.field_registry import field_studies
     from tdhil.study.registry import simulated_studies
 
     known = {study.name: study for study in (*simulated_studies(), *field_studies(SimulatedFieldBench()))}
-    return {name: known[name] for name in sorted(known, key=_order)}
+    return {name: known[name] for name in sorted(known, key=_order)} | {COVERAGE.name: COVERAGE}
 
 
 def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[tuple[Study, Any]]:
@@ -58,7 +61,7 @@ def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[
 
     names = list(dict.fromkeys(namespace.studies))
     if names == [ALL]:
-        names = list(studies)
+        names = [name for name in studies if name not in OURS]
     for name in names:
         if name not in studies:
             raise _unknown(name, studies)

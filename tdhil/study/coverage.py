@@ -1,0 +1,112 @@
+"""`tdhil study coverage`: does the interval cover the truth, on plants that the estimator knows nothing of?
+
+Every plant of the fleet is simulated and identified many times over, each run with its own noise and its own rough
+inertia. Counted are the intervals that miss; bias and scatter are held against the least that is possible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, model_validator
+
+from profiles.data_model import DataModel, Finding, refuse_if
+from tdhil.study.coverage_bound import cramer_rao
+from tdhil.study.coverage_draw import draw_coverage
+from tdhil.study.coverage_figures import PlantFigures, figures_of
+from tdhil.study.coverage_fleet import FLEET
+from tdhil.study.coverage_plants import CoveragePlant
+from tdhil.study.coverage_runs import Run, run_all, tasks
+from tdhil.study.coverage_said import about_table, plant_table, refusal_table, said
+from tdhil.study.outcome import Progress, Study, StudyOutcome
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class CoverageSettings(DataModel):
+    """How many runs, of which plants, how long, at what confidence."""
+
+    seeds: Annotated[int, Field(ge=1, le=100_000)] = 500
+    """Runs a plant."""
+    plants: list[str] = Field(default_factory=list)
+    """Names of plants; none for all of them."""
+    periods: Annotated[int, Field(ge=4, le=200)] = 10
+    """Periods that count, at each of two mean speeds."""
+    confidence: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.95
+    processes: Annotated[int, Field(ge=1, le=64)] = 2
+    seed: Annotated[int, Field(ge=0)] = 1
+
+    @property
+    def chosen(self) -> tuple[CoveragePlant, ...]:
+        """The plants meant, in the fleet's order."""
+        return tuple(plant for plant in FLEET if not self.plants or plant.name in self.plants)
+
+    @model_validator(mode="after")
+    def _known(self) -> CoverageSettings:
+        names = [plant.name for plant in FLEET]
+        findings: list[Finding] = [
+            ("plants", f"no plant '{name[:40]}'; known: {', '.join(names)}")
+            for name in self.plants
+            if name not in names
+        ]
+        refuse_if(findings)
+        return self
+
+
+@dataclass
+class CoverageStudy:
+    """`tdhil study coverage`."""
+
+    name: str = "coverage"
+    title: str = "Coverage of the interval and closeness to the Cramér-Rao bound, plant by plant"
+
+    @property
+    def settings_model(self) -> type[CoverageSettings]:
+        return CoverageSettings
+
+    def run(self, settings: CoverageSettings, progress: Progress) -> StudyOutcome:
+        """Every run of every plant; the same settings give the same bits, whatever the number of processes."""
+        plants = settings.chosen
+        wanted = tasks(plants, settings.seeds, settings.seed, settings.periods, settings.confidence)
+        runs: dict[str, list[Run]] = {plant.name: [] for plant in plants}
+        total, done = settings.seeds * len(plants), 0
+        progress(0.0, "first runs")
+        for group in run_all(wanted, min(settings.processes, len(wanted))):
+            runs[group[0].plant] += group
+            done += len(group)
+            progress(0.98 * done / total, f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs")
+        found = []
+        for index, plant in enumerate(plants):
+            progress(0.98 + 0.02 * index / len(plants), f"{plant.name}: Cramér-Rao bound")
+            found.append(figures_of(plant, runs[plant.name], cramer_rao(plant, settings.periods)))
+        progress(1.0, "done")
+        return outcome_of(self, found, settings)
+
+
+def outcome_of(study: CoverageStudy, found: list[PlantFigures], settings: CoverageSettings) -> StudyOutcome:
+    """Figures as tables, statements, document and picture."""
+    nominal = 1.0 - settings.confidence
+
+    def draw(figure: Figure) -> None:
+        draw_coverage(figure, found, nominal)
+
+    return StudyOutcome(
+        name=study.name,
+        title=study.title,
+        tables=(plant_table(found, settings.confidence), about_table(found), refusal_table(found)),
+        statements=said(found, settings.confidence),
+        document={"plants": [_document(one) for one in found], "settings": settings.model_dump(mode="json")},
+        simulated_s=sum(one.runs * one.run_seconds for one in found),
+        draw=draw,
+        figure_size_in=(8.0, 6.0),
+    )
+
+
+def _document(one: PlantFigures) -> dict[str, Any]:
+    """All of a plant's figures, and the plant itself."""
+    return {**asdict(one), "answered": one.answered, "rmse_over_bound": one.over_bound}
+
+
+COVERAGE: Study = CoverageStudy()
