@@ -40,7 +40,7 @@ from drivers.cia402.state import (
     decode,
     power_state,
 )
-from drivers.cia402.watch import OPERATIONAL, PRE_OPERATIONAL, Watch
+from drivers.cia402.watch import OPERATIONAL, Watch
 from drivers.clock import Clock
 from drivers.drive import (
     Command,
@@ -381,4 +381,4 @@ class Cia402Drive:
         return left
 
 
-__all__ = ["HOST_NODE", "PRE_OPERATIONAL", "Cia402Drive"]
+__all__ = ["HOST_NODE", "Cia402Drive"]

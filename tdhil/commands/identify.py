@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -150,15 +150,14 @@ def _task(options: Resolved, rig: Rig | None, log: RunLog, identity: Identity) -
 def _finish(outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console) -> int:
     """Identify and print, or say what ended the run."""
     from tdhil.commands.conclude import conclude, print_result
-    from tdhil.errors import ExitCode
 
     if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
         return _failed(outcome, path, as_json, console)
-    with console.status("identifying …") if console.is_terminal else _Nothing():
+    with console.status("identifying …") if console.is_terminal else nullcontext():
         document, code = conclude(log.recording(complete=True), log.run, path)
     log.result(document)
     print_result(document, as_json)
-    return int(code if code is not ExitCode.OK else ExitCode.OK)
+    return int(code)
 
 
 def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> int:
@@ -201,14 +200,6 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         }
         print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
     return int(code)
-
-
-class _Nothing:
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, *exc: object) -> None:
-        return None
 
 
 def _configuration(options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:

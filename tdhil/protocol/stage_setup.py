@@ -8,7 +8,6 @@ at walking pace.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 from drivers.drive import Command, Mode
 from drivers.errors import LimitHit, PreflightRefused
@@ -19,15 +18,6 @@ from tdhil.protocol.steady import trace
 STANDSTILL_S = 1.0
 RAMP_S = 5.0
 """The probe torque is reached after this long, if nothing moves before."""
-
-
-@dataclass(frozen=True)
-class SetupResult:
-    """Offsets (de-energised, at standstill) and the torque at which the shaft first moved."""
-
-    speed_offset_rad_s: float
-    torque_offset_nm: float
-    breakaway_nm: float | None
 
 
 def measure_offsets(bench: Bench, limits: MachineLimits) -> tuple[float, float]:
