@@ -1,12 +1,16 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
 from tdhil.identify.identification import (
+    BudgetLine,
+    Compliant,
     Estimate,
+    FrictionPoint,
     Identification,
     InertiaEstimate,
     LineFit,
     PaperEstimate,
     ResidualTest,
+    SecondOpinion,
     Verdict,
 )
 from tdhil.identify.identify import identify
@@ -14,7 +18,10 @@ from tdhil.identify.options import Options
 from tdhil.identify.rough import RoughFriction, RoughInertia, rough_friction, rough_inertia
 
 __all__ = [
+    "BudgetLine",
+    "Compliant",
     "Estimate",
+    "FrictionPoint",
     "Identification",
     "InertiaEstimate",
     "LineFit",
@@ -23,6 +30,7 @@ __all__ = [
     "ResidualTest",
     "RoughFriction",
     "RoughInertia",
+    "SecondOpinion",
     "Verdict",
     "identify",
     "rough_friction",

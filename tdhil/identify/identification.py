@@ -66,11 +66,61 @@ class ResidualTest:
 
 
 @dataclass(frozen=True)
+class BudgetLine:
+    """One source's share of J's uncertainty, kg·m²: the half-width that it alone leaves, at the result's confidence.
+
+    ``source``: noise, lag structure, lags, friction model, timing, torque scale. Lines add up in squares, about.
+    """
+
+    source: str
+    half_width_kg_m2: float
+    note: str
+
+
+@dataclass(frozen=True)
+class SecondOpinion:
+    """J by another route through the same run, with the interval that this route can vouch for.
+
+    ``route``: speed change, coast-down, torque steps. ``agrees``: its interval and the result's overlap as two
+    independent ones of this confidence should; None where there is no result to agree with.
+    """
+
+    route: str
+    inertia_kg_m2: Estimate
+    agrees: bool | None
+    note: str
+
+
+@dataclass(frozen=True)
+class FrictionPoint:
+    """Friction torque (load included) at one steady speed, N·m, with its interval."""
+
+    speed_rad_s: float
+    torque_nm: Estimate
+
+
+@dataclass(frozen=True)
+class Compliant:
+    """A shaft that is not rigid: what turns behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
+
+    ``total_inertia`` is J_r + J_L, known even where the two can't be told apart. A quantity that the data leave open is
+    None. ``antiresonance_hz``: where torque moves the motor most easily; ``resonance_hz``: where the load alone swings.
+    """
+
+    total_inertia: Estimate
+    load_inertia: Estimate | None
+    stiffness_nm_rad: Estimate | None
+    damping_nm_s_rad: Estimate | None
+    resonance_hz: Estimate | None
+    antiresonance_hz: Estimate | None
+
+
+@dataclass(frozen=True)
 class Identification:
     """The whole conclusion. Estimates are None where the verdict is a refusal or the quantity isn't in the model."""
 
     verdict: Verdict
-    model: str                                  # rigid, rigid+lags, two-mass, …; which one stands
+    model: str                                  # paper, rigid+lags, two-mass, string, …; which one stands
     reason: str                                 # one sentence: why this verdict and this model
     advice: str                                 # one sentence: what would make it better
     inertia: InertiaEstimate | None
@@ -84,3 +134,7 @@ class Identification:
     periods_used: int = 0
     samples_used: int = 0
     warnings: tuple[str, ...] = ()
+    budget: tuple[BudgetLine, ...] = ()
+    second_opinions: tuple[SecondOpinion, ...] = ()
+    friction_curve: tuple[FrictionPoint, ...] = ()      # rising speed; empty where fewer than three speeds were seen
+    compliant: Compliant | None = None                  # with the models two-mass and string; ``inertia`` is J_r then
