@@ -1,28 +1,52 @@
 """Can these lines tell the inertia at all? Count equations and unknowns before fitting.
 
 Each distinct excited frequency is two equations (real and imaginary part of T/ω); two mean speeds add one (B), each
-lag stated by the drive or the rig one. Unknown are five: J, B, the two lags, and the skew. At a second mean speed the
+lag stated by the drive or the rig one. Unknown are five: J, B, the two lags, and the skew. (The structure of the lags
+is unknown too; where the lines cannot tell it, the interval is wide or open, but is one.) At a second mean speed the
 same frequency says the same again: it helps the scatter, not the count.
+
+The parameters are those of the rigid model.
 """
 
 from tdhil.identify.friction import ViscousTie
 from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.model import Model
 from tdhil.identify.quality import Refusal
-from tdhil.identify.rigid import SKEW, SPEED_LAG, TORQUE_LAG
+from tdhil.identify.reports import AVERAGE, SKEW, SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE
 from tdhil.record.recording import LagPrior
 
 UNKNOWNS = 5
+_AT = Model().at
 _LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisecond at best
 
 
-def lag_priors(prior: LagPrior) -> tuple[GaussianPrior, ...]:
-    """What is known of the two lags."""
+def lag_priors(
+    prior: LagPrior, speed_index: int = _AT(SPEED_LAG), torque_index: int = _AT(TORQUE_LAG)
+) -> tuple[GaussianPrior, ...]:
+    """What is known of the two lags; the indices are where they stand in theta."""
     known = []
     if prior.speed_lag_s is not None:
-        known.append(GaussianPrior(SPEED_LAG, prior.speed_lag_s, max(prior.speed_lag_sd_s, _LEAST_SD_S)))
+        known.append(GaussianPrior(speed_index, prior.speed_lag_s, max(prior.speed_lag_sd_s, _LEAST_SD_S)))
     if prior.torque_lag_s is not None:
-        known.append(GaussianPrior(TORQUE_LAG, prior.torque_lag_s, max(prior.torque_lag_sd_s, _LEAST_SD_S)))
+        known.append(GaussianPrior(torque_index, prior.torque_lag_s, max(prior.torque_lag_sd_s, _LEAST_SD_S)))
     return tuple(known)
+
+
+def known_structure(prior: LagPrior) -> dict[int, float]:
+    """A stated lag is a first-order one. What the manual states of both reports leaves no room for an average."""
+    held = {}
+    if prior.speed_lag_s is not None:
+        held[_AT(SPEED_SHAPE)] = 0.0
+    if prior.torque_lag_s is not None:
+        held[_AT(TORQUE_SHAPE)] = 0.0
+    if len(held) == 2:
+        held[_AT(AVERAGE)] = 0.0
+    return held
+
+
+def unfiltered() -> dict[int, float]:
+    """The paper's assumption: what is reported is what is."""
+    return {_AT(index): 0.0 for index in (SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW)}
 
 
 def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | None, sd_s: float) -> tuple[
@@ -31,7 +55,7 @@ def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | N
     """If only the skew is missing from the count, and both lags are known: torque and speed come in one frame."""
     known = len(priors) + (tie is not None) + 2 * lines
     if known < UNKNOWNS and len(priors) == 2:
-        return (*priors, GaussianPrior(SKEW, 0.0, max(sd_s, _LEAST_SD_S)))
+        return (*priors, GaussianPrior(_AT(SKEW), 0.0, max(sd_s, _LEAST_SD_S)))
     return priors
 
 

@@ -9,12 +9,13 @@ import math
 
 import numpy as np
 
-from tdhil.identify.fit import Box, Fit, minimise
+from tdhil.identify.descent import Box, Fit
+from tdhil.identify.fit import minimise
 from tdhil.identify.likelihood import Likelihood
 from tdhil.record.recording import FloatArray
 
 _TRIES = 14
-_CLOSE = 2e-3     # of t: how well the edge is found
+_CLOSE = 5e-3     # of t: how well the edge is found
 
 
 def student_quantile(confidence: float, dof: float) -> float:

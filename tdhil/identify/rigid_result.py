@@ -1,30 +1,27 @@
-"""The rigid model fitted to the lines of a recording: best structure, intervals, and what they rest on."""
+"""The rigid model fitted to the lines of a recording: values, intervals, and what they rest on."""
 
 import math
 from dataclasses import dataclass, replace
 
-from tdhil.identify.fit import Box, Fit, best_fit, box, rough_inertia_of
+from tdhil.identify import reports
+from tdhil.identify.budget import budget_of
+from tdhil.identify.fit import Held, rigid_rivals, rigid_starts
 from tdhil.identify.friction import Levels, ViscousTie, coulomb_level
-from tdhil.identify.identification import Estimate, ResidualTest
+from tdhil.identify.identification import BudgetLine, Estimate, ResidualTest
+from tdhil.identify.interval import estimate, first_order_estimate
 from tdhil.identify.likelihood import GaussianPrior, Likelihood
-from tdhil.identify.profile import profile_edge, standard_deviation, student_quantile
+from tdhil.identify.model import Model
+from tdhil.identify.profile import standard_deviation, student_quantile
 from tdhil.identify.residual import rejects, residual_test
-from tdhil.identify.rigid import INERTIA, SKEW, SPEED_LAG, TORQUE_LAG, VISCOUS, SpeedReport
+from tdhil.identify.shaft import INERTIA, VISCOUS
 from tdhil.identify.spectrum import Line
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One structure of the speed report with its best fit."""
-
-    problem: Likelihood
-    limits: Box
-    fit: Fit
+from tdhil.identify.structure import Fitted, fit_model
+from tdhil.record.recording import FloatArray
 
 
 @dataclass(frozen=True)
 class RigidResult:
-    """``inertia`` is infinite on a side that the data leave open; ``structures`` are those allowed, simplest first."""
+    """``inertia`` is infinite on a side that the data leave open."""
 
     inertia: Estimate
     viscous: Estimate
@@ -33,7 +30,9 @@ class RigidResult:
     torque_lag_s: Estimate
     skew_s: Estimate
     residual: ResidualTest | None
-    structures: tuple[SpeedReport, ...]
+    budget: tuple[BudgetLine, ...]
+    first_order: bool          # first-order lags are the likelier answer
+    fitted: Fitted
 
 
 def fit_rigid(
@@ -41,91 +40,74 @@ def fit_rigid(
     levels: Levels,
     tie: ViscousTie | None,
     priors: tuple[GaussianPrior, ...],
-    held: dict[int, float],
-    reports: tuple[SpeedReport, ...],
+    held: Held,
     confidence: float,
+    torque_scale_rel_sd: float = 0.0,
 ) -> RigidResult:
-    """Fit every structure; the interval of J is what any structure leaves open that the data don't contradict.
-
-    The structure of the speed report is one more unknown, a discrete one, and is profiled out like the others: J lies
-    where min over structures and other parameters of −2 ln L is within t² of the overall minimum. The value is that of
-    the simplest structure within the same distance.
-    """
-    candidates = _candidates(lines, tie, priors, held, reports)
-    lowest = min(candidate.fit.objective for candidate in candidates)
-    best = min(candidates, key=lambda candidate: candidate.fit.objective)
-    free = [index for index in range(5) if index not in held]
-    _, dof = standard_deviation(best.problem, best.fit.theta, INERTIA, free)
-    quantile = student_quantile(confidence, dof)
-    allowed = [candidate for candidate in candidates if candidate.fit.objective - lowest <= quantile**2]
-    chosen = allowed[0]
-    residual = residual_test(best.problem, best.fit.theta, len(free))
-    hopeless = rejects(residual)     # then no interval will be shown, and none is sought
-    edges = [] if hopeless else [_edges(candidate, INERTIA, lowest, quantile, held, free) for candidate in allowed]
-    found = float(chosen.fit.theta[INERTIA])
-    inertia = Estimate(
-        found, min((edge[0] for edge in edges), default=found), max((edge[1] for edge in edges), default=found)
-    )
-
-    def estimate(index: int) -> Estimate:
-        value = float(chosen.fit.theta[index])
-        if hopeless or index in held:
-            return Estimate(value, value, value)
-        _, own_dof = standard_deviation(chosen.problem, chosen.fit.theta, index, free)
-        own = student_quantile(confidence, own_dof)
-        low, high = _edges(chosen, index, chosen.fit.objective, own, held, free)
-        return Estimate(value, low, high)
-
-    viscous = estimate(VISCOUS)
+    """Fit, test, and profile. ``held``: parameters of theta known for certain (see Model)."""
+    model = Model()
+    problem = Likelihood(lines, model, tie, priors)
+    fitted = fit_model(lines, model, tie, priors, held, rigid_starts(problem), problem, rigid_rivals)
+    residual = residual_test(problem, fitted.whole.theta, len(fitted.free))
+    if rejects(residual):            # then no interval will be shown, and none is sought
+        return _bare(fitted, residual)
+    inertia = estimate(fitted, INERTIA, confidence)
+    viscous = estimate(fitted, VISCOUS, confidence)
+    speed_lag, torque_lag, skew = _lags(fitted, confidence)
     return RigidResult(
         inertia=inertia,
         viscous=viscous,
-        coulomb=_coulomb(levels, chosen, free, confidence),
-        speed_lag_s=estimate(SPEED_LAG),
-        torque_lag_s=estimate(TORQUE_LAG),
-        skew_s=estimate(SKEW),
+        coulomb=_coulomb(levels, fitted, confidence),
+        speed_lag_s=speed_lag,
+        torque_lag_s=torque_lag,
+        skew_s=skew,
         residual=residual,
-        structures=tuple(candidate.problem.report for candidate in allowed),
+        budget=budget_of(fitted, inertia, confidence, torque_scale_rel_sd),
+        first_order=fitted.first_order,
+        fitted=fitted,
     )
 
 
-def _candidates(
-    lines: tuple[Line, ...],
-    tie: ViscousTie | None,
-    priors: tuple[GaussianPrior, ...],
-    held: dict[int, float],
-    reports: tuple[SpeedReport, ...],
-) -> list[Candidate]:
-    found: list[Candidate] = []
-    for report in reports:
-        problem = Likelihood(lines, report, tie, priors)
-        limits = box(problem, rough_inertia_of(problem))
-        near = found[0].fit if found else None
-        found.append(Candidate(problem, limits, best_fit(problem, limits, held, near)))
-    return found
+def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
+    """Of a model that the data reject: the values, for whoever wants to look, without width."""
+    theta, at = fitted.whole.theta, fitted.problem.model.at
+    point = [Estimate(float(x), float(x), float(x)) for x in theta]
+    speed, torque, skew = (point[at(i)] for i in (reports.SPEED_LAG, reports.TORQUE_LAG, reports.SKEW))
+    return RigidResult(
+        point[INERTIA], point[VISCOUS], None, speed, torque, skew, residual, (), fitted.first_order, fitted
+    )
 
 
-def _edges(
-    candidate: Candidate, index: int, lowest: float, quantile: float, held: dict[int, float], free: list[int]
-) -> tuple[float, float]:
-    sd, _ = standard_deviation(candidate.problem, candidate.fit.theta, index, free)
-    step = quantile * sd
-    centre = abs(float(candidate.fit.theta[index]))
-    natural = float(candidate.limits.scale[index])
-    step = min(max(step, 1e-7 * natural), 0.5 * max(centre, natural))
-    rise = quantile**2 - (candidate.fit.objective - lowest)
-    low = profile_edge(candidate.problem, candidate.limits, candidate.fit, index, -step, rise, held)
-    high = profile_edge(candidate.problem, candidate.limits, candidate.fit, index, step, rise, held)
-    return low, high
+def _lags(fitted: Fitted, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
+    """Delay of slow motion in either report, and what torque is late besides.
+
+    Where first-order lags are the answer, their intervals are those of first-order lags. The whole family counts half
+    of a moving average among the delays, whichever report it stands in; where one was found it is given back.
+    """
+    at = fitted.problem.model.at
+    chosen = (reports.SPEED_LAG, reports.TORQUE_LAG, reports.SKEW)
+    if fitted.first_order:
+        first = [first_order_estimate(fitted, at(index), confidence) for index in chosen]
+        return first[0], first[1], first[2]
+    speed, torque, skew = (estimate(fitted, at(index), confidence) for index in chosen)
+    u = float(fitted.whole.theta[at(reports.AVERAGE)])
+    half = 0.5 * math.sqrt(abs(u))
+    if u > 0.0:
+        return speed, _shifted(torque, half), _shifted(skew, -half)
+    return _shifted(speed, half), torque, _shifted(skew, half)
 
 
-def _coulomb(levels: Levels, chosen: Candidate, free: list[int], confidence: float) -> Estimate | None:
+def _shifted(one: Estimate, by: float) -> Estimate:
+    return Estimate(one.value + by, one.low + by, one.high + by)
+
+
+def _coulomb(levels: Levels, fitted: Fitted, confidence: float) -> Estimate | None:
     if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
         return None
-    sd_viscous, dof = standard_deviation(chosen.problem, chosen.fit.theta, VISCOUS, free)
-    value, sd = coulomb_level(
-        levels, float(chosen.fit.theta[INERTIA]), float(chosen.fit.theta[VISCOUS]), sd_viscous
-    )
+    free = [index for index in fitted.free if index not in fitted.simple_held]
+    theta: FloatArray = fitted.simple.theta if fitted.first_order else fitted.whole.theta
+    sd_viscous, dof = standard_deviation(fitted.problem, theta, VISCOUS, free)
+    value, sd = coulomb_level(levels, float(theta[INERTIA]), float(theta[VISCOUS]), sd_viscous)
     half = student_quantile(confidence, min(dof, levels.dof)) * sd
     return Estimate(value, value - half, value + half) if math.isfinite(half) else None
 

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from tdhil.identify.friction import ViscousTie
 from tdhil.identify.identification import Identification, InertiaEstimate, PaperEstimate, Verdict
 from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.line_points import fitted_points
+from tdhil.identify.model import Model
 from tdhil.identify.options import Options
 from tdhil.identify.profile import student_quantile
 from tdhil.identify.quality import Refusal
+from tdhil.identify.reports import SKEW
 from tdhil.identify.residual import REJECT_P, rejects
-from tdhil.identify.rigid import SKEW, SpeedReport
 from tdhil.identify.rigid_result import RigidResult, turned, widened
-from tdhil.record.recording import Recording
+from tdhil.record.recording import LagPrior, Recording
 
 _OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
 
@@ -99,6 +101,8 @@ def conclude(
         periods_used=evidence.periods,
         samples_used=evidence.samples,
         warnings=(*evidence.warnings, *_caveats(result, tie, as_paper)),
+        budget=result.budget if kept else (),
+        lines=fitted_points(result.fitted, options.confidence),
     )
 
 
@@ -140,15 +144,24 @@ def _conditions(
     conditions = ["torque scale exact"]
     if options.model == "paper":
         return (*conditions, "no reporting lags")
-    if result.structures == (SpeedReport.FIRST_ORDER,):
-        conditions.append("first-order reporting lags")
-    else:
-        names = ", ".join(report.value for report in result.structures)
-        conditions.append(f"reporting lags: torque first order; speed {names}")
-    if recording.lag_prior.speed_lag_s is not None or recording.lag_prior.torque_lag_s is not None:
-        conditions.append(f"reporting lags as stated{f' by {s}' if (s := recording.lag_prior.source) else ''}")
-    conditions += [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in priors if p.index == SKEW]
+    conditions += of_reports(recording.lag_prior)
+    skew = Model().at(SKEW)
+    conditions += [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in priors if p.index == skew]
     return tuple(conditions)
+
+
+def of_reports(prior: LagPrior) -> list[str]:
+    """What an inertia is conditional on, of the reports."""
+    stated = [
+        name for name, lag in (("speed", prior.speed_lag_s), ("torque", prior.torque_lag_s)) if lag is not None
+    ]
+    found = []
+    if stated:
+        by = f" by {prior.source}" if prior.source else ""
+        found.append(f"reporting lags as stated{by}, first order: {', '.join(stated)}")
+    if len(stated) < 2:
+        found.append("unstated reporting filters: two poles, a moving average and a delay at most")
+    return found
 
 
 def _words(
@@ -175,8 +188,8 @@ def _caveats(result: RigidResult, tie: ViscousTie | None, as_paper: bool) -> tup
     found = []
     if tie is None:
         found.append("only one mean speed: viscous friction rests on the lines, not on levels")
-    if not as_paper and result.structures and result.structures[0] is not SpeedReport.FIRST_ORDER:
-        found.append(f"a first-order speed lag does not fit; used: {result.structures[0].value}")
+    if not as_paper and not result.first_order:
+        found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
     if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
         found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
     return tuple(found)

@@ -41,6 +41,10 @@ TRUTHS = {
     "moving average and lag": {"speed_poles": (0.2,), "speed_average": 0.5},
     "moving average alone": {"speed_poles": (), "speed_average": 0.5},
     "matched": {"speed_poles": (0.15,), "torque_delay": 0.005},
+    "two long poles": {"speed_poles": (0.5, 0.3)},
+    "three poles": {"speed_poles": (0.2, 0.2, 0.2)},
+    "torque through two poles": {"speed_poles": (0.1,), "torque_poles": (0.25, 0.25)},
+    "the long lag on torque": {"speed_poles": (0.1,), "torque_poles": (0.4,)},
 }
 
 

@@ -81,38 +81,57 @@ def test_torque_offset_is_taken_off():
     assert found.coulomb_nm.value == pytest.approx(60.0, abs=0.5)
 
 
-def test_jacobian_is_the_derivative():
-    from tdhil.identify.rigid import SpeedReport, impedance, impedance_jacobian
+THETA = np.array([104.0, 8.0, 0.4, 0.1, 0.15, 0.3, 0.2, 0.02])
+SMALL = np.array([1e-3, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])
+
+
+@pytest.mark.parametrize("u", (0.2, -0.3, 1e-6, 0.0))
+def test_jacobian_is_the_derivative(u):
+    from tdhil.identify.model import Model
 
     s = 2j * np.pi * np.array([0.05, 0.2, 0.7])
-    theta = np.array([104.0, 8.0, 0.4, 0.15, 0.02])
-    for report in SpeedReport:
-        jacobian = impedance_jacobian(theta, s, report)
-        for index, step in enumerate((1e-3, 1e-3, 1e-6, 1e-6, 1e-6)):
-            ahead, behind = theta.copy(), theta.copy()
-            ahead[index] += step
-            behind[index] -= step
-            slope = (impedance(ahead, s, report) - impedance(behind, s, report)) / (2.0 * step)
-            assert np.allclose(jacobian[:, index], slope, rtol=1e-6)
+    theta = THETA.copy()
+    theta[6] = u
+    g, jacobian = Model().impedance_jacobian(theta, s)
+    assert np.allclose(g, Model().impedance(theta, s), rtol=1e-12)
+    for index, step in enumerate(SMALL):
+        ahead, behind = theta.copy(), theta.copy()
+        ahead[index] += step
+        behind[index] -= step
+        slope = (Model().impedance(ahead, s) - Model().impedance(behind, s)) / (2.0 * step)
+        assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-7 * np.abs(g).max())
 
 
 def test_impedance_against_a_simulated_filter():
     """An independent oracle: scipy's frequency response of the same rational function."""
     from scipy.signal import freqs
 
-    from tdhil.identify.rigid import SpeedReport, impedance
+    from tdhil.identify.model import Model
 
     omega = np.array([0.3, 1.0, 4.0])
-    numerator = np.polymul([104.0, 8.0], [0.4, 1.0])
-    _, expected = freqs(numerator, [0.15, 1.0], omega)
-    found = impedance(np.array([104.0, 8.0, 0.4, 0.15, 0.0]), 1j * omega, SpeedReport.FIRST_ORDER)
+    numerator = np.polymul([104.0, 8.0], [0.1 * 0.4**2, 0.4, 1.0])
+    _, expected = freqs(numerator, [0.3 * 0.15**2, 0.15, 1.0], omega)
+    found = Model().impedance(np.array([104.0, 8.0, 0.4, 0.1, 0.15, 0.3, 0.0, 0.0]), 1j * omega)
     assert np.allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("over", ("speed", "torque"))
+def test_an_average_is_one_of_the_family(over):
+    """A mean over w of a rotating phasor, summed up sample by sample: half of w is delay, the rest u."""
+    from tdhil.identify.reports import log_ratio
+
+    w, omega = 0.5, np.array([0.6, 2.0, 5.0])
+    steps = (np.arange(20000) + 0.5) * w / 20000
+    averaged = np.exp(-1j * np.outer(omega, steps)).mean(axis=1)
+    sign = 1.0 if over == "torque" else -1.0
+    found = np.exp(log_ratio(np.array([0.0, 0.0, 0.0, 0.0, sign * w * w, sign * w / 2]), 1j * omega))
+    assert np.allclose(found, averaged**sign, rtol=1e-7)
 
 
 def test_likelihood_jacobian_is_the_derivative():
     from tdhil.identify.friction import ViscousTie
     from tdhil.identify.likelihood import GaussianPrior, Likelihood
-    from tdhil.identify.rigid import SpeedReport
+    from tdhil.identify.model import Model
     from tdhil.identify.spectrum import Line
 
     rng = np.random.default_rng(3)
@@ -121,13 +140,40 @@ def test_likelihood_jacobian_is_the_derivative():
         speed = rng.standard_normal(2) + 1j * rng.standard_normal(2)
         return Line(hertz, speed, 60.0 * speed * (1 + 2j), np.array([5.0, 6.0]), 0.02, 30.0, 0.1 + 0.2j, 9.0)
 
-    problem = Likelihood((line(0.1), line(0.3)), SpeedReport.TWO_POLES, ViscousTie(8.0, 0.01, 0.1, 9.0),
+    problem = Likelihood((line(0.1), line(0.3)), Model(), ViscousTie(8.0, 0.01, 0.1, 9.0),
                          (GaussianPrior(2, 0.3, 0.05),))
-    theta = np.array([104.0, 7.5, 0.4, 0.15, 0.02])
-    jacobian = problem.jacobian(theta)
-    for index, step in enumerate((1e-3, 1e-4, 1e-6, 1e-6, 1e-6)):
-        ahead, behind = theta.copy(), theta.copy()
+    residuals, jacobian = problem.linearised(THETA)
+    assert np.allclose(residuals, problem.residuals(THETA), rtol=1e-12)
+    for index, step in enumerate(SMALL):
+        ahead, behind = THETA.copy(), THETA.copy()
         ahead[index] += step
         behind[index] -= step
         slope = (problem.residuals(ahead) - problem.residuals(behind)) / (2.0 * step)
         assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-6 * np.max(np.abs(slope)))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_descent_against_scipy(seed):
+    """The same bounded minimum as scipy's solver, on a curved valley with a bound across it."""
+    from scipy.optimize import least_squares
+
+    from tdhil.identify.descent import Box, descend
+
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(0.5, 3.0, 2)
+
+    def residuals(x):
+        return np.array([10.0 * (x[1] - a * x[0] ** 2), b - x[0], 0.3 * (x[2] - x[0] * x[1])])
+
+    def linearised(x):
+        slopes = np.array([[-20.0 * a * x[0], 10.0, 0.0], [-1.0, 0.0, 0.0], [-0.3 * x[1], -0.3 * x[0], 0.3]])
+        return residuals(x), slopes
+
+    low, high = np.array([-5.0, -5.0, -5.0]), np.array([5.0, rng.uniform(0.5, 20.0), 5.0])
+    start = np.clip(rng.uniform(-2.0, 2.0, 3), low, high)
+    found = descend(linearised, residuals, start, np.ones(3, bool), Box(low, high, np.ones(3)))
+    oracle = least_squares(residuals, start, bounds=(low, high), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    assert found.objective <= 2.0 * oracle.cost + 1e-5
+    assert np.all((found.theta >= low) & (found.theta <= high))
+
+

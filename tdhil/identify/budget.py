@@ -1,0 +1,44 @@
+"""The error budget of J: what each thing that isn't known adds to the half-width, line by line.
+
+Unknowns are set free one group after another: J alone (noise), then friction, then the skew (timing), then the lags,
+then their structure; a line is what its group adds, in squares: √(h_n² − h_(n−1)²). So they add up to the interval,
+and the last is what a drive that stated its filters would save. The order is that from what no manual could
+tell to what it could.
+"""
+
+import math
+
+from tdhil.identify import reports
+from tdhil.identify.identification import BudgetLine, Estimate
+from tdhil.identify.interval import half_width_first_order
+from tdhil.identify.profile import student_quantile
+from tdhil.identify.shaft import INERTIA
+from tdhil.identify.structure import Fitted
+
+
+def budget_of(
+    fitted: Fitted, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+) -> tuple[BudgetLine, ...]:
+    """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
+    model = fitted.problem.model
+    lags = (model.at(reports.SPEED_LAG), model.at(reports.TORQUE_LAG))
+    timing = (model.at(reports.SKEW),)
+    friction = tuple(range(1, model.mechanical))
+    half = 0.5 * (inertia.high - inertia.low)
+    grown = (
+        ("noise", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing, *friction)),
+         "scatter from period to period, everything else known"),
+        ("friction", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing)),
+         "viscous friction" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
+        ("timing", half_width_first_order(fitted, INERTIA, confidence, lags), "skew between speed and torque"),
+        ("lags", half_width_first_order(fitted, INERTIA, confidence), "time constants of the reports' filters"),
+        ("lag structure", half, "filters of two poles, moving averages"),
+    )
+    found, before = [], 0.0
+    for source, reached, note in grown:
+        total = min(max(reached, before), max(half, before))
+        found.append(BudgetLine(source, math.sqrt(max(total**2 - before**2, 0.0)), note))
+        before = total
+    scale = student_quantile(confidence, 1e6) * torque_scale_rel_sd * abs(inertia.value)
+    found.append(BudgetLine("torque scale", scale, "of the drive; in the total interval only"))
+    return tuple(found)
