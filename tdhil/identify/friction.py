@@ -8,15 +8,19 @@ whatever filters stand in the reports, since they pass a mean unchanged. With J 
 the mean disturbance in it, about independent from period to period; its scatter, pooled over the segments, gives every
 level's variance. B is then the slope of a weighted straight line, as a function of the J that is being sought:
 B(J) = slope − slope_per_inertia·J. The second term is small: the net change of speed nearly vanishes over a segment.
+
+Levels are also times. Where the periods show that friction drifts at c N·m/s (`warming`), T̄ − c t̄ takes the place of T̄;
+a slope of the levels' times on their speeds, s, carries what is not known of c into B: var B += s² var c.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tdhil.identify.samples import Samples, Stretch
 from tdhil.identify.spectrum import PeriodLines
+from tdhil.identify.warming import Warming, warming_of
 from tdhil.record.recording import FloatArray, Level
 
 _LEAST_SPAN = 0.03    # mean speeds closer than this share of the speed tell no slope
@@ -27,7 +31,8 @@ class Levels:
     """N mean operating points: speed (rad/s), torque (N·m), net acceleration (rad/s²), duration (s); (N,) each.
 
     ``density`` is the disturbance's mean square times duration, (N·m)²·s: the variance of a level is density/duration;
-    ``dof`` says how well the density is known.
+    ``dof`` says how well the density is known. ``torque`` is as it would have been in the middle of the run, had
+    friction not drifted (``warming``); ``time`` (N,): the levels' middles, s.
     """
 
     speed: FloatArray
@@ -36,6 +41,8 @@ class Levels:
     duration: FloatArray
     density: float
     dof: float
+    time: FloatArray = field(default_factory=lambda: np.zeros(0))
+    warming: Warming = field(default_factory=Warming)
 
     @property
     def direction(self) -> float:
@@ -65,25 +72,44 @@ def measure_levels(
     rough_inertia: float,
 ) -> Levels:
     """Levels of the segments; the protocol's steady stretches are added only if the segments share one mean speed."""
-    rows: list[tuple[float, float, float, float]] = []
+    rows: list[tuple[float, ...]] = []
     errors: list[FloatArray] = []
+    times: list[FloatArray] = []
     length = 1.0
     for stretch, fit in zip(stretches, fits, strict=True):
-        if not stretch.periods:
-            continue
-        length = stretch.segment.period_s
         drift = fit.drift
-        rows.append((fit.speed_mean.mean(), fit.torque_mean.mean(), drift.mean(), length * len(drift)))
         errors.append(np.column_stack([fit.speed_mean, fit.torque_mean - rough_inertia * drift]))
-    spread = [error - error.mean(axis=0) for error in errors]
-    dof = float(sum(len(error) - 1 for error in errors))
+        times.append(stretch.segment.start_s + stretch.segment.period_s * (np.array(stretch.index) + 0.5))
+        if len(drift):
+            length = stretch.segment.period_s
+            means = (fit.speed_mean.mean(), fit.torque_mean.mean(), drift.mean())
+            rows.append((*means, length * len(drift), times[-1].mean()))
+    warming = _warming(times, errors)
     if not _span_enough(rows):
         rows += [row for level in steady if (row := _steady_row(samples.between(level.start_s, level.end_s)))]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    time = table[:, 4]
+    if warming.rate != 0.0:
+        table[:, 1] -= warming.rate * (time - _mean(time, table[:, 3]))
     slope = _slope(table[:, 0], table[:, 1] - rough_inertia * table[:, 2], table[:, 3]) if _span_enough(rows) else 0.0
-    scatter = sum(float(np.sum((part[:, 1] - slope * part[:, 0]) ** 2)) for part in spread)
+    # a segment's own trend costs a degree of freedom where it is taken off its periods
+    costs = 1 + (warming.rate != 0.0)
+    dof = float(sum(max(len(error) - costs, 0) for error in errors))
+    scatter = 0.0
+    for error, when, rate in zip(errors, times, warming.own, strict=True):
+        if len(error):
+            left = error[:, 1] - slope * error[:, 0] - rate * when
+            scatter += float(np.sum((left - left.mean()) ** 2))
     density = length * scatter / dof if dof > 0.0 else 0.0
-    return Levels(table[:, 0], table[:, 1], table[:, 2], table[:, 3], density, dof)
+    return Levels(table[:, 0], table[:, 1], table[:, 2], table[:, 3], density, dof, time, warming)
+
+
+def _warming(times: list[FloatArray], errors: list[FloatArray]) -> Warming:
+    """Of the segments that have periods; the others drift like the rest."""
+    held = [number for number, error in enumerate(errors) if len(error)]
+    found = warming_of([times[number] for number in held], [errors[number][:, 1] for number in held])
+    own = dict(zip(held, found.own, strict=True))
+    return replace(found, own=tuple(own.get(number, found.rate) for number in range(len(errors))))
 
 
 def tie_viscous(levels: Levels) -> ViscousTie | None:
@@ -95,7 +121,11 @@ def tie_viscous(levels: Levels) -> ViscousTie | None:
     weights = levels.weights
     centred = levels.speed - float(weights @ levels.speed)
     lever = float(np.sum(levels.duration * centred**2))
-    sd = float(np.sqrt(levels.density / lever))
+    variance = levels.density / lever
+    if levels.warming.rate != 0.0:
+        across = _slope(levels.speed, levels.time, levels.duration)
+        variance += across**2 * (levels.warming.variance + levels.warming.bend**2)
+    sd = float(np.sqrt(variance))
     slope = _slope(levels.speed, levels.torque, levels.duration)
     floor = 1e-9 * float(np.max(np.abs(levels.torque))) / float(np.max(np.abs(levels.speed)))
     return ViscousTie(slope, _slope(levels.speed, levels.drift, levels.duration), max(sd, floor), levels.dof)
@@ -110,8 +140,8 @@ def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: fl
     return levels.direction * (torque - viscous * speed), float(np.sqrt(variance))
 
 
-def _steady_row(samples: Samples) -> tuple[float, float, float, float] | None:
-    """A level of the protocol: means and net acceleration over a stretch of steady speed."""
+def _steady_row(samples: Samples) -> tuple[float, ...] | None:
+    """A level of the protocol: means, net acceleration, duration and middle of a stretch of steady speed."""
     if len(samples) < 16:
         return None
     time = samples.time_s
@@ -119,7 +149,8 @@ def _steady_row(samples: Samples) -> tuple[float, float, float, float] | None:
     length = float(time[-1] - time[0])
     rise = float(np.mean(samples.speed_rad_s[-part:]) - np.mean(samples.speed_rad_s[:part]))
     between = float(np.mean(time[-part:]) - np.mean(time[:part]))
-    return float(np.mean(samples.speed_rad_s)), float(np.mean(samples.torque_nm)), rise / between, length
+    middle = 0.5 * float(time[0] + time[-1])
+    return float(np.mean(samples.speed_rad_s)), float(np.mean(samples.torque_nm)), rise / between, length, middle
 
 
 def _span_enough(rows: Sequence[tuple[float, ...]]) -> bool:
@@ -127,6 +158,10 @@ def _span_enough(rows: Sequence[tuple[float, ...]]) -> bool:
         return False
     speeds = np.array([row[0] for row in rows])
     return bool(np.ptp(speeds) > _LEAST_SPAN * np.max(np.abs(speeds)))
+
+
+def _mean(x: FloatArray, weight: FloatArray) -> float:
+    return float(np.sum(weight * x) / np.sum(weight)) if len(x) else 0.0
 
 
 def _slope(x: FloatArray, y: FloatArray, weight: FloatArray) -> float:

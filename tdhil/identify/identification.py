@@ -116,6 +116,22 @@ class Compliant:
 
 
 @dataclass(frozen=True)
+class LinePoint:
+    """One excited line: what torque over acceleration is at that frequency, and what the model makes of it.
+
+    Apparent inertia is Im(T/ω)/2πf, the slope that a regression of torque on acceleration gives there, lags and all;
+    damping is Re(T/ω). ``residual_sd``: root mean square of what the model leaves, in standard deviations.
+    """
+
+    hertz: float
+    apparent_inertia_kg_m2: Estimate
+    fitted_inertia_kg_m2: float
+    apparent_damping_nm_s_rad: Estimate
+    fitted_damping_nm_s_rad: float
+    residual_sd: float
+
+
+@dataclass(frozen=True)
 class Identification:
     """The whole conclusion. Estimates are None where the verdict is a refusal or the quantity isn't in the model."""
 
@@ -138,3 +154,4 @@ class Identification:
     second_opinions: tuple[SecondOpinion, ...] = ()
     friction_curve: tuple[FrictionPoint, ...] = ()      # rising speed; empty where fewer than three speeds were seen
     compliant: Compliant | None = None                  # with the models two-mass and string; ``inertia`` is J_r then
+    lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report

@@ -6,23 +6,31 @@ there are samples, and shown beside whatever comes out.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
+from tdhil.identify.beside import with_second_look
+from tdhil.identify.compliant_choice import may_swing, usable_lines
+from tdhil.identify.compliant_verdict import identify_compliant
 from tdhil.identify.friction import Levels, ViscousTie, measure_levels, tie_viscous
-from tdhil.identify.identifiable import lag_priors, refuse_count, with_skew
+from tdhil.identify.friction_curve import friction_curve
+from tdhil.identify.friction_curve_points import Inertia
+from tdhil.identify.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
 from tdhil.identify.identification import Identification
 from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.line_faults import hints, refuse_lines
 from tdhil.identify.options import Options
 from tdhil.identify.paper_method import paper_estimate
 from tdhil.identify.quality import Refusal, refuse_motion, refuse_samples
-from tdhil.identify.rigid import SKEW, SPEED_LAG, TORQUE_LAG, SpeedReport
+from tdhil.identify.record_route import identify_record
 from tdhil.identify.rigid_result import RigidResult, fit_rigid
 from tdhil.identify.samples import Samples, Stretch, excited_window, stretches, usable_samples
 from tdhil.identify.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.identify.verdict import Evidence, conclude, refused
 from tdhil.record.recording import Recording
 
+_ROUGH_REL_SD = 0.1
 _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
 
 
@@ -34,18 +42,24 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         return refused(refusal, None, 0, 0, ())
     samples = usable_samples(recording)
     paper = paper_estimate(_excited_parts(recording, samples))
-    refusal = refuse_motion(recording, samples)
     excitation = recording.excitation
-    if refusal is not None or excitation is None:
-        return refused(refusal or Refusal("there was no excitation", ""), paper, 0, len(samples), ())
+    if excitation is None or not excitation.segments:
+        return identify_record(recording, samples, options, paper)
+    refusal = refuse_motion(recording, samples)
+    if refusal is not None:
+        return refused(refusal, paper, 0, len(samples), ())
     cut = stretches(samples, excitation.segments)
     fits = tuple(period_lines(stretch, samples) for stretch in cut)
     periods = sum(len(stretch.periods) for stretch in cut)
     used = sum(len(period) for stretch in cut for period in stretch.periods)
     warnings = _warnings(recording, cut)
     levels = measure_levels(cut, fits, samples, recording.levels, _rough(fits))
-    tie = tie_viscous(levels)
-    every = pooled_lines(fits, tie.slope if tie is not None else 0.0)
+    tie = _tie(recording, samples, levels, _rough(fits), options)
+    warnings = (*warnings, *hints(recording, cut, fits, levels))
+    every = pooled_lines(fits, tie.slope if tie is not None else 0.0, levels.warming.own)
+    refusal = refuse_lines(samples, recording.speed_resolution_rad_s, cut, fits, every)
+    if refusal is not None:
+        return refused(refusal, paper, periods, used, warnings)
     if not every or max(line.nu for line in every) < _LEAST_NU:
         short = Refusal(
             f"{periods} usable whole periods are too few to know the scatter",
@@ -58,7 +72,14 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         return refused(unclear, paper, periods, used, warnings)
     if len(lines) < len(every):
         warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
-    return _rigid(recording, options, Evidence(paper, periods, used, warnings), lines, levels, tie)
+    evidence = Evidence(paper, periods, used, warnings)
+    found = None
+    swinging = options.model in ("two-mass", "string")
+    if not swinging:
+        found, swinging = _rigid(recording, options, evidence, lines, levels, tie)
+    if found is None or swinging:
+        found = _compliant(recording, options, evidence, usable_lines(every, _LEAST_NU), levels, tie, found)
+    return with_second_look(found, recording, samples, levels, options)
 
 
 def _rigid(
@@ -68,21 +89,48 @@ def _rigid(
     lines: tuple[Line, ...],
     levels: Levels,
     tie: ViscousTie | None,
-) -> Identification:
+) -> tuple[Identification, bool]:
+    """The verdict on a rigid shaft; and whether another one should be tried."""
     priors: tuple[GaussianPrior, ...] = ()
     held: dict[int, float] = {}
-    reports: tuple[SpeedReport, ...] = (SpeedReport.FIRST_ORDER,)
     if options.model == "paper":
         refusal = None if len(lines) > 1 else _one_line_paper()
-        held = {SPEED_LAG: 0.0, TORQUE_LAG: 0.0, SKEW: 0.0}
+        held = unfiltered()
     else:
         priors = with_skew(lag_priors(recording.lag_prior), len(lines), tie, recording.lag_prior.skew_sd_s)
         refusal = refuse_count(len(lines), tie, priors)
-        reports = _reports(recording, len(lines), tie, priors)
+        held = known_structure(recording.lag_prior)
     if refusal is not None:
-        return refused(refusal, evidence.paper, evidence.periods, evidence.samples, evidence.warnings)
-    result = _fitted(lines, levels, tie, priors, held, reports, options.confidence)
-    return conclude(result, recording, options, evidence, tie, priors)
+        return refused(refusal, evidence.paper, evidence.periods, evidence.samples, evidence.warnings), False
+    result = _fitted(lines, levels, tie, priors, held, options.confidence, recording.torque_scale_rel_sd)
+    found = conclude(result, recording, options, evidence, tie, priors)
+    doubted = options.model == "auto" and result is not None and may_swing(result, lines, tie, priors, held)
+    return found, doubted
+
+
+def _compliant(
+    recording: Recording,
+    options: Options,
+    evidence: Evidence,
+    lines: tuple[Line, ...],
+    levels: Levels,
+    tie: ViscousTie | None,
+    rigid: Identification | None,
+) -> Identification:
+    priors = with_skew(lag_priors(recording.lag_prior), len(lines), tie, recording.lag_prior.skew_sd_s)
+    held = known_structure(recording.lag_prior)
+    return identify_compliant(recording, options, evidence, lines, levels, tie, priors, held, rigid)
+
+
+def _tie(
+    recording: Recording, samples: Samples, levels: Levels, rough_inertia: float, options: Options
+) -> ViscousTie | None:
+    """B from the levels; the less sure, the more the friction curve is bent: between two speeds it is a chord."""
+    tie = tie_viscous(levels)
+    if tie is None:
+        return None
+    curve = friction_curve(recording, samples, levels, Inertia(rough_inertia, _ROUGH_REL_SD * rough_inertia), options)
+    return replace(tie, sd=math.hypot(tie.sd, curve.viscous_spread_nm_s_rad))
 
 
 def _rough(fits: tuple[PeriodLines, ...]) -> float:
@@ -102,23 +150,14 @@ def _fitted(
     tie: ViscousTie | None,
     priors: tuple[GaussianPrior, ...],
     held: dict[int, float],
-    reports: tuple[SpeedReport, ...],
     confidence: float,
+    torque_scale_rel_sd: float,
 ) -> RigidResult | None:
     """None if the arithmetic breaks down, which only data can cause that passed every test before."""
     try:
-        return fit_rigid(lines, levels, tie, priors, held, reports, confidence)
+        return fit_rigid(lines, levels, tie, priors, held, confidence, torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
-
-
-def _reports(
-    recording: Recording, lines: int, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]
-) -> tuple[SpeedReport, ...]:
-    """A stated speed lag is a first-order one, and so is one that the count leaves no room to question."""
-    if recording.lag_prior.speed_lag_s is not None or 2 * lines + (tie is not None) + len(priors) <= 5:
-        return (SpeedReport.FIRST_ORDER,)
-    return tuple(SpeedReport)
 
 
 def _excited_parts(recording: Recording, samples: Samples) -> tuple[Samples, ...]:

@@ -4,15 +4,17 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-Model = Literal["auto", "rigid", "paper"]
+Model = Literal["auto", "rigid", "two-mass", "string", "paper"]
+MODELS: tuple[Model, ...] = ("auto", "rigid", "two-mass", "string", "paper")
 
 
 @dataclass(frozen=True)
 class Options:
     """``confidence`` of every interval; ``tolerance``: relative half-width of J above which a result is `valid_wide`.
 
-    ``model``: auto and rigid take the rigid shaft with reporting lags; paper takes the paper's method at its word
-    (no lags), and lets it stand only where the data do not contradict that.
+    ``model``: rigid, two-mass and string take that shaft, with reporting lags; auto the simplest of these that the
+    data do not contradict; paper takes the paper's method at its word (no lags), and lets it stand only where the data
+    do not contradict that.
     """
 
     confidence: float = 0.95
@@ -24,5 +26,5 @@ class Options:
             raise ValueError(f"confidence must be in [0.5, 1): {self.confidence!r}")
         if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
             raise ValueError(f"tolerance must be a positive number: {self.tolerance!r}")
-        if self.model not in ("auto", "rigid", "paper"):
-            raise ValueError(f"model must be auto, rigid or paper: {self.model!r}")
+        if self.model not in MODELS:
+            raise ValueError(f"model must be {', '.join(MODELS[:-1])} or {MODELS[-1]}: {self.model!r}")

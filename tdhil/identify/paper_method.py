@@ -10,6 +10,8 @@ raw rate (difference of neighbouring samples, torque of the later one) noise and
 by 1 + var(noise of α)/var(α): it depends on the sampling rate, and collapses.
 """
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 
 from tdhil.identify.identification import LineFit, PaperEstimate
@@ -19,15 +21,43 @@ from tdhil.record.recording import FloatArray
 STEP_S = 0.1
 _SHORTEST = 0.7     # of a step: a gap before the last sample may cut it
 _LONGEST = 1.5
+_BLOCK = 65536      # samples worked on at once
+
+Pairs = tuple[FloatArray, FloatArray]
 
 
 def paper_estimate(parts: tuple[Samples, ...]) -> PaperEstimate | None:
     """Both fits over all parts together; None if the speed never changes or there are too few steps."""
     stepped = [_steps(part) for part in parts]
-    raw = [_raw(part) for part in parts]
-    first = line_fit(*_joined(stepped))
-    second = line_fit(*_joined(raw))
+    first = _fit_blocks(lambda: iter(stepped))
+    second = _fit_blocks(lambda: _raw(parts))
     return None if first is None or second is None else PaperEstimate(stepped=first, raw_rate=second)
+
+
+def _fit_blocks(blocks: Callable[[], Iterator[Pairs]]) -> LineFit | None:
+    """`line_fit` over blocks of (α, torque), which are made twice: once for the means, once for the moments.
+
+    R² is (Σ a t)²/(Σ a² Σ t²), which is 1 − Σ (t − slope a)²/Σ t² at the least-squares slope.
+    """
+    count, alpha_sum, torque_sum = 0, 0.0, 0.0
+    for alpha, torque in blocks():
+        count += len(alpha)
+        alpha_sum += float(np.sum(alpha))
+        torque_sum += float(np.sum(torque))
+    if count < 3:
+        return None
+    alpha_mean, torque_mean = alpha_sum / count, torque_sum / count
+    power = cross = total = 0.0
+    for alpha, torque in blocks():
+        a, t = alpha - alpha_mean, torque - torque_mean
+        power += float(a @ a)
+        cross += float(a @ t)
+        total += float(t @ t)
+    if power <= 0.0 or not np.isfinite(power):
+        return None
+    slope = cross / power
+    r2 = slope * cross / total if total > 0.0 else 0.0
+    return LineFit(inertia_kg_m2=slope, intercept_nm=torque_mean - slope * alpha_mean, r2=r2)
 
 
 def line_fit(alpha: FloatArray, torque: FloatArray) -> LineFit | None:
@@ -44,7 +74,7 @@ def line_fit(alpha: FloatArray, torque: FloatArray) -> LineFit | None:
     return LineFit(inertia_kg_m2=slope, intercept_nm=float(torque.mean() - slope * alpha.mean()), r2=r2)
 
 
-def _steps(part: Samples) -> tuple[FloatArray, FloatArray]:
+def _steps(part: Samples) -> Pairs:
     """Adjoining steps of 0.1 s: from the sample nearest to each tenth to the next; trapezoidal mean of the torque."""
     time = part.time_s
     if len(time) < 3:
@@ -53,21 +83,28 @@ def _steps(part: Samples) -> tuple[FloatArray, FloatArray]:
     right = np.clip(np.searchsorted(time, marks), 1, len(time) - 1)
     nearest = np.where(marks - time[right - 1] <= time[right] - marks, right - 1, right)
     nearest = np.unique(nearest)
-    impulse = np.concatenate(([0.0], np.cumsum(0.5 * (part.torque_nm[1:] + part.torque_nm[:-1]) * np.diff(time))))
+    impulse = _impulse(part)
     length = np.diff(time[nearest])
     good = (length >= _SHORTEST * STEP_S) & (length <= _LONGEST * STEP_S)
     alpha = np.diff(part.speed_rad_s[nearest])[good] / length[good]
     return alpha, np.diff(impulse[nearest])[good] / length[good]
 
 
-def _raw(part: Samples) -> tuple[FloatArray, FloatArray]:
-    """Backward difference of the speed, with the torque at the interval's end."""
-    if len(part) < 2:
-        return np.zeros(0), np.zeros(0)
-    return np.diff(part.speed_rad_s) / np.diff(part.time_s), part.torque_nm[1:]
+def _impulse(part: Samples) -> FloatArray:
+    """Trapezoidal integral of the torque from the first sample to each, (N,), N·m·s; one array, nothing beside it."""
+    time, torque = part.time_s, part.torque_nm
+    total = np.zeros(len(time))
+    for first in range(0, len(time) - 1, _BLOCK):
+        last = min(first + _BLOCK, len(time) - 1)
+        mean = 0.5 * (torque[first + 1 : last + 1] + torque[first:last])
+        total[first + 1 : last + 1] = mean * np.diff(time[first : last + 1])
+    return np.cumsum(total, out=total)
 
 
-def _joined(pairs: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    if not pairs:
-        return np.zeros(0), np.zeros(0)
-    return np.concatenate([pair[0] for pair in pairs]), np.concatenate([pair[1] for pair in pairs])
+def _raw(parts: tuple[Samples, ...]) -> Iterator[Pairs]:
+    """Backward difference of the speed, with the torque at the interval's end; a block at a time."""
+    for part in parts:
+        for first in range(0, len(part) - 1, _BLOCK):
+            block = slice(first, first + _BLOCK + 1)
+            time, speed = part.time_s[block], part.speed_rad_s[block]
+            yield np.diff(speed) / np.diff(time), part.torque_nm[block][1:]

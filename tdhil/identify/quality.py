@@ -1,52 +1,83 @@
-"""Hopeless data, recognised before anything is fitted to them: each with what is wrong and what would mend it."""
+"""Hopeless data, recognised before anything is fitted to them: each with what is wrong and what would mend it.
+
+In the order of the questions: are these samples; can the excitation have been so, and was it sampled fast enough
+(`declared`); did anything move; did a limit shape it (`clipped`)? What the lines help to tell (a wrong period, a wrong
+sign, a shaft that stood still) is asked later, in `line_faults`.
+"""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.identify.clipped import LIMIT_SHARE, refuse_limited
+from tdhil.identify.declared import refuse_declared
+from tdhil.identify.refusal import Refusal
 from tdhil.identify.samples import Samples, excited_window
-from tdhil.record.recording import BoolArray, FloatArray, Recording
+from tdhil.record.recording import FloatArray, Recording
+
+__all__ = ["Refusal", "refuse_motion", "refuse_samples"]
 
 _LEAST_SAMPLES = 64
-_LIMIT_SHARE = 0.005      # of the excited samples that may be at a limit: they bend the line fit by about as much
-_AT_LIMIT = 0.98          # of the torque limit counts as at it
-_FLAT_SHARE = 0.10        # of the samples exactly at the extreme: clamped, unless rounding explains it
-_FLAT_FACTOR = 3.0
 _STALE_SHARE = 0.5
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why there can be no number, and what to do about it; a sentence each."""
-
-    reason: str
-    advice: str
+_LONGEST_S = 7.0 * 86400.0
+_HUGE = 1e15            # rad/s or N·m: no machine; squares of it, and of its ratios, are still numbers
+_MOTIONLESS = 2.0       # steps of a signal within which it hasn't changed
+_TINY = 1e-12           # of a signal's size, or of its unit: below it is the arithmetic's own
 
 
 def refuse_samples(recording: Recording) -> Refusal | None:
     """Shapes, time stamps, numbers and freshness: what must hold before samples can be used at all."""
-    count = len(recording.time_s)
+    count = int(np.size(recording.time_s))
     others = (recording.speed_rad_s, recording.torque_nm, recording.fresh, recording.limited)
     if any(np.shape(other) != (count,) for other in others) or np.ndim(recording.time_s) != 1:
         return Refusal("the signals differ in length", "record time, speed and torque of the same samples")
     if count < _LEAST_SAMPLES:
         return Refusal(f"{count} samples are too few to identify anything", "record whole periods of the excitation")
+    signals = (recording.time_s, recording.speed_rad_s, recording.torque_nm)
+    flags = (recording.fresh, recording.limited)
+    if any(signal.dtype.kind not in "fiu" for signal in signals) or any(flag.dtype.kind != "b" for flag in flags):
+        return Refusal("the signals are not numbers", "look for a decoding fault")
     time = recording.time_s
-    if not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
+    if not np.all(np.isfinite(time)) or np.any(time[1:] <= time[:-1]):
         return Refusal("the time stamps do not rise throughout", "repair the clock or the order of the samples")
+    if float(time[-1]) - float(time[0]) > _LONGEST_S:
+        return Refusal(
+            f"the time spans {float(time[-1]) - float(time[0]):.3g} s, more than a week",
+            "check the unit of the time stamps",
+        )
     if not np.isfinite(recording.torque_offset_nm):
         return Refusal("the torque offset is not a number", "measure the torque at standstill again")
     fresh = recording.fresh
-    finite = np.isfinite(recording.speed_rad_s) & np.isfinite(recording.torque_nm)
-    bad = float(np.mean(~finite[fresh])) if np.any(fresh) else 0.0
-    if bad > _LIMIT_SHARE:
+    finite = np.isfinite(recording.speed_rad_s)
+    finite &= np.isfinite(recording.torque_nm)
+    fresh_count = int(np.count_nonzero(fresh))
+    bad = 1.0 - np.count_nonzero(finite & fresh) / fresh_count if fresh_count else 0.0
+    if bad > LIMIT_SHARE:
         return Refusal(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault")
-    if np.mean(fresh) < _STALE_SHARE:
-        return Refusal(
-            f"{float(np.mean(~fresh)):.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus"
-        )
-    return None
+    stale = 1.0 - fresh_count / count
+    if stale > 1.0 - _STALE_SHARE:
+        return Refusal(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus")
+    for name, signal in (("speed", recording.speed_rad_s), ("torque", recording.torque_nm)):
+        largest = max(abs(float(np.max(signal, where=finite, initial=0.0))),
+                      abs(float(np.min(signal, where=finite, initial=0.0))))
+        if largest > _HUGE:
+            return Refusal(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault")
+    return _refuse_known(recording)
+
+
+def _refuse_known(recording: Recording) -> Refusal | None:
+    """What the recording says besides its samples."""
+    prior = recording.lag_prior
+    lags = [lag for lag in (prior.speed_lag_s, prior.torque_lag_s) if lag is not None]
+    sizes = (prior.speed_lag_sd_s, prior.torque_lag_sd_s, prior.skew_sd_s, recording.speed_resolution_rad_s,
+             recording.torque_resolution_nm, recording.torque_scale_rel_sd, *lags)
+    limit = recording.torque_limit_nm
+    if all(math.isfinite(size) and size >= 0.0 for size in sizes) and (limit is None or not math.isnan(limit)):
+        return None
+    return Refusal(
+        "a resolution, lag, limit or standard deviation that goes with the recording is no usable number",
+        "check how the recording was made",
+    )
 
 
 def refuse_motion(recording: Recording, samples: Samples) -> Refusal | None:
@@ -57,59 +88,23 @@ def refuse_motion(recording: Recording, samples: Samples) -> Refusal | None:
             "there was no periodic excitation, so acceleration, friction and lags can't be told apart",
             "run a multisine about two mean speeds",
         )
-    inside = np.zeros(len(samples), dtype=np.bool_)
-    limited_inside = np.zeros(len(recording.time_s), dtype=np.bool_)
-    for segment in excitation.segments:
-        if not _sound(segment.start_s, segment.end_s, segment.period_s, *segment.lines_hz):
-            return Refusal("a segment's times or lines are not usable numbers", "check how the recording was made")
-        start, end = excited_window(segment)
-        inside |= (samples.time_s >= start) & (samples.time_s < end)
-        limited_inside |= (recording.time_s >= start) & (recording.time_s < end)
-    if not np.any(inside):
-        return Refusal("the excitation ended before its first period after settling", "let the excitation run longer")
-    speed, torque = samples.speed_rad_s[inside], samples.torque_nm[inside]
-    if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s:
+    wrong = refuse_declared(excitation, samples)
+    if wrong is not None:
+        return wrong
+    windows = [excited_window(segment) for segment in excitation.segments]
+    parts = [(segment, part) for segment, window in zip(excitation.segments, windows, strict=True)
+             if len(part := samples.between(*window))]
+    if not _moved([part.speed_rad_s for _, part in parts], recording.speed_resolution_rad_s):
         return Refusal("the speed did not change", "excite with more amplitude, and check that the shaft can turn")
-    if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm:
+    if not _moved([part.torque_nm for _, part in parts], recording.torque_resolution_nm):
         return Refusal("the torque did not change", "excite with more amplitude, and check the torque signal")
-    return _refuse_limited(recording, speed, torque, limited_inside, excitation.kind)
+    return refuse_limited(recording, windows, parts, excitation.kind)
 
 
-def _refuse_limited(
-    recording: Recording, speed: FloatArray, torque: FloatArray, inside: BoolArray, kind: str
-) -> Refusal | None:
-    advice = "use less amplitude, or more torque if the machine allows it"
-    flagged = float(np.mean(recording.limited[inside]))
-    if flagged > _LIMIT_SHARE:
-        return Refusal(f"the drive was at an internal limit for {flagged:.1%} of the excitation", advice)
-    limit = recording.torque_limit_nm
-    if limit is not None and limit > 0.0:
-        reported = torque + recording.torque_offset_nm
-        saturated = float(np.mean(np.abs(reported) >= _AT_LIMIT * limit))
-        if saturated > _LIMIT_SHARE:
-            reason = f"the torque was at its limit of {limit:g} N·m for {saturated:.1%} of the excitation"
-            return Refusal(reason, advice)
-    if kind != "step":
-        for name, signal, quantum in (
-            ("torque", torque, recording.torque_resolution_nm),
-            ("speed", speed, recording.speed_resolution_rad_s),
-        ):
-            share = _flat_share(signal, quantum)
-            if share is not None:
-                return Refusal(f"the {name} is cut off flat for {share:.1%} of the excitation", advice)
-    return None
-
-
-def _flat_share(signal: FloatArray, quantum: float) -> float | None:
-    """Share of samples exactly at the greatest or least value, if rounding of a smooth wave can't explain it.
-
-    A sine of amplitude A rounded to q spends arccos(1 − q/A)/π of its time within q of its crest.
-    """
-    amplitude = 0.5 * float(np.ptp(signal))
-    natural = math.acos(max(-1.0, 1.0 - quantum / amplitude)) / math.pi
-    share = max(float(np.mean(signal == signal.max())), float(np.mean(signal == signal.min())))
-    return share if share > max(_FLAT_SHARE, _FLAT_FACTOR * natural) else None
-
-
-def _sound(*values: float) -> bool:
-    return all(math.isfinite(value) for value in values) and values[2] > 0.0
+def _moved(parts: list[FloatArray], quantum: float) -> bool:
+    """Did the signal leave the noise of its rounding, and of the arithmetic, within any one segment?"""
+    for part in parts:
+        high, low = float(np.max(part)), float(np.min(part))
+        if high - low > max(_MOTIONLESS * quantum, _TINY * max(abs(high), abs(low), 1.0)):
+            return True
+    return False

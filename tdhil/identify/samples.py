@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.identify.left_out import good_samples
 from tdhil.record.recording import FloatArray, Recording, Segment
 
 _LEAST_SHARE = 0.6        # of a period's samples that must be there
@@ -38,18 +39,22 @@ class Stretch:
 
 
 def usable_samples(recording: Recording) -> Samples:
-    """Drop what is stale or not a number, and subtract the torque that was reported at standstill."""
-    good = (
-        recording.fresh
-        & np.isfinite(recording.time_s)
-        & np.isfinite(recording.speed_rad_s)
-        & np.isfinite(recording.torque_nm)
+    """Drop what is stale, stuck, a spike or not a number, and subtract the torque that was reported at standstill.
+
+    Nothing is copied that need not be: where every sample is good, and no offset is known, these are the recording's
+    own arrays.
+    """
+    good = good_samples(recording)
+    every = bool(np.all(good))
+    time, speed, torque = (
+        np.asarray(signal if every else signal[good], dtype=np.float64)
+        for signal in (recording.time_s, recording.speed_rad_s, recording.torque_nm)
     )
-    return Samples(
-        np.asarray(recording.time_s[good], dtype=np.float64),
-        np.asarray(recording.speed_rad_s[good], dtype=np.float64),
-        np.asarray(recording.torque_nm[good], dtype=np.float64) - recording.torque_offset_nm,
-    )
+    if recording.torque_offset_nm != 0.0:
+        torque = torque - recording.torque_offset_nm if every else np.subtract(
+            torque, recording.torque_offset_nm, out=torque
+        )
+    return Samples(time, speed, torque)
 
 
 def excited_window(segment: Segment) -> tuple[float, float]:
@@ -60,12 +65,12 @@ def excited_window(segment: Segment) -> tuple[float, float]:
 def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch, ...]:
     """Cut every segment into whole periods; a period with holes in it is left out."""
     found = []
+    interval = usual_interval(samples.time_s)
     for segment in segments:
         if not segment.lines_hz or not (segment.period_s > 0.0 and math.isfinite(segment.period_s)):
             continue
         start, end = excited_window(segment)
         last_time = float(samples.time_s[-1]) if len(samples) else start
-        interval = _usual_interval(samples)
         end = min(end, last_time + interval)
         whole = max(0, math.floor((end - start) / segment.period_s + 1e-6))
         longest_gap = max(_LONGEST_GAP / max(segment.lines_hz), 3.0 * interval)
@@ -80,9 +85,9 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
     return tuple(found)
 
 
-def _usual_interval(samples: Samples) -> float:
-    """Median time between samples, s."""
-    return float(np.median(np.diff(samples.time_s))) if len(samples) > 1 else math.inf
+def usual_interval(time_s: FloatArray) -> float:
+    """Median time between samples (N,), s."""
+    return float(np.median(np.diff(time_s), overwrite_input=True)) if len(time_s) > 1 else math.inf
 
 
 def _is_whole(period: Samples, begin_s: float, length_s: float, interval_s: float, longest_gap_s: float) -> bool:

@@ -24,14 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.identify.edge import Edge
 from tdhil.identify.samples import Samples, Stretch
 from tdhil.record.recording import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 
 _SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
-_EDGE_S = 0.1             # either side of a period's end, averaged to read the speed there
-_EDGE_SAMPLES = 4
+_BLOCK = 8192             # samples worked on at once
 _FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
 
 
@@ -86,7 +86,7 @@ def period_lines(stretch: Stretch, samples: Samples) -> PeriodLines:
     means = np.array([fit[0] for fit in fits]).reshape(-1, 3)
     wave = table[:, 0].mean(axis=0) if fits else np.zeros(count, dtype=np.complex128)
     # only within the segment: across its ends the motion is another one
-    edge = _Edge(samples.between(segment.start_s - 1e-9, segment.end_s - 1e-9), segment.start_s, lines, wave)
+    edge = Edge(samples.between(segment.start_s - 1e-9, segment.end_s - 1e-9), segment.start_s, lines, wave)
     begins = [segment.start_s + number * segment.period_s for number in stretch.index]
     drift = np.array([edge.drift(begin, segment.period_s) for begin in begins])
     return PeriodLines(
@@ -102,52 +102,43 @@ def period_lines(stretch: Stretch, samples: Samples) -> PeriodLines:
 
 def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray]:
     """Means (3,) and lines (3, K) of speed, torque and tᶜ in one period; phases count from ``start_s``."""
-    time = period.time_s - start_s
-    middle = 0.5 * (time[0] + time[-1])
-    angle = 2.0 * np.pi * np.outer(time, lines_hz)
-    design = np.hstack([np.ones((len(time), 1)), np.cos(angle), np.sin(angle)])
-    signals = np.column_stack([period.speed_rad_s, period.torque_nm, time - middle])
-    # normal equations: the columns are nearly orthogonal, so nothing is lost and much time is won
-    solution = np.linalg.solve(design.T @ design, design.T @ signals)
     count = len(lines_hz)
+    time = period.time_s
+    middle = 0.5 * (time[0] + time[-1])
+    omega = 2.0 * np.pi * np.asarray(lines_hz)
+    # normal equations: the columns are nearly orthogonal, so nothing is lost and much time is won; in blocks, so that
+    # a long period never stands in memory as a whole table
+    normal, right = np.zeros((1 + 2 * count, 1 + 2 * count)), np.zeros((1 + 2 * count, 3))
+    for first in range(0, len(time), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        angle = np.multiply.outer(time[block] - start_s, omega)
+        design = np.empty((len(angle), 1 + 2 * count))
+        design[:, 0] = 1.0
+        np.cos(angle, out=design[:, 1 : 1 + count])
+        np.sin(angle, out=design[:, 1 + count :])
+        signals = np.column_stack([period.speed_rad_s[block], period.torque_nm[block], time[block] - middle])
+        normal += design.T @ design
+        right += design.T @ signals
+    solution = np.linalg.solve(normal, right)
     lines: ComplexArray = (solution[1 : 1 + count] - 1j * solution[1 + count :]).T
     return solution[0], lines
 
 
-class _Edge:
-    """Speed at an instant, less the periodic motion: the mean of the samples within 0.1 s, or of the nearest few."""
-
-    def __init__(self, samples: Samples, start_s: float, lines_hz: tuple[float, ...], wave: ComplexArray) -> None:
-        self.samples, self.start_s, self.wave = samples, start_s, wave
-        self.omega = 2.0 * np.pi * np.asarray(lines_hz)
-
-    def drift(self, begin_s: float, length_s: float) -> float:
-        """Net change of speed per second over a period."""
-        (begin, speed_begin), (end, speed_end) = self.speed(begin_s), self.speed(begin_s + length_s)
-        return (speed_end - speed_begin) / (end - begin)
-
-    def speed(self, at_s: float) -> tuple[float, float]:
-        """The mean time of the samples taken, s, and their mean speed."""
-        time = self.samples.time_s
-        first, last = (int(i) for i in np.searchsorted(time, (at_s - _EDGE_S, at_s + _EDGE_S)))
-        while last - first < min(_EDGE_SAMPLES, len(time)):
-            first, last = max(first - 1, 0), min(last + 1, len(time))
-        turned = np.exp(1j * np.outer(time[first:last] - self.start_s, self.omega))
-        speed = float(np.mean(self.samples.speed_rad_s[first:last] - (turned @ self.wave).real))
-        return float(np.mean(time[first:last])), speed
-
-
-def pooled_lines(fits: tuple[PeriodLines, ...], viscous: float) -> tuple[Line, ...]:
+def pooled_lines(
+    fits: tuple[PeriodLines, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
+) -> tuple[Line, ...]:
     """Lines in rising frequency, pooled over the segments that have them; only those with a scatter to go by.
 
     ``viscous``: B as the levels tell it (0 if they don't), for the ramp of torque that a ramp of speed needs.
+    ``warming_nm_s``: the ramp of friction in each of the segments; none of it if left out.
     """
+    rates = warming_nm_s or (0.0,) * len(fits)
     frequencies = sorted({round(hertz, 9) for fit in fits for hertz in fit.lines_hz})
     pooled = []
     for hertz in frequencies:
         speeds, torques = [], []
-        for fit in fits:
-            torque = fit.torque - viscous * fit.drift[:, None] * fit.ramp
+        for fit, rate in zip(fits, rates, strict=True):
+            torque = fit.torque - (viscous * fit.drift + rate)[:, None] * fit.ramp
             for column, own in enumerate(fit.lines_hz):
                 if round(own, 9) == hertz and len(fit.speed) > 0:
                     speeds.append(fit.speed[:, column])

@@ -1,0 +1,118 @@
+"""Which bins to believe, how loud their noise is, and the fit: each needs the others, so a few rounds of all three.
+
+A bin counts where the torque that the speed explains stands clear of the residual. Where it doesn't, the direction of
+the regression would matter: least squares of torque on speed errs by the share of the noise in the speed, the other
+way round by the share in the torque. And frequencies end where the longer lag turns the phase by more than about a
+radian: beyond that the structure of the filter, which nobody knows, is no longer told by its mean and its spread.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.record_route import noise
+from tdhil.identify.record_route.bins import Bins
+from tdhil.identify.record_route.equation import (
+    BACK,
+    FORWARD,
+    INERTIA,
+    PARAMETERS,
+    SKEW,
+    SPEED_LAG,
+    TORQUE_LAG,
+    VISCOUS,
+    evaluate,
+)
+from tdhil.identify.record_route.fitting import Fit, Problem, box, covariance, minimise
+from tdhil.record.recording import BoolArray, FloatArray
+
+_STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
+_ROUNDS = 5
+_CLEAR = 20.0            # power of what is explained over the residual's
+_PHASE = 1.2             # rad
+_LEAST_BINS = 8
+_ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
+_LEAST_LAG_S = 1e-3
+_ABOUT_AS_WELL = 9.0     # of −2 ln L
+
+
+@dataclass(frozen=True)
+class Found:
+    """The problem as it stands in the end, its fit, and of all bins those that stand clear."""
+
+    problem: Problem
+    fit: Fit
+    clear: int
+
+
+def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> Found | None:
+    """None where too few bins stand clear of the noise. Filters are taken as one pole each."""
+    inertia = _rough(bins)
+    if inertia is None:
+        return None
+    levels = tuple(index for index, column in ((FORWARD, 0), (BACK, 1)) if np.any(bins.level[:, column]))
+    free = (INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, *levels)
+    limits = box(inertia, 1.0, torque_span_nm, priors)
+    every = Problem(bins, noise.guessed(bins, inertia).variance, priors, free, limits)
+    keep = _worth_a_look(every, inertia)
+    problem = _part(every, keep)
+    fit = min((minimise(problem, _start(inertia, lags, priors)) for lags in _STARTS), key=lambda one: one.objective)
+    clear = len(bins)
+    for _ in range(_ROUNDS):
+        _, leverage = covariance(problem, fit.theta, free)
+        taken = np.zeros(len(bins))
+        taken[keep] = leverage
+        found = evaluate(fit.theta, bins)
+        every = replace(every, variance=noise.from_residuals(bins, found.error, taken).variance)
+        explained, _ = noise.smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy)
+        stands = explained * bins.energy > _CLEAR * every.variance
+        clear = int(np.count_nonzero(stands))
+        if clear < _LEAST_BINS:
+            return None
+        keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands]))
+        problem = _part(every, keep)
+        fit = minimise(problem, fit.theta)
+    return Found(problem, fit, clear)
+
+
+def _plain(problem: Problem, fit: Fit) -> FloatArray:
+    """Without lags, where that does about as well: lags that are alike cancel, and would be found anywhere."""
+    without = minimise(problem, fit.theta, {SPEED_LAG: 0.0, TORQUE_LAG: 0.0})
+    return without.theta if without.objective - fit.objective <= _ABOUT_AS_WELL else fit.theta
+
+
+def _part(every: Problem, keep: BoolArray) -> Problem:
+    return replace(every, bins=every.bins.chosen(keep), variance=every.variance[keep])
+
+
+def _rough(bins: Bins) -> float | None:
+    """|T|/(ω|W|) over the lower part of the frequencies."""
+    low = (bins.hertz > 0.0) & (bins.hertz <= np.quantile(bins.hertz, 0.2)) if len(bins) else np.zeros(0, dtype=bool)
+    accelerated = float(np.sum(np.abs(bins.s[low] * bins.speed[low, 0]) ** 2))
+    driven = float(np.sum(np.abs(bins.torque[low, 0]) ** 2))
+    found = math.sqrt(driven / accelerated) if accelerated > 0.0 else 0.0
+    return found if 0.0 < found < math.inf else None
+
+
+def _worth_a_look(every: Problem, inertia: float) -> BoolArray:
+    """For the first fit: where torque and acceleration stand above their noise at the highest frequencies."""
+    bins = every.bins
+    moved, _ = noise.smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy)
+    keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)
+    return keep if np.count_nonzero(keep) >= _ENOUGH_BINS else np.ones(len(bins), dtype=np.bool_)
+
+
+def _highest(theta: FloatArray, clear_hz: FloatArray) -> float:
+    lag = max(float(theta[SPEED_LAG]), float(theta[TORQUE_LAG]), _LEAST_LAG_S)
+    enough = float(np.sort(clear_hz)[min(_ENOUGH_BINS, len(clear_hz)) - 1])
+    return max(_PHASE / (2.0 * math.pi * lag), enough)
+
+
+def _start(inertia: float, lags: tuple[float, float, float], priors: tuple[GaussianPrior, ...]) -> FloatArray:
+    theta = np.zeros(PARAMETERS)
+    theta[INERTIA], theta[SPEED_LAG : SKEW + 1] = inertia, lags
+    for prior in priors:
+        theta[prior.index] = prior.mean
+    return theta

@@ -1,0 +1,80 @@
+"""The drill string: its impedance against the waves, and a string that is told from two masses."""
+
+import cmath
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from compliant_bench import Pipe, run
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from test_two_mass import KNOWN, MILD, S, parameters
+
+from tdhil.identify import Verdict, identify
+from tdhil.identify.string_shaft import StringShaft, resonances
+from tdhil.identify.two_mass import TwoMassShaft
+
+few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.generate])
+
+
+def string_parameters(pipe):
+    """With friction below shared as the inertias are, the estimator's one assumption about it."""
+    share = pipe.inertia / pipe.load
+    swing = np.sqrt(pipe.stiffness / (pipe.load * (1.0 - 2.0 / 3.0 * share)))
+    below = pipe.drag + pipe.end_viscous
+    return np.array([pipe.motor, pipe.motor_viscous + below, pipe.load, swing, 0.0, below, share])
+
+
+@few
+@given(share=st.floats(0.01, 0.99), k=st.floats(50.0, 2000.0), b=st.floats(0.0, 50.0), hz=st.floats(0.01, 3.0))
+def test_impedance_is_that_of_the_waves(share, k, b, hz):
+    pipe = Pipe(end=600.0 * (1.0 - share), inertia=600.0 * share, stiffness=k, drag=b * share,
+                end_viscous=b * (1.0 - share))
+    found = StringShaft().impedance(string_parameters(pipe), np.array([2j * np.pi * hz]))[0]
+    assert found == pytest.approx(pipe.impedance(hz), rel=1e-8)
+
+
+def test_a_string_that_weighs_nothing_is_a_spring():
+    from compliant_bench import TwoMass
+
+    m = parameters(TwoMass())
+    assert np.allclose(StringShaft().impedance(np.append(m, 0.0), S), TwoMassShaft().impedance(m, S), rtol=1e-12)
+    near, far = (StringShaft().impedance(np.append(m, share), S) for share in (1e-9, 1e-6))
+    assert np.allclose(near, far, rtol=1e-4)
+
+
+@pytest.mark.parametrize("share", (0.0, 0.05, 0.4, 0.9, 1.0))
+def test_resonances_are_where_the_impedance_has_its_pole_and_its_zero(share):
+    m = np.array([1500.0, 0.0, 600.0, 1.0, 0.0, 0.0, share])
+    held, free = resonances(m)
+    assert 0.0 < held < free
+    at = StringShaft().impedance(m, 1j * np.array([held * (1 - 1e-7), held * (1 + 1e-7), free, 0.5 * held])).imag
+    assert at[0] > 1e5 * at[3] and at[1] < -1e5 * at[3]
+    assert abs(at[2]) < 1e-6 * at[3]
+
+
+def test_auto_finds_the_string():
+    pipe = Pipe()
+    found = identify(run(pipe, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0])
+    shaft = found.compliant
+    assert found.model == "string"
+    assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
+    assert found.inertia.value == pytest.approx(pipe.motor, rel=0.01)
+    assert shaft.total_inertia.value == pytest.approx(pipe.total, rel=0.015)
+    assert shaft.load_inertia.value == pytest.approx(pipe.load, rel=0.1)
+    pole = abs(pipe.impedance(shaft.antiresonance_hz.value))
+    assert pole > 5.0 * max(abs(pipe.impedance(shaft.antiresonance_hz.value * by)) for by in (0.8, 1.15))
+    assert any("a resonance" in warning for warning in found.warnings)
+
+
+def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
+    """The simulator's waves, one tone at a time: so that what is estimated is what the formula says."""
+    pipe = replace(Pipe(), motor=20.0, motor_viscous=100.0, end_viscous=40.0)
+    for hz in (0.1, 0.5):
+        body, count = pipe.body(1, 0.0, (0.0, 0.0)), round(100.0 / hz)
+        turn = np.exp(2j * np.pi * np.arange(count) / count)
+        for _ in range(8):
+            speed = np.array([body.step(np.array([torque]))[0] for torque in turn.real])
+        seen = np.sum(turn.real * turn.conj()) / np.sum(speed * turn.conj())
+        late = cmath.exp(1j * np.pi * hz * 0.01)       # torque is held over a step, speed is read at its beginning
+        assert seen / late == pytest.approx(pipe.impedance(hz), rel=0.01)
