@@ -6,16 +6,12 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+from tdhil.commands.after_looks import after_looks, working_confidence_of
 from tdhil.errors import ExitCode
 from tdhil.record.recording import Recording
-
-_MOTION_UNKNOWN = (
-    "no periodic excitation is known for this trace, so acceleration, friction and lags can't be told apart",
-    "say with --excitation excitation.yaml which periods and lines were run and when, or record a run that has them: "
-    "a multisine about two mean speeds",
-)
 
 
 def conclude(
@@ -32,15 +28,21 @@ def conclude(
 
     asked = run.get("identify", {})
     known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}
-    identification = identify(recording, Options(**known))
+    options = Options(**known)
+    working = working_confidence_of(run, options.confidence)
+    identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     if warnings is not None:
         identification = replace(identification, warnings=(*warnings, *identification.warnings))
-        # A foreign trace doesn't say what was run; its user may know. Samples that are none stay the reason.
-        refused = identification.verdict is Verdict.NOT_IDENTIFIABLE and identification.samples_used > 0
-        if recording.excitation is None and refused:
-            identification = replace(identification, reason=_MOTION_UNKNOWN[0], advice=_MOTION_UNKNOWN[1])
     stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     return result_document(identification, recording, run, log), ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
+
+
+def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:
+    """Where one was asked for, the page as a file. Raises UsageError if it can't be written."""
+    if path is not None:
+        from tdhil.report.html import write_report
+
+        write_report(document, recording, path)
 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:

@@ -7,7 +7,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from tdhil.commands.conclude import conclude, print_result
+from tdhil.commands.conclude import conclude, print_result, save_report
+from tdhil.commands.models import MODELS
 from tdhil.errors import ExitCode, UsageError
 from tdhil.record.errors import LogError
 
@@ -29,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    parser.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
+    parser.add_argument("--model", choices=MODELS, help="of the shaft (default: the run's, or auto)")
     parser.add_argument("--confidence", type=float, metavar="P", help="of the interval (default: the run's, or 0.95)")
     parser.add_argument("--tolerance", type=float, metavar="SHARE",
                         help="half-width of the interval that is enough (default: the run's, or 0.05)")
@@ -58,6 +61,10 @@ def run(namespace: argparse.Namespace) -> int:
     if not path.is_file():
         raise UsageError("there is no such log", where=str(path),
                          next_step="Name a run.mcap of this tool, or a trace in CSV")
+    if namespace.report is not None:
+        from tdhil.report.html import check_report_path
+
+        check_report_path(namespace.report, path)
     return _run_log(namespace, path) if _is_log(path) else _run_trace(namespace, path)
 
 
@@ -81,6 +88,7 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
     for problem in found.problems:
         console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
     print_result(document, namespace.json)
+    save_report(document, found.recording, namespace.report)
     return int(code if found.recording.complete or code is not ExitCode.OK else ExitCode.PARTIAL)
 
 
@@ -104,6 +112,7 @@ def _run_trace(namespace: argparse.Namespace, path: Path) -> int:
     asked = {"tolerance": 0.05, "confidence": 0.95} | _asked(namespace)
     document, code = conclude(recording, {"identify": asked}, str(path), warnings)
     print_result(document, namespace.json)
+    save_report(document, recording, namespace.report)
     return int(code)
 
 
@@ -139,8 +148,8 @@ def _is_log(path: Path) -> bool:
     return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
 
 
-def _asked(namespace: argparse.Namespace) -> dict[str, float]:
-    names = ("confidence", "tolerance")
+def _asked(namespace: argparse.Namespace) -> dict[str, float | str]:
+    names = ("confidence", "tolerance", "model")
     return {name: getattr(namespace, name) for name in names if getattr(namespace, name) is not None}
 
 

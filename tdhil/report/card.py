@@ -10,6 +10,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from tdhil.report.card_parts import budget_table, compliant_rows, estimate_text, friction_rows, opinion_rows
 from tdhil.report.document import SIMULATED
 from tdhil.report.numbers import percent, with_interval
 
@@ -49,11 +50,16 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
         ("skew", "skew_s", "s"),
     ):
         if (part := document[key]) is not None:
-            rows.add_row(title, with_interval(part["value"], part["low"], part["high"], unit))
+            rows.add_row(title, estimate_text(part, unit))
+    for title, text in (*compliant_rows(document), *friction_rows(document), *opinion_rows(document)):
+        rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
         rows.add_row("the paper's method", _paper_text(paper, inertia))
     rows.add_row("model", document["model"])
-    body: list[RenderableType] = [rows, Text(), Text(_sentence(document["reason"]))]
+    body: list[RenderableType] = [rows, Text()]
+    if inertia is not None and document["budget"]:
+        body += [budget_table(document["budget"], inertia["value"]), Text()]
+    body.append(Text(_sentence(document["reason"])))
     if document["advice"]:
         body.append(Text(_sentence(document["advice"]), style="italic"))
     body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]

@@ -38,6 +38,11 @@ def result_document(
         "skew_s": _estimate(found.skew_s),
         "paper": None,
         "residual": None if found.residual is None else asdict(found.residual),
+        "budget": [asdict(line) for line in found.budget],
+        "second_opinions": [asdict(opinion) for opinion in found.second_opinions],
+        "friction_curve": [asdict(point) for point in found.friction_curve],
+        "compliant": _compliant(found),
+        "lines": [asdict(line) for line in found.lines],
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,
         "warnings": list(found.warnings),
@@ -66,6 +71,23 @@ def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[s
     squared = gear_ratio * gear_ratio
     names = ("value", "low", "high", "low_total", "high_total")
     return {name: getattr(inertia, name) * squared for name in names}
+
+
+def _compliant(found: Identification) -> dict[str, Any] | None:
+    """The shaft behind the spring; ``motor_inertia_kg_m2`` is the result's own inertia, J_r."""
+    shaft = found.compliant
+    if shaft is None:
+        return None
+    motor = found.inertia
+    return {
+        "motor_inertia_kg_m2": None if motor is None else {n: getattr(motor, n) for n in ("value", "low", "high")},
+        "load_inertia_kg_m2": _estimate(shaft.load_inertia),
+        "total_inertia_kg_m2": _estimate(shaft.total_inertia),
+        "stiffness_nm_rad": _estimate(shaft.stiffness_nm_rad),
+        "damping_nm_s_rad": _estimate(shaft.damping_nm_s_rad),
+        "resonance_hz": _estimate(shaft.resonance_hz),
+        "antiresonance_hz": _estimate(shaft.antiresonance_hz),
+    }
 
 
 def _estimate(estimate: Any) -> dict[str, float] | None:

@@ -9,7 +9,16 @@ def with_interval(value: float, low: float, high: float, unit: str) -> str:
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
         return f"{value:.5g} {unit}"
     decimals = max(0, 1 - math.floor(math.log10(half)))
-    return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f}) {unit}"
+    shown = (f"{round(number, decimals) + 0.0:.{decimals}f}" for number in (value, low, high))     # no minus zero
+    return "{} ({} to {}) ".format(*shown) + unit
+
+
+def plus_minus(value: float, half_width: float) -> str:
+    """``83.9 ± 3.0``, decimals as in `with_interval`."""
+    if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
+        return f"{value:.4g}"
+    decimals = max(0, 1 - math.floor(math.log10(half_width)))
+    return f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
 
 
 def percent(half_width: float, value: float) -> str:

@@ -14,9 +14,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from tdhil.report import page
 from tdhil.study.outcome import Cell, ResultTable, StudyOutcome
 
-INSTALL = "no pictures without matplotlib; install it with: pip install 'tdhil[report]'"
+INSTALL = f"no pictures without matplotlib; install it with: {page.INSTALL}"
 DPI = 120
 
 
@@ -101,19 +102,17 @@ def _settings(name: str, settings: BaseModel, folder: Path) -> Path:
 
 
 def _pictures(outcome: StudyOutcome, folder: Path) -> tuple[Path, Path]:
-    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     assert outcome.draw is not None
     png, svg = folder / f"{outcome.name}.png", folder / f"{outcome.name}.svg"
-    # the salt and no date: the same outcome gives the same file
-    with rc_context({"svg.hashsalt": "tdhil", "font.size": 10.0, "figure.facecolor": "white"}):
+    with page.repeatable_figures():
         figure = Figure(figsize=outcome.figure_size_in)
         FigureCanvasAgg(figure)
         outcome.draw(figure)
         figure.savefig(png, dpi=DPI)
-        figure.savefig(svg, metadata={"Date": None})
+        figure.savefig(svg, metadata={"Date": None})     # the same outcome gives the same file
     return png, svg
 
 

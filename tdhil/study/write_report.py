@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tdhil.report.page import STYLE
 from tdhil.study.outcome import StudyOutcome
 from tdhil.study.write import Written
 from tdhil.study.write_numbers import shown
@@ -47,11 +48,13 @@ def tally(chapters: Sequence[Chapter]) -> str:
 
 def _html(chapters: Sequence[Chapter], folder: Path) -> str:
     from jinja2 import Environment
+    from markupsafe import Markup
 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
     template = environment.from_string(_TEMPLATE)
-    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, beside=_beside(folder))
+    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, beside=_beside(folder),
+                           style=Markup(STYLE))
 
 
 def _beside(folder: Path):  # type: ignore[no-untyped-def]
@@ -85,16 +88,7 @@ _TEMPLATE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>Paper and program, side by side</title>
 <meta name="viewport" content="width=device-width">
 <style>
-body { font: 15px/1.45 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-nav a { margin-right: .8rem; white-space: nowrap }
-img { max-width: 100%; border: 1px solid #ddd }
-.wide { overflow-x: auto }
-table { border-collapse: collapse; margin: .6rem 0; font-size: 13px }
-caption { text-align: left; font-style: italic; padding-bottom: .2rem }
-th, td { border: 1px solid #ddd; padding: .2rem .5rem; text-align: right }
-th { background: #f4f4f4; font-weight: 600 }
-.claims td { text-align: left; vertical-align: top }
-.green { color: #1a7f37 } .red { color: #b42318 } .yellow { color: #8a6100 }
+{{ style }}
 </style></head><body>
 <h1>Paper and program, side by side</h1>
 <p>Xu et al., <i>Appl. Sci.</i> 2026, 16, 2012, beside what comes out here. {{ tally }}. Everything here is SIMULATED;

@@ -1,0 +1,67 @@
+"""What every HTML page of ours shares: its style, its pictures as SVG, and the word for what must be installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from io import StringIO
+from typing import TYPE_CHECKING
+
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Draw = Callable[["Figure"], None]
+
+INSTALL = "pip install 'tdhil[report]'"
+NEEDED = ("matplotlib", "jinja2")
+
+STYLE = """\
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+nav a { margin-right: .8rem; white-space: nowrap }
+img, svg { max-width: 100%; height: auto }
+img { border: 1px solid #ddd }
+.wide { overflow-x: auto }
+table { border-collapse: collapse; margin: .6rem 0; font-size: 13px }
+caption { text-align: left; font-style: italic; padding-bottom: .2rem }
+th, td { border: 1px solid #ddd; padding: .2rem .5rem; text-align: right }
+th { background: #f4f4f4; font-weight: 600 }
+.claims td { text-align: left; vertical-align: top }
+.green { color: #1a7f37 } .red { color: #b42318 } .yellow { color: #8a6100 }
+"""
+
+
+def require_extra(where: str) -> None:
+    """Raises UsageError, in one line, where the optional packages for a report are missing."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"a report needs {' and '.join(missing)}, not installed here", where=where, next_step=f"Install: {INSTALL}"
+        )
+
+
+@contextmanager
+def repeatable_figures() -> Iterator[None]:
+    """Matplotlib set so that the same data give the same file: salted ids, no style of the user's."""
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": "tdhil", "font.size": 10.0, "figure.facecolor": "white"}):
+        yield
+
+
+def inline_svg(draw: Draw, size_in: tuple[float, float]) -> str:
+    """A picture as an <svg> element for the page itself: no date, no second file, text as text."""
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    with repeatable_figures(), rc_context({"svg.fonttype": "none", "font.family": "sans-serif"}):
+        figure = Figure(figsize=size_in)
+        FigureCanvasSVG(figure)
+        draw(figure)
+        text = StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    whole = text.getvalue()
+    return whole[whole.index("<svg") :]

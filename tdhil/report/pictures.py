@@ -1,0 +1,113 @@
+"""The pictures of a result: lines over frequency, the budget, friction over speed, all inertias side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+OURS, PAPER, DARK, QUIET = "#1f5fa8", "#c2410c", "0.15", "0.55"
+Part = Mapping[str, Any]
+
+
+def draw_lines(figure: Figure, document: Part) -> None:
+    """Above: what every line shows by itself, the model through it, and J. Below: what the model leaves."""
+    points = document["lines"]
+    hertz = [point["hertz"] for point in points]
+    top, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    seen = [point["apparent_inertia_kg_m2"] for point in points]
+    top.plot(hertz, [point["fitted_inertia_kg_m2"] for point in points], "-", color=OURS, lw=1.4, label="model")
+    top.errorbar(hertz, [e["value"] for e in seen], _bars(seen), fmt="o", color=DARK, ms=5, capsize=3, lw=1.2,
+                 label="each line by itself")
+    inertia, paper = document["inertia_kg_m2"], document["paper"]
+    if inertia is not None:
+        top.axhspan(inertia["low"], inertia["high"], color=OURS, alpha=0.18, lw=0)
+        top.axhline(inertia["value"], color=OURS, lw=1.0, ls=":", label="J with its interval")
+    if paper is not None and paper["inertia_kg_m2"] is not None:
+        top.axhline(paper["inertia_kg_m2"], color=PAPER, lw=1.2, ls="--", label="the paper's slope")
+    top.set_ylabel("Im(T/ω) / 2πf, kg·m²")
+    top.legend(fontsize=9, loc="best")
+    below.bar(hertz, [point["residual_sd"] for point in points], width=_width(hertz), color=QUIET)
+    below.axhline(1.0, color=DARK, lw=0.8, ls=":")
+    below.set(xlabel="frequency, Hz", ylabel="residual,\nst. dev.")
+    for axes in (top, below):
+        axes.grid(alpha=0.3)
+    figure.tight_layout()
+
+
+def draw_budget(figure: Figure, document: Part) -> None:
+    """One bar for each source, largest on top."""
+    lines = sorted((line for line in document["budget"] if line["half_width_kg_m2"] is not None),
+                   key=lambda line: float(line["half_width_kg_m2"]))
+    axes = figure.subplots()
+    halves = [line["half_width_kg_m2"] for line in lines]
+    colours = [QUIET if line["source"] == "torque scale" else OURS for line in lines]
+    bars = axes.barh([line["source"] for line in lines], halves, color=colours)
+    axes.bar_label(bars, [f"{half:.2g}" for half in halves], padding=4, fontsize=9)
+    axes.margins(x=0.12)
+    axes.set_xlabel("half-width that it alone leaves, kg·m²")
+    axes.grid(axis="x", alpha=0.3)
+    figure.tight_layout()
+
+
+def draw_friction(figure: Figure, document: Part) -> None:
+    """The points, and the straight line of T_c and B through them."""
+    points = document["friction_curve"]
+    speeds = [point["speed_rad_s"] for point in points]
+    torques = [point["torque_nm"] for point in points]
+    axes = figure.subplots()
+    axes.errorbar(speeds, [e["value"] for e in torques], _bars(torques), fmt="o", color=DARK, ms=5, capsize=3, lw=1.2,
+                  label="at steady speed")
+    viscous, coulomb = document["viscous_nm_s_rad"], document["coulomb_nm"]
+    if viscous is not None and coulomb is not None and min(speeds) * max(speeds) > 0.0:
+        sign = 1.0 if max(speeds) > 0.0 else -1.0
+        ends = [min(speeds, key=abs), max(speeds, key=abs)]
+        axes.plot(ends, [sign * coulomb["value"] + viscous["value"] * end for end in ends], color=OURS, lw=1.4,
+                  label="T$_c$ + B ω of the result")
+    axes.set(xlabel="speed, rad/s", ylabel="friction torque, N·m")
+    axes.legend(fontsize=9)
+    axes.grid(alpha=0.3)
+    figure.tight_layout()
+
+
+def draw_opinions(figure: Figure, document: Part) -> None:
+    """Every inertia that this run speaks of, on one axis."""
+    rows: list[tuple[str, Part, str]] = []
+    inertia, paper = document["inertia_kg_m2"], document["paper"]
+    if inertia is not None:
+        rows.append(("result", inertia, OURS))
+        total = {"value": inertia["value"], "low": inertia["low_total"], "high": inertia["high_total"]}
+        rows.append(("with torque scale", total, QUIET))
+    if document["compliant"] is not None:
+        rows.append(("J_r + J_L", document["compliant"]["total_inertia_kg_m2"], OURS))
+    rows += [(opinion["route"], opinion["inertia_kg_m2"], PAPER if opinion["agrees"] is False else DARK)
+             for opinion in document["second_opinions"]]
+    if paper is not None and paper["inertia_kg_m2"] is not None:
+        alone = paper["inertia_kg_m2"]
+        rows.append(("the paper's slope", {"value": alone, "low": alone, "high": alone}, PAPER))
+    axes = figure.subplots()
+    for at, (_, part, colour) in enumerate(rows):
+        axes.errorbar([part["value"]], [at], xerr=_bars([part]), fmt="o", color=colour, ms=6, capsize=4, lw=1.6)
+    if inertia is not None:
+        axes.axvspan(inertia["low"], inertia["high"], color=OURS, alpha=0.12, lw=0)
+    axes.set_yticks(range(len(rows)), [title for title, _, _ in rows])
+    axes.invert_yaxis()
+    axes.margins(y=0.15)
+    axes.set_xlabel("kg·m² at the motor shaft")
+    axes.grid(axis="x", alpha=0.3)
+    figure.tight_layout()
+
+
+def _bars(estimates: Sequence[Part]) -> list[list[float]]:
+    """Distances down and up, as errorbar wants them; an open side has no bar."""
+    down = [0.0 if e["low"] is None else max(0.0, e["value"] - e["low"]) for e in estimates]
+    up = [0.0 if e["high"] is None else max(0.0, e["high"] - e["value"]) for e in estimates]
+    return [down, up]
+
+
+def _width(hertz: Sequence[float]) -> float:
+    gaps = [b - a for a, b in pairwise(hertz)]
+    return 0.4 * min(gaps) if gaps and min(gaps) > 0.0 else 0.02

@@ -1,0 +1,51 @@
+"""`--report`: one page, the same from a run and from its replay, and never in the way of either."""
+
+import pytest
+from path_runs import identify, tdhil
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    done = identify(folder, "--simulate", "--seed", 4, "--periods", 4, "--report", folder / "live.html")
+    assert done.code == 0, done.err
+    return done
+
+
+def test_a_run_has_a_second_opinion_and_a_friction_curve(run):
+    opinions = run.document["second_opinions"]
+    assert [opinion["route"] for opinion in opinions] == ["speed change"]
+    assert opinions[0]["inertia_kg_m2"]["low"] < 104.0 < opinions[0]["inertia_kg_m2"]["high"]
+    assert opinions[0]["agrees"] is True
+    assert len(run.document["friction_curve"]) >= 3
+
+
+def test_the_replay_gives_the_same_page_and_the_same_numbers_to_the_last_bit(run):
+    page = run.log.parent / "replay.html"
+    again = tdhil("replay", "--json", run.log, "--report", page)
+    assert again.code == 0, again.err
+    for part in ("inertia_kg_m2", "second_opinions", "friction_curve", "lines", "budget", "warnings"):
+        assert again.document[part] == run.document[part]
+    assert page.read_bytes() == (run.log.parent / "live.html").read_bytes()
+    text = page.read_text(encoding="utf-8")
+    assert "SIMULATED" in text
+    assert "speed change" in text
+
+
+@pytest.mark.parametrize(("name", "said"), [("run.mcap", "the log itself"), ("no/r.html", "no such folder")])
+def test_a_place_where_no_report_can_go_is_refused_before_anything_moves(tmp_path, name, said):
+    done = identify(tmp_path, "--simulate", "--report", tmp_path / name)
+    assert done.code == 2
+    assert said in done.err
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_the_log_is_never_written_over_by_its_own_report(run):
+    before = run.log.read_bytes()
+    done = tdhil("replay", run.log, "--report", run.log)
+    assert done.code == 2
+    assert "the log itself" in done.err
+    assert run.log.read_bytes() == before

@@ -1,0 +1,59 @@
+"""The result card: eighty columns, every part where there is one, nothing invented where there is none."""
+
+import io
+
+import pytest
+from findings import bare, full, open_sided, recording
+from rich.console import Console
+
+from tdhil.report.card import print_card
+from tdhil.report.document import result_document
+from tdhil.report.numbers import plus_minus, with_interval
+
+
+def shown(found, width=80, **changes):
+    text = io.StringIO()
+    document = result_document(found, recording(**changes), {}, "run.mcap")
+    print_card(document, Console(file=text, width=width, highlight=False))
+    return text.getvalue()
+
+
+@pytest.mark.parametrize("make", [full, bare, open_sided])
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_no_line_is_wider_than_the_terminal(make, width):
+    assert max(map(len, shown(make(), width).splitlines())) <= width
+
+
+def test_every_part_is_shown():
+    card = shown(full())
+    for wanted in (
+        "104.00 (103.55 to 104.45) kg·m²  ±0.43 %", "SIMULATED", "motor's side, J_r", "J_L behind the spring",
+        "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
+        "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
+        "130.6 (128.3 to 132.9) kg·m²  agrees, speed change", "DOES NOT AGREE, coast-down",
+        "what makes it unsure", "! friction <b>bends</b> & more",
+    ):
+        assert wanted in card, wanted
+    # the largest source first
+    assert card.index("torque scale         ") < card.index("noise  ") < card.index("lags  ")
+
+
+def test_open_sides_are_said():
+    card = shown(open_sided())
+    assert "0.4 s, open on one side" in card
+    assert "0 s, open on both sides" in card
+
+
+def test_a_refusal_shows_nothing_that_is_not_there():
+    card = shown(bare(), simulated=False)
+    assert "not_identifiable" in card
+    assert "Record for longer." in card
+    for unwanted in ("unsure", "friction", "second opinion", "kg·m²", "SIMULATED", "None"):
+        assert unwanted not in card
+
+
+def test_digits_follow_the_half_width():
+    assert plus_minus(83.1234, 1.5) == "83.1 ± 1.5"
+    assert plus_minus(1234.5, 120.0) == "1234 ± 120"
+    assert plus_minus(5.0, float("inf")) == "5"
+    assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"

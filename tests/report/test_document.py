@@ -1,0 +1,39 @@
+"""The JSON document: every part is in it, units in the names, and no number that JSON doesn't know."""
+
+import json
+
+import pytest
+from findings import bare, full, open_sided, recording
+
+from tdhil.report.document import result_document
+
+
+@pytest.mark.parametrize("make", [full, bare, open_sided])
+def test_it_is_json(make):
+    document = result_document(make(), recording(), {}, "run.mcap")
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+
+
+def test_every_part_is_in_it():
+    document = result_document(full(), recording(), {}, "run.mcap")
+    assert [line["source"] for line in document["budget"]] == ["noise", "lags", "torque scale"]
+    assert document["budget"][0]["half_width_kg_m2"] == 0.31
+    assert [(o["route"], o["agrees"]) for o in document["second_opinions"]] == [
+        ("speed change", True), ("coast-down", False)
+    ]
+    assert document["second_opinions"][0]["inertia_kg_m2"].keys() == {"value", "low", "high"}
+    assert document["friction_curve"][0] == {
+        "speed_rad_s": 2.9, "torque_nm": {"value": 83.1, "low": 81.6, "high": 84.6}
+    }
+    shaft = document["compliant"]
+    assert shaft["motor_inertia_kg_m2"]["value"] == 104.0
+    assert shaft["total_inertia_kg_m2"]["value"] == 130.0
+    assert shaft["damping_nm_s_rad"] is None
+    assert [line["hertz"] for line in document["lines"]] == [0.1, 0.2, 0.3, 0.4]
+
+
+def test_a_refusal_has_the_same_keys_with_nothing_in_them():
+    empty = result_document(bare(), recording(), {}, "run.mcap")
+    assert empty.keys() == result_document(full(), recording(), {}, "run.mcap").keys()
+    assert empty["budget"] == empty["second_opinions"] == empty["friction_curve"] == empty["lines"] == []
+    assert empty["compliant"] is None

@@ -1,0 +1,120 @@
+"""The HTML report: one file that needs nothing else, whole and escaped, and says what it can't do in one line."""
+
+import importlib.util
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from findings import bare, full, open_sided, recording
+
+from tdhil.errors import UsageError
+from tdhil.report.document import result_document
+from tdhil.report.html import check_report_path, report_page, write_report
+from tdhil.report.picture_run import envelope
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+VOID = {"meta", "br", "img", "path", "use", "rect", "line", "circle", "polyline", "polygon"}
+
+
+class Balanced(HTMLParser):
+    """Every tag that opens is closed, in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.text, self.loaded = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.loaded += [value for name, value in attributes if name in ("src", "href", "xlink:href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.loaded += [value for name, value in attributes if name in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag):
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def page(found, **changes):
+    own = recording(**changes)
+    return report_page(result_document(found, own, {}, "run.mcap"), own)
+
+
+@pytest.mark.parametrize("make", [full, bare, open_sided])
+@pytest.mark.parametrize("changes", [{}, {"samples": 1}, {"samples": 0, "stages": (), "excitation": None}])
+def test_the_page_is_well_formed_and_loads_nothing(make, changes):
+    text = page(make(), **changes)
+    parser = Balanced()
+    parser.feed(text)
+    assert parser.open == []
+    assert all(target.startswith("#") for target in parser.loaded)
+    assert "url(http" not in text
+    assert "<script" not in text
+    for svg in re.findall(r"<svg.*?</svg>", text, re.DOTALL):
+        ET.fromstring(svg)
+
+
+def test_everything_is_on_it():
+    text = page(full())
+    assert text.count("<svg") == 5
+    for wanted in (
+        "J_r = 104.00 (103.55 to 104.45) kg·m²", "J_r + J_L = 130.0 (128.0 to 132.0) kg·m²",
+        "±0.43 % at 95 %", "104.0 (99.9 to 108.1) kg·m²", "SIMULATED",
+        "does not agree", "motor side J_r", "9 of 3200 cycles without feedback", "scatter from period to period",
+        "111.5 kg·m²", "116.20 ± 0.80",
+    ):
+        assert wanted in text, wanted
+    assert "friction &lt;b&gt;bends&lt;/b&gt; &amp; more" in text
+
+
+def test_a_refusal_has_no_number_and_no_banner_on_a_real_drive():
+    text = page(bare(), simulated=False)
+    assert "No number" in text
+    assert "12 samples are no record" in text.lower()
+    assert "SIMULATED" not in text
+    assert text.count("<svg") == 1
+
+
+def test_open_sides_are_open():
+    assert page(open_sided()).count("<td>open</td>") == 3
+
+
+def test_the_same_result_is_the_same_file(tmp_path):
+    own = recording()
+    document = result_document(full(), own, {}, "run.mcap")
+    write_report(document, own, tmp_path / "a.html")
+    write_report(document, own, tmp_path / "b.html")
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_what_can_not_be_done_is_said_in_one_line(tmp_path, monkeypatch):
+    log = tmp_path / "run.mcap"
+    for path, said in ((log, "the log itself"), (tmp_path, "a folder"), (tmp_path / "no" / "r.html", "no such folder")):
+        with pytest.raises(UsageError) as caught:
+            check_report_path(path, log)
+        assert said in str(caught.value)
+        assert "\n" not in str(caught.value)
+    check_report_path(tmp_path / "r.html", log)
+    find = importlib.util.find_spec
+    monkeypatch.setattr("tdhil.report.page.find_spec", lambda name: None if name == "jinja2" else find(name))
+    with pytest.raises(UsageError, match=r"needs jinja2, not installed here.*pip install 'tdhil\[report\]'"):
+        check_report_path(tmp_path / "r.html", log)
+
+
+def test_the_envelope_loses_no_peak():
+    rng = np.random.default_rng(1)
+    signal = rng.standard_normal(100_000)
+    signal[77_777] = 50.0
+    time, low, high = envelope(np.arange(100_000) * 0.001, signal)
+    assert len(time) <= 1200
+    assert high.max() == 50.0
+    assert low.min() == signal.min()
+    assert np.all(low <= high)
