@@ -12,6 +12,7 @@ from tdhil.study.coverage_plants import CoveragePlant
 from tdhil.study.coverage_runs import Run
 
 ONE_SIDED = 0.99          # confidence of each bound of the miss rate
+MOST_REFUSED = 0.02
 _BIAS_FLOOR = 0.002
 _BIAS_ERRORS = 3.0
 _OVER_BOUND = 1.2
@@ -104,6 +105,13 @@ def not_too_wide(found: PlantFigures, nominal: float) -> bool | None:
     if found.miss_rate is None or not found.plant.model_true:
         return None
     return found.miss_high >= _LEAST_MISSES * nominal
+
+
+def answers(found: PlantFigures) -> bool | None:
+    """Is a number refused in 2 % of the runs at most (lower 99 % bound)? Only where the model is the truth."""
+    if not found.plant.model_true or found.runs == 0:
+        return None
+    return clopper_pearson(found.refused, found.runs)[0] <= MOST_REFUSED
 
 
 def unbiased(found: PlantFigures) -> bool | None:

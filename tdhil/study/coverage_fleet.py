@@ -86,4 +86,37 @@ FLEET: tuple[CoveragePlant, ...] = (
         Noise(10.0, 0.6, 25.0, 0.02, 0.003, 5.0, 0.1 * RPM, 3.0),
         Reading(10.0, 0.010, 0.005, -0.020, 0.020, 0.0, 0.1),
     ),
+    CoveragePlant(
+        "torque_average", "torque as a moving average, longer than the speed's lag", 104.0, 8.0, 60.0, (0.5, 10.0),
+        400.0, _lag(0.20), _lag(average_s=0.60), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "torque_poles", "torque through two equal poles", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.10), _lag(0.25, 0.25), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "long_poles", "speed through two long poles", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.50, 0.30), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "three_poles", "speed through three poles, one more than any model has", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.20, 0.20, 0.20), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "dead_time", "speed merely late, by 0.3 s", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(delay_s=0.30), _lag(), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "long_average", "speed as a moving average over 1 s", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(average_s=1.0), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "crossed", "the long lag on torque, a short one on speed", 40.0, 3.0, 30.0, (1.0, 20.0), 300.0,
+        _lag(0.10), _lag(0.40), Noise(2.0, 0.5, 6.0, 0.02, 0.004, 1.5, 0.1 * RPM, 0.8), Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "modbus_poles", "10 Hz, instants 40 ms apart, speed through two poles", 350.0, 20.0, 150.0, (0.5, 12.0), 1200.0,
+        _lag(0.30, 0.10), _lag(0.10), Noise(10.0, 0.6, 25.0, 0.02, 0.003, 5.0, 0.1 * RPM, 3.0),
+        Reading(10.0, 0.010, 0.005, -0.020, 0.020, 0.0, 0.1),
+    ),
 )

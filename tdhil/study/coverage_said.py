@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tdhil.study.coverage_figures import PlantFigures, covers, efficient, not_too_wide, unbiased
+from tdhil.study.coverage_figures import MOST_REFUSED, PlantFigures, answers, covers, efficient, not_too_wide, unbiased
 from tdhil.study.outcome import Cell, ResultTable, Statement
 
 
@@ -89,6 +89,12 @@ def _said_of(one: PlantFigures, nominal: float) -> list[Statement]:
                 f"≥ {0.4 * nominal:.3g}",
                 f"{one.miss_high:.3f} ({told})",
                 not_too_wide(one, nominal),
+            )
+        )
+        statements.append(
+            Statement(
+                f"{name}: runs refused though the model is the truth", f"≤ {MOST_REFUSED:.0%} (lower 99 % bound)",
+                f"{one.refused} of {one.runs}", answers(one),
             )
         )
     bias = "no run gave a number"

@@ -18,6 +18,7 @@ from tdhil.record.recording import FloatArray
 from tdhil.study.field import FieldBench, FieldRun, part_of
 from tdhil.study.field_draw_slopes import SlopePicture, draw_slopes
 from tdhil.study.field_settings import SlopeSettings
+from tdhil.study.field_singly import Alone, alone_statements, alone_table, each_alone
 from tdhil.study.field_slopes_said import Record, percent, said_of_slopes
 from tdhil.study.field_tone import excited, line_slope, scatter
 from tdhil.study.joint import joined, slope_of
@@ -53,12 +54,19 @@ class FieldSlopes:
             records.append(Record(tone.frequency_hz, tone.mode, scatter(recording), line_slope(recording), mean))
         progress(count / (count + 0.5), "joint fit")
         joint = identify(joined(recordings), Options(confidence=settings.confidence))
+        alone = each_alone(recordings, joint, settings.confidence)
         progress(1.0, "joint fit")
-        return _outcome(self, settings, records, joint, sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings))
+        simulated_s = sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings)
+        return _outcome(self, settings, records, joint, alone, simulated_s)
 
 
 def _outcome(
-    study: FieldSlopes, settings: SlopeSettings, records: list[Record], joint: Identification, simulated_s: float
+    study: FieldSlopes,
+    settings: SlopeSettings,
+    records: list[Record],
+    joint: Identification,
+    alone: tuple[Alone, ...],
+    simulated_s: float,
 ) -> StudyOutcome:
     tones = np.array([record.hertz for record in records])
     curve = slope_of(joint, tones)
@@ -66,8 +74,10 @@ def _outcome(
     return StudyOutcome(
         name=study.name,
         title=study.title,
-        tables=(_slope_table(records, curve), _joint_table(settings, joint)),
-        statements=said_of_slopes(settings, records, joint, curve),
+        tables=(_slope_table(records, curve), _joint_table(settings, joint), alone_table(alone)),
+        statements=(
+            *said_of_slopes(settings, records, joint, curve), *alone_statements(alone, settings.rig.inertia_kg_m2)
+        ),
         document=_document(settings, records, joint),
         simulated_s=simulated_s,
         draw=lambda figure: draw_slopes(figure, picture),

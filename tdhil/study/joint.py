@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.identify.identification import Identification
-from tdhil.identify.rigid import SpeedReport, impedance
 from tdhil.record.recording import Excitation, FloatArray, Recording, Segment
 
 _BETWEEN_S = 10.0      # of nothing, between two records
@@ -68,8 +67,8 @@ def expected_slope(
     Averaging both over the same 0.1 s changes nothing in it.
     """
     s = (2j * np.pi * np.asarray(hertz, dtype=np.float64)).astype(np.complex128)
-    theta = np.array([inertia, viscous, speed_lag_s, torque_lag_s, skew_s])
-    slope: FloatArray = (impedance(theta, s, SpeedReport.FIRST_ORDER) / s).real
+    seen = (inertia * s + viscous) * (1.0 + speed_lag_s * s) / (1.0 + torque_lag_s * s) * np.exp(-skew_s * s)
+    slope: FloatArray = (seen / s).real
     return slope
 
 

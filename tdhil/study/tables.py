@@ -17,9 +17,9 @@ from tdhil.study.outcome import Cell, Progress, ResultTable, StudyOutcome
 from tdhil.study.published import PublishedDesign, published
 from tdhil.study.ranges import ranking
 from tdhil.study.settings import NonNegative, Positive, SamplePeriod
-from tdhil.study.tables_design import DesignResult, run_design
+from tdhil.study.tables_design import DesignResult, DesignRun, run_design
 from tdhil.study.tables_draw import draw_runs
-from tdhil.study.tables_statements import design_statements
+from tdhil.study.tables_statements import design_statements, tdhil_inertia
 
 
 class Table6Settings(DesignSettings):
@@ -85,16 +85,17 @@ def rms_deviation(result: DesignResult, paper: PublishedDesign) -> float:
 
 
 def run_table(name: str, result: DesignResult, paper: PublishedDesign | None) -> ResultTable:
-    """One row per run: factors; J as the paper identifies it; J of whole periods; the closed form; the deviation."""
+    """One row per run: factors; J as the paper identifies it, of whole periods, by the closed form, by this tool."""
     silent = result.runs[0].silent_kg_m2 is not None
     columns = ["run", *result.runs[0].factors, "inertia_kg_m2", "without_start_up_kg_m2", "closed_form_kg_m2"]
+    columns.append("tdhil_kg_m2")
     columns += ["without_noise_kg_m2"] if silent else []
     columns += ["published_kg_m2", "deviation_kg_m2"] if paper else []
     rows: list[tuple[Cell, ...]] = []
     for number, run in enumerate(result.runs):
         found = run.line.inertia_kg_m2
         row: list[Cell] = [number + 1, *run.factors.values(), found]
-        row += [run.settled.inertia_kg_m2 if run.settled else None, run.closed_form_kg_m2]
+        row += [run.settled.inertia_kg_m2 if run.settled else None, run.closed_form_kg_m2, tdhil_inertia(run)]
         row += [run.silent_kg_m2] if silent else []
         row += [paper.runs_kg_m2[number], found - paper.runs_kg_m2[number]] if paper else []
         rows.append(tuple(row))
@@ -131,12 +132,24 @@ def effect_document(settings: DesignSettings, result: DesignResult) -> list[dict
     ]
 
 
+def _own(run: DesignRun) -> dict[str, Any] | None:
+    """What this tool itself concludes, for machines."""
+    found = run.identification
+    if found is None:
+        return None
+    inertia = None if found.inertia is None else {
+        "value": found.inertia.value, "low": found.inertia.low, "high": found.inertia.high
+    }
+    return {"verdict": found.verdict.value, "reason": found.reason, "inertia_kg_m2": inertia}
+
+
 def _document(settings: DesignSettings, result: DesignResult, paper: PublishedDesign | None) -> dict[str, Any]:
     runs = [
         {
             **run.factors, "inertia_kg_m2": run.line.inertia_kg_m2, "intercept_nm": run.line.intercept_nm,
             "r2": run.line.r2, "without_start_up_kg_m2": run.settled.inertia_kg_m2 if run.settled else None,
             "closed_form_kg_m2": run.closed_form_kg_m2, "true_inertia_kg_m2": run.settings.inertia_kg_m2,
+            "tdhil": _own(run),
         }
         for run in result.runs
     ]

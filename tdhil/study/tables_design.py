@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.identify.identification import LineFit
+from tdhil.identify.identification import Identification, LineFit
 from tdhil.study.design import DesignSettings
 from tdhil.study.loop import LoopRecord, simulate
 from tdhil.study.loop_reference import reference_of
@@ -17,6 +17,7 @@ from tdhil.study.processing import backward_difference, settled_periods, torque_
 from tdhil.study.ranges import LevelMeans, main_effects, ranking
 from tdhil.study.settings import LoopSettings, changed
 from tdhil.study.tables_bias import closed_form_inertia
+from tdhil.study.tables_identified import identified
 
 FloatArray = NDArray[np.float64]
 
@@ -39,6 +40,8 @@ class DesignRun:
     alpha_rad_s2: FloatArray
     torque_nm: FloatArray
     """Points of the scatter, evenly thinned out."""
+    identification: Identification | None = None
+    """This tool's own, of the same samples, lags declared absent; None where the motion is no sine."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,7 @@ def _identified(
         factors, run, torque_line(time, speed, torque), _settled(record, number, run), closed_form_inertia(run),
         None if twin is None else _line(record, twin, slice(None)).inertia_kg_m2,
         backward_difference(time, speed)[thin].copy(), torque[1:][thin].copy(),
+        identified(run, time, speed, torque),
     )
 
 
