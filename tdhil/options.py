@@ -35,6 +35,7 @@ OPTIONS = (
     Option("offset_rad_s", "--offset", "run.offset_rad_s"),
     Option("periods", "--periods", "run.periods"),
     Option("tolerance", "--tolerance", "run.tolerance", 0.05),
+    Option("max_time_s", "--max-time", "run.max_time_s"),
     Option("confidence", "--confidence", "run.confidence", 0.95),
     Option("seed", "--seed", "run.seed"),
     Option("simulate", "--simulate", "run.simulate", False),

@@ -88,6 +88,15 @@ class DriveData(DataModel):
         return self
 
 
+class Expected(DataModel):
+    """What is expected of the shaft, for planning before it has moved (`--dry-run`); never used for the result."""
+
+    inertia_kg_m2: Positive | None = Field(default=None, description="kg·m² at the motor")
+    viscous_nm_s_rad: NotNegative | None = Field(default=None, description="N·m·s/rad")
+    coulomb_nm: NotNegative | None = Field(default=None, description="N·m")
+    load_noise_nm: Positive | None = Field(default=None, description="N·m; standard deviation of what disturbs")
+
+
 class Run(DataModel):
     """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
 
@@ -98,6 +107,7 @@ class Run(DataModel):
     offset_rad_s: float | None = Field(default=None, description="rad/s; mean speed")
     periods: int | None = Field(default=None, ge=1, le=10_000)
     tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
+    max_time_s: Positive | None = Field(default=None, description="s; longest stage 5")
     confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
     seed: int | None = Field(default=None, ge=0, le=2**63 - 1, description="repeats a simulated run")
     simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")
@@ -131,6 +141,7 @@ class Rig(DataModel):
     torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
     allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
     drive_data: DriveData = DriveData()
+    expected: Expected = Expected()
     reference_inertia_kg_m2: Positive | None = Field(default=None, description="kg·m² at the motor; shown beside J")
     run: Run = Run()
 

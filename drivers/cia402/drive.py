@@ -325,6 +325,15 @@ class Cia402Drive:
             link.receive(left_s)
         return clock.now_s() - sync_s
 
+    def keep_alive(self) -> None:
+        """A sign of life between two cycles, without a SYNC: in stepped time a peer takes a silent host for a dead one.
+
+        The heartbeats that are due in control time stay due.
+        """
+        due_s = self._next_heartbeat_s
+        self._send_heartbeat()
+        self._next_heartbeat_s = due_s
+
     def _send_heartbeat(self) -> None:
         self._link.send(0x700 + self._host_node, bytes((OPERATIONAL,)))
         self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s

@@ -29,6 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.options`)."""
     from can.cli import add_bus_arguments
 
+    from tdhil.commands.models import MODELS
+    from tdhil.commands.quantities import seconds, share
+
     drive = parser.add_argument_group("drive")
     drive.add_argument("--drive", choices=("canopen", "modbus"), help="how the drive is spoken to (default canopen)")
     drive.add_argument("--node", type=int, metavar="N", help="CANopen node number (default: the profile's)")
@@ -43,11 +46,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument("--amplitude", dest="amplitude_rad_s", type=float, metavar="RAD_S", help="peak of the speed")
     motion.add_argument("--offset", dest="offset_rad_s", type=float, metavar="RAD_S", help="mean speed")
     motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
+    motion.add_argument("--max-time", dest="max_time_s", type=seconds, metavar="TIME",
+                        help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
+    motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
     motion.add_argument("--yes", action="store_const", const=True, help="no prompt before motion; limits stay")
     result = parser.add_argument_group("result")
-    result.add_argument("--tolerance", type=float, metavar="SHARE", help="half-width of the interval that is enough")
+    result.add_argument("--tolerance", type=share, metavar="SHARE",
+                        help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
     result.add_argument("--confidence", type=float, metavar="P", help="of the interval (default 0.95)")
+    result.add_argument("--model", choices=MODELS, help="of the shaft (default auto: the simplest that fits)")
     result.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
+    result.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
     result.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     simulated = parser.add_argument_group("simulated rig")
     simulated.add_argument(
@@ -79,6 +88,14 @@ def run(namespace: argparse.Namespace) -> int:
         namespace.json = True
     bus = bus_config(vars(namespace), rig)
     console = stderr_console()
+    if namespace.report is not None:
+        from tdhil.report.html import check_report_path
+
+        check_report_path(namespace.report, Path(options["log"]))
+    if namespace.dry_run:
+        from tdhil.commands.dry_run import dry_run
+
+        return dry_run(options, rig, simulated=bool(options["simulate"]) or not bus.configured)
     peer = plan_peer(options, bus)
     _show_settings(console, options, bus, peer)
     return _run(namespace, options, bus, peer, rig, console)
@@ -107,7 +124,7 @@ def _run(
     if (older := make_room(path)) is not None:
         console.print(f"an older {path} was kept as {older}", style="dim", markup=False)
     writer = RunWriter(path, epoch_ns=peer.epoch_ns, block=peer.stepped)
-    log = RunLog(writer, _configuration(options, bus, peer, rig))
+    log = RunLog(writer, _configuration(options, bus, peer, rig, namespace.model))
     rated_nm = rig.drive_data.rated_torque_nm if rig is not None else None
     trace = None if options["trace"] is None else Path(options["trace"])
     try:
@@ -122,8 +139,9 @@ def _run(
                 display,
                 partial(confirm_motion, yes=bool(options["yes"]), console=console, pause_display=display.pause),
                 reset_fault=namespace.reset_fault,
+                say=partial(console.print, style="dim", markup=False, highlight=False),
             ).run()
-        code = _finish(outcome, log, str(path), bool(options["json"]), console)
+        code = _finish(outcome, log, str(path), bool(options["json"]), console, namespace.report)
     except BaseException:
         with suppress(LogError):  # the first cause stays the cause
             log.close()
@@ -147,9 +165,11 @@ def _task(options: Resolved, rig: Rig | None, log: RunLog, identity: Identity) -
     return Task(machine_limits(bench), excitation_request(options), facts(bench))
 
 
-def _finish(outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console) -> int:
+def _finish(
+    outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console, report: Path | None = None
+) -> int:
     """Identify and print, or say what ended the run."""
-    from tdhil.commands.conclude import conclude, print_result
+    from tdhil.commands.conclude import conclude, print_result, save_report
 
     if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
         return _failed(outcome, path, as_json, console)
@@ -157,6 +177,7 @@ def _finish(outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console:
         document, code = conclude(log.recording(complete=True), log.run, path)
     log.result(document)
     print_result(document, as_json)
+    save_report(document, log.recording(complete=True), report)
     return int(code)
 
 
@@ -202,7 +223,9 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     return int(code)
 
 
-def _configuration(options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
+def _configuration(
+    options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None, model: str | None
+) -> dict[str, Any]:
     """What the log keeps of how the run was set up; everything that identification needs is in it."""
     return {
         "tdhil": __version__,
@@ -212,7 +235,8 @@ def _configuration(options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig |
         "stepped": peer.stepped,
         "seed": peer.seed,
         "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
-        "identify": {"confidence": options["confidence"], "tolerance": options["tolerance"]},
+        "identify": {"confidence": options["confidence"], "tolerance": options["tolerance"]}
+        | ({} if model is None else {"model": model}),
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
 

@@ -64,6 +64,9 @@ def excitation_request(options: Resolved) -> ExcitationRequest:
         amplitude_rad_s=options["amplitude_rad_s"],
         offset_rad_s=options["offset_rad_s"],
         periods=options["periods"],
+        confidence=options["confidence"],
+        tolerance=options["tolerance"] if options.source("tolerance") != "default" else None,
+        max_time_s=options["max_time_s"],
     )
 
 

@@ -1,9 +1,9 @@
 """The error budget of J: what each thing that isn't known adds to the half-width, line by line.
 
-Unknowns are set free one group after another: J alone (noise), then friction, then the skew (timing), then the lags,
-then their structure; a line is what its group adds, in squares: √(h_n² − h_(n−1)²). So they add up to the interval,
-and the last is what a drive that stated its filters would save. The order is that from what no manual could
-tell to what it could.
+Unknowns are set free one group after another: J alone (noise), then the skew (timing), the lags, the friction, and last
+the structure of the lags; a line is what its group adds, in squares: √(h_n² − h_(n−1)²); they add up to the interval.
+Friction comes behind the lags since without them a line tells J and B apart by itself (imaginary and real part); it is
+lags that mix the two.
 """
 
 import math
@@ -28,10 +28,12 @@ def budget_of(
     grown = (
         ("noise", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing, *friction)),
          "scatter from period to period, everything else known"),
-        ("friction", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing)),
-         "viscous friction" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
-        ("timing", half_width_first_order(fitted, INERTIA, confidence, lags), "skew between speed and torque"),
-        ("lags", half_width_first_order(fitted, INERTIA, confidence), "time constants of the reports' filters"),
+        ("timing", half_width_first_order(fitted, INERTIA, confidence, (*lags, *friction)),
+         "skew between speed and torque"),
+        ("lags", half_width_first_order(fitted, INERTIA, confidence, friction),
+         "time constants of the reports' filters"),
+        ("friction model", half_width_first_order(fitted, INERTIA, confidence),
+         "its slope" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
         ("lag structure", half, "filters of two poles, moving averages"),
     )
     found, before = [], 0.0

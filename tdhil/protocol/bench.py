@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Protocol, TypeVar
 
 from drivers.drive import Command, Drive, Mode, PowerState, Sample
@@ -13,6 +14,12 @@ from tdhil.protocol.guard import Guard
 from tdhil.protocol.settings import StopRequest
 
 T = TypeVar("T")
+
+ALIVE_S = 0.2
+"""Wall time between two signs of life in stepped time; a simulated peer gives a host a second."""
+
+SWITCH_S = 0.0005
+"""How long arithmetic beside the control loop may keep the interpreter to itself."""
 
 
 class RunLog(Protocol):
@@ -108,14 +115,36 @@ class Bench:
         )
 
     def compute(self, work: Callable[[], T], command: Command) -> T:
-        """Do a longer piece of arithmetic without letting the drive starve of setpoints.
+        """Do a longer piece of arithmetic while the drive keeps getting one command."""
+        return self.compute_while(work, lambda: self.cycle(command))
 
-        In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat.
+    def compute_while(self, work: Callable[[], T], cycle: Callable[[], object]) -> T:
+        """Do a longer piece of arithmetic without letting the drive starve of setpoints: ``cycle`` is one of them.
+
+        In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
+        there, signs of life that move no time on are all that goes out. In real time the arithmetic has to hand over
+        the interpreter sooner than usual, or cycles would come late.
         """
-        if self.drive.clock.stepped:
-            return work()
-        with ThreadPoolExecutor(max_workers=1) as pool:
-            future = pool.submit(work)
-            while not future.done():
-                self.cycle(command)
-            return future.result()
+        stepped = self.drive.clock.stepped
+        usual_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(usual_s, SWITCH_S))
+        try:
+            with ThreadPoolExecutor(max_workers=1) as pool:
+                future = pool.submit(work)
+                while not future.done():
+                    if stepped:
+                        self._wait_alive(future)
+                    else:
+                        cycle()
+                return future.result()
+        finally:
+            sys.setswitchinterval(usual_s)
+
+    def _wait_alive(self, future: Future[T]) -> None:
+        """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
+        if self._stop_request.signum is not None:
+            raise Interrupted(self._stop_request.signum)
+        wait([future], timeout=ALIVE_S)
+        keep_alive = getattr(self.drive, "keep_alive", None)
+        if keep_alive is not None and not future.done():
+            keep_alive()

@@ -68,6 +68,10 @@ class Guard:
         """The time limit counts from here."""
         self._started_s = time_s
 
+    def left_s(self, time_s: float) -> float:
+        """What the time limit leaves, s."""
+        return self._limits.time_s - (0.0 if self._started_s is None else time_s - self._started_s)
+
     def check_sample(self, command: Command, sample: Sample) -> None:
         """Raise what the sample shows: CommunicationLost, DriveFault or LimitHit."""
         self._check_age(sample)

@@ -16,8 +16,11 @@ from tdhil.errors import Interrupted
 from tdhil.protocol import excitation
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.control import MeanSpeedControl
-from tdhil.protocol.excitation import ExcitationWish, Plan, PlanRefused, RigGuess, make_plan
+from tdhil.protocol.design import Knowledge, assumed_noise, measured_noise
+from tdhil.protocol.enough import Decision, Enough
+from tdhil.protocol.excitation import Plan, PlanRefused, RigGuess
 from tdhil.protocol.guard import Guard
+from tdhil.protocol.planning import Planned, plan_acquisition
 from tdhil.protocol.settings import ControlAssumptions, ExcitationRequest, MachineLimits, StopRequest
 from tdhil.protocol.stage_acquire import run_acquire
 from tdhil.protocol.stage_hold import run_hold
@@ -29,6 +32,9 @@ from tdhil.record.recording import Excitation, LagPrior, Ramp, Stage
 from tdhil.record.run_log import RunLog
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
+
+RESERVE_S = 30.0
+"""Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
 
 TOLERATED_LOSS = 0.01
 """A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
@@ -51,6 +57,14 @@ class Display(Protocol):
     def stage_ended(self, stage: Stage) -> None: ...
 
     def stopped(self, confirmed: bool) -> None: ...
+
+
+Say = Callable[[str], None]
+"""Tells whoever watches one line."""
+
+
+def _nothing(text: str) -> None:
+    pass
 
 
 Confirm = Callable[["Task", Preflight, Idle], None]
@@ -94,10 +108,12 @@ class Runner:
         confirm: Confirm,
         *,
         reset_fault: bool = False,
+        say: Say = _nothing,
     ) -> None:
         self._drive = drive
         self._make_task = make_task
         self._reset_fault = reset_fault
+        self._say = say
         self._log = log
         self._stop_request = stop_request
         self._display = display
@@ -105,6 +121,7 @@ class Runner:
         self._stages: list[Stage] = []
         self._preflight: Preflight | None = None
         self._stop: StopSequence | None = None
+        self._prior = LagPrior()
 
     def run(self) -> RunOutcome:
         """Connect, five stages, stop, close."""
@@ -163,7 +180,8 @@ class Runner:
         else:
             self._skip("torque", bench, "speed mode")
         model = self._model(bench, speed, drifted)
-        plan = self._plan(task, bench, model, mode)
+        planned = self._plan(task, bench, speed, mode)
+        plan = planned.plan
         control: MeanSpeedControl | None = None
         if drifted is not None:
             with self._stage("hold", 15.0):
@@ -172,9 +190,9 @@ class Runner:
                 run_hold(bench, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
         else:
             self._skip("hold", bench, "speed mode")
-        with self._stage("acquire", plan.duration_s + 10.0):
+        with self._stage("acquire", planned.duration_s + 10.0):
             announced = self._announcer(speed, ramps)
-            run_acquire(bench, limits, plan, control, announced)
+            run_acquire(bench, limits, plan, control, announced, self._enough(planned, bench))
 
     def _prepare(self) -> tuple[Task, Bench, Preflight]:
         identity = self._drive.connect()
@@ -195,11 +213,12 @@ class Runner:
             self._log.event(self._drive.clock.now_s(), "preflight", text)
         if preflight.refused:
             raise _refusal(preflight)
+        self._prior = _with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
         self._log.learn(
             speed_resolution_rad_s=preflight.speed_resolution_rad_s,
             torque_resolution_nm=preflight.torque_resolution_nm,
             torque_limit_nm=limits.torque_nm,
-            lag_prior=_with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters),
+            lag_prior=self._prior,
         )
         guard = Guard(
             limits,
@@ -219,29 +238,29 @@ class Runner:
             self._log.event(bench.now_s, "plan", text)
         return model
 
-    def _plan(self, task: Task, bench: Bench, model: RigGuess, mode: Mode) -> Plan:
-        request, limits = task.request, task.limits
-        offsets = None if request.offset_rad_s is None else (request.offset_rad_s,)
-        wish = ExcitationWish(
-            kind=request.kind,
-            mode=mode.value,
-            frequency_hz=request.frequency_hz,
-            amplitude_rad_s=request.amplitude_rad_s,
-            offsets_rad_s=offsets,
-            periods=request.periods,
-        )
+    def _plan(self, task: Task, bench: Bench, speed: SpeedResult, mode: Mode) -> Planned:
+        request, limits, model = task.request, task.limits, speed.model
         room = excitation.MachineLimits(
             limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
         )
         last = bench.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
         keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
+        left_s = bench.guard.left_s(bench.now_s) - RESERVE_S
+        assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
+        theta = Knowledge(assumed, self._prior).theta(model)
+
+        def work() -> Planned:
+            known = Knowledge(measured_noise(speed.steady, theta, assumed), self._prior)
+            return plan_acquisition(request, mode.value, room, model, known, left_s)
+
         try:
-            plan = bench.compute(lambda: make_plan(room, model, wish), keep)
+            planned = bench.compute(work, keep)
         except PlanRefused as error:
             raise PreflightRefused(
                 str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
             ) from error
+        plan = planned.plan
         self._display.planned(plan)
         self._log.event(
             bench.now_s,
@@ -249,7 +268,29 @@ class Runner:
             f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
         )
-        return plan
+        self._tell(bench, planned.said())
+        self._log.configure(plan=planned.plain())
+        if planned.stopping is not None:
+            self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})
+        return planned
+
+    def _tell(self, bench: Bench, text: str) -> None:
+        self._log.event(bench.now_s, "plan", text)
+        self._say(text)
+
+    def _enough(self, planned: Planned, bench: Bench) -> Enough | None:
+        """Asks the scatter, where a tolerance was given; every decision is in the log before it is carried out."""
+        rule = planned.stopping
+        if rule is None:
+            return None
+        told: list[dict[str, Any]] = []
+
+        def note(decision: Decision) -> None:
+            told.append(decision.plain())
+            self._log.configure(stopping=rule.plain() | {"decisions": list(told)})
+            self._tell(bench, decision.why)
+
+        return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
 
     def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
         return lambda motion: self._log.motion(motion, speed.levels, ramps)

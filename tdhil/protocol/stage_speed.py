@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from drivers.drive import Command, Mode, Sample
 from drivers.errors import DriveFault
 from tdhil.identify.rough import RoughInertia, rough_inertia
+from tdhil.identify.samples import Samples
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
@@ -37,6 +38,7 @@ class SpeedResult:
     rough: RoughInertia
     ramp: Ramp
     last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
+    steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -94,8 +96,19 @@ def run_speed(
     )
     bench.guard.model = model
     return SpeedResult(
-        low, high, model, rough, Ramp(low.level.end_s, high.level.start_s), tuple(high_samples[-bench.cycles(0.5) :])
+        low,
+        high,
+        model,
+        rough,
+        Ramp(low.level.end_s, high.level.start_s),
+        tuple(high_samples[-bench.cycles(0.5) :]),
+        tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
     )
+
+
+def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:
+    fresh = trace(held)
+    return Samples(fresh.time_s, fresh.speed_rad_s, fresh.torque_nm - torque_offset_nm)
 
 
 def _in_torque(bench: Bench) -> bool:

@@ -1,6 +1,7 @@
 """One cycle: guard, drive, log, guard, display; and what the helpers around it wait for."""
 
 import signal
+import threading
 import time
 
 import pytest
@@ -133,3 +134,20 @@ def test_arithmetic_takes_no_cycles_in_stepped_time_and_feeds_the_drive_in_real_
     assert here.drive.cycles >= 3
     with pytest.raises(ZeroDivisionError):
         here.bench.compute(lambda: 1 // 0, REST)
+
+
+def test_in_stepped_time_a_long_computation_gives_signs_of_life_and_no_cycle(world):
+    """A peer in another process takes a silent host for a dead one, and runs on by itself."""
+    here = world()
+    alive = threading.Event()
+    here.drive.keep_alive = alive.set
+    assert here.bench.compute(lambda: alive.wait(60.0), REST)
+    assert here.drive.cycles == 0
+    assert here.bench.compute(lambda: "done", REST) == "done"
+
+
+def test_a_stop_request_ends_the_wait_for_a_computation(world):
+    here = world()
+    here.stop_request.ask(2)
+    with pytest.raises(Interrupted):
+        here.bench.compute(lambda: time.sleep(0.05), REST)

@@ -54,6 +54,7 @@ run:
   log: here.mcap
   plant: plant.yaml
   trace: shaft.csv
+  max_time_s: 300
 """
 
 

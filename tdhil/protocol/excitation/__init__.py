@@ -2,10 +2,12 @@
 
 from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, PlanRefused, RigGuess
 from tdhil.protocol.excitation.periodic import PeriodicReference
-from tdhil.protocol.excitation.plan import ExcitationWish, Plan, PlannedSegment, make_plan
+from tdhil.protocol.excitation.plan import LEAST_COUNTED, ExcitationWish, Plan, PlannedSegment, make_plan
+from tdhil.protocol.excitation.shape import Shape
 from tdhil.protocol.excitation.transition import Transition, make_transition
 
 __all__ = [
+    "LEAST_COUNTED",
     "DriveMode",
     "ExcitationWish",
     "MachineLimits",
@@ -14,6 +16,7 @@ __all__ = [
     "PlanRefused",
     "PlannedSegment",
     "RigGuess",
+    "Shape",
     "Transition",
     "make_plan",
     "make_transition",

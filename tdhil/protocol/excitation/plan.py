@@ -1,7 +1,7 @@
 """Scale an excitation to the rig's speed window and torque limit, or refuse it before anything moves."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ from tdhil.record.recording import Segment
 ExcitationKind = Literal["multisine", "sine", "step"]
 
 _OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
+LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
 _SETTLE_S = 10.0         # at least this long before the first period that counts
 _SINGLE_TONE_S = 100.0   # shortest useful measurement of one tone
 
@@ -26,7 +27,8 @@ class ExcitationWish:
 
     ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
     deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
-    settling included.
+    settling included. ``shape``: other lines for the multisine than its own; ``offset_share`` of the usable window: how
+    far apart two mean speeds of the plan's own choice are at least (friction's lever).
     """
 
     kind: ExcitationKind = "multisine"
@@ -35,6 +37,8 @@ class ExcitationWish:
     amplitude_rad_s: float | None = None
     offsets_rad_s: tuple[float, ...] | None = None
     periods: int | None = None
+    shape: Shape | None = None
+    offset_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,11 @@ class Plan:
             for index, before in enumerate(self.segments[:-1])
         )
         return between + sum(segment.duration_s for segment in self.segments)
+
+    def with_counted(self, periods: int) -> "Plan":
+        """The same motion with so many periods that count at each mean speed, settling on top."""
+        segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
+        return replace(self, segments=segments)
 
     def transition(self, from_rad_s: float, index: int) -> Transition:
         """From a speed to the start of segment ``index``."""
@@ -205,6 +214,8 @@ def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
     frequency = default if wish.frequency_hz is None else wish.frequency_hz
     if not (math.isfinite(frequency) and frequency > 0.0):
         raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
+    if wish.shape is not None:
+        return wish.shape, frequency
     return make(), frequency
 
 
@@ -217,7 +228,7 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
         return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))
     # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
     counted = (multisine.DEFAULT_PERIODS - 1) / multisine.DEFAULT_FREQUENCY_HZ
-    return settle + max(6, math.ceil(counted / period_s - 1e-9))
+    return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
 
 
 def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tuple[float, ...]]:
@@ -248,7 +259,8 @@ def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
     span = (fit.foreseen + fit.down) * fit.swing
     if wish.kind == "sine":
         return (low + (high - low) * fit.down / (fit.foreseen + fit.down),)
-    amplitude = (1.0 - _OFFSET_SHARE) * (high - low) / span
+    share = _OFFSET_SHARE if wish.offset_share is None else wish.offset_share
+    amplitude = (1.0 - share) * (high - low) / span
     torque_room = fit.limits.usable_torque_nm - max(fit.guess.steady_torque_nm(low), fit.guess.steady_torque_nm(high))
     torque_swing = max(fit.torque_up, fit.torque_down) * fit.guess.torque_swing_factor(fit.mode)
     if torque_room <= 0.0:

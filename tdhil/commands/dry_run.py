@@ -1,0 +1,220 @@
+"""`tdhil identify --dry-run`: the plan and what may be expected of it. Connects to nothing, moves nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from drivers.drive import Identity
+from drivers.errors import PreflightRefused
+from tdhil import __version__
+from tdhil.commands.task import bench_of, excitation_request, lag_prior, machine_limits
+from tdhil.options import Resolved
+from tdhil.rig import Rig
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tdhil.protocol.excitation import RigGuess
+    from tdhil.protocol.planning import Planned
+    from tdhil.protocol.settings import MachineLimits
+
+SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
+VISCOUS_SHARE = 0.2         # assumed friction at the highest speed, of the torque limit, …
+COULOMB_SHARE = 0.15        # … and at standstill
+BEFORE_ACQUIRE_S = 90.0     # stages 1 to 4, about
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One thing that the plan rests on. ``source``: assumed, or where it stands in rig.yaml."""
+
+    name: str
+    value: float
+    unit: str
+    source: str
+
+    @property
+    def text(self) -> str:
+        return f"{self.value:.4g} {self.unit}"
+
+
+def dry_run(options: Resolved, rig: Rig | None, simulated: bool) -> int:
+    """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would."""
+    planned, figures, limits = plan_dry(options, rig, simulated)
+    if options["json"]:
+        json.dump(document(planned, figures, limits), sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+        sys.stdout.write("\n")
+        return 0
+    from rich.console import Console
+
+    show(planned, figures, limits, Console(highlight=False))
+    return 0
+
+
+def plan_dry(
+    options: Resolved, rig: Rig | None, simulated: bool
+) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
+    """The plan, what it rests on, and the machine's limits."""
+    from tdhil.protocol import excitation
+    from tdhil.protocol.design import Knowledge, assumed_noise
+    from tdhil.protocol.excitation import PlanRefused
+    from tdhil.protocol.guard import Guard
+    from tdhil.protocol.planning import plan_acquisition
+    from tdhil.protocol.settings import ControlAssumptions
+
+    bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
+    limits = machine_limits(bench)
+    guess, figures = _guess(bench, limits)
+    stated = bench.expected.load_noise_nm
+    noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
+    known = Knowledge(noise, lag_prior(bench))
+    figures += (
+        Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),
+        Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
+        Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
+    )
+    room = excitation.MachineLimits(
+        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(ControlAssumptions())
+    )
+    left_s = limits.time_s - BEFORE_ACQUIRE_S
+    try:
+        planned = plan_acquisition(
+            excitation_request(options), options["mode"] or "torque", room, guess, known, left_s
+        )
+    except PlanRefused as error:
+        raise PreflightRefused(
+            str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
+        ) from error
+    return planned, figures, limits
+
+
+def _guess(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, tuple[Figure, ...]]:
+    """What rig.yaml expects of the shaft; for the rest, a shaft that suits its drive."""
+    from tdhil.protocol.excitation import RigGuess
+
+    expected = bench.expected
+    window = limits.speed_max_rad_s - limits.speed_min_rad_s
+    inertia = expected.inertia_kg_m2 or SPIN_UP_S * limits.torque_nm / window
+    viscous, coulomb = expected.viscous_nm_s_rad, expected.coulomb_nm
+    viscous = VISCOUS_SHARE * limits.torque_nm / limits.speed_max_rad_s if viscous is None else viscous
+    coulomb = COULOMB_SHARE * limits.torque_nm if coulomb is None else coulomb
+    return RigGuess(inertia, viscous, coulomb), (
+        Figure("moment of inertia", inertia, "kg·m²", _source(bench, "expected.inertia_kg_m2")),
+        Figure("viscous friction", viscous, "N·m·s/rad", _source(bench, "expected.viscous_nm_s_rad")),
+        Figure("Coulomb friction", coulomb, "N·m", _source(bench, "expected.coulomb_nm")),
+    )
+
+
+def _source(bench: Rig, at: str) -> str:
+    return "assumed" if bench.get(at) is None else bench.source(at) or "rig.yaml"
+
+
+def document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
+    """The plan as plain data."""
+    plan, stopping = planned.plan, planned.stopping
+    return {
+        "dry_run": True,
+        "excitation": plan.kind,
+        "mode": plan.mode,
+        "segments": [
+            {
+                "offset_rad_s": one.reference.offset_rad_s,
+                "period_s": one.reference.period_s,
+                "periods": one.periods,
+                "settle_periods": one.settle_periods,
+                "lines_hz": list(one.reference.lines_hz),
+                "amplitudes_rad_s": list(one.reference.amplitudes_rad_s),
+            }
+            for one in plan.segments
+        ],
+        "duration_s": planned.duration_s,
+        "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
+        "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
+        "limits": {
+            "speed_min_rad_s": limits.speed_min_rad_s,
+            "speed_max_rad_s": limits.speed_max_rad_s,
+            "torque_nm": limits.torque_nm,
+        },
+        "rests_on": [asdict(figure) for figure in figures],
+        "expected_half_width": planned.half_width if math.isfinite(planned.half_width) else None,
+        "stopping": None if stopping is None else stopping.plain(),
+        "tdhil": __version__,
+    }
+
+
+def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, console: Console) -> None:
+    """Tables for people, in 80 columns."""
+    from rich.text import Text
+
+    console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
+    console.print(_motion_table(planned, limits))
+    console.print(_lines_table(planned))
+    console.print(_figures_table(figures))
+    for text in _conclusions(planned):
+        console.print(Text(text))
+
+
+def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
+    plan, table = planned.plan, _table(f"stage 5: {planned.plan.kind} in {planned.plan.mode} mode")
+    for heading in ("", "planned", "limit"):
+        table.add_column(heading, overflow="fold")
+    table.add_row(
+        "speed, rad/s", f"{plan.speed_min_rad_s:.3g} to {plan.speed_max_rad_s:.3g}",
+        f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g}",
+    )
+    table.add_row(
+        "torque, N·m", f"{plan.torque_min_nm:.3g} to {plan.torque_max_nm:.3g}", f"±{limits.torque_nm:g}"
+    )
+    table.add_row("time, s", f"{planned.duration_s:.0f} (+ about {BEFORE_ACQUIRE_S:.0f})", f"{limits.time_s:g}")
+    for one in plan.segments:
+        counted = f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle"
+        table.add_row(f"at {one.reference.offset_rad_s:.3g} rad/s", counted, "")
+    return table
+
+
+def _lines_table(planned: Planned) -> Table:
+    reference, table = planned.plan.segments[0].reference, _table("lines")
+    table.add_column("Hz", justify="right")
+    table.add_column("amplitude, rad/s", justify="right")
+    for hertz, amplitude in zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True):
+        table.add_row(f"{hertz:.4g}", f"{amplitude:.3g}")
+    return table
+
+
+def _figures_table(figures: tuple[Figure, ...]) -> Table:
+    table = _table("it rests on")
+    for heading in ("", "value", "from"):
+        table.add_column(heading, overflow="fold")
+    for figure in figures:
+        assumed = figure.source == "assumed"
+        table.add_row(figure.name, figure.text, "[yellow]assumed[/]" if assumed else figure.source)
+    return table
+
+
+def _conclusions(planned: Planned) -> list[str]:
+    from tdhil.protocol.planning import NOTHING_TO_EXPECT
+
+    stopping = planned.stopping
+    if not math.isfinite(planned.half_width):
+        return [NOTHING_TO_EXPECT]
+    found = [f"expected interval of J: ±{100.0 * planned.half_width:.2g} % after {planned.duration_s:.0f} s"]
+    if stopping is not None and not stopping.reachable:
+        found.append(f"±{100.0 * stopping.tolerance:.3g} % is not to be expected: {stopping.advice}")
+    elif stopping is not None:
+        found.append(
+            f"±{100.0 * stopping.tolerance:.3g} % asked for: a pilot of {stopping.pilot_periods} periods at each mean "
+            f"speed, some {stopping.expected_periods} in all; the scatter decides"
+        )
+    found.append("A run measures friction, inertia and noise first, and plans again from that.")
+    return found
+
+
+def _table(title: str) -> Table:
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left", expand=False)

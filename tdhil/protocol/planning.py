@@ -1,0 +1,176 @@
+"""The plan of stage 5, and of when it ends: from what is asked for and what stages 2 and 3 have shown. Pure.
+
+Without a tolerance the motion is planned for a fixed time. With one, a pilot is planned from what the noise leads to
+expect, and everything after it is decided by its scatter (`design.stopping`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from tdhil.protocol.design.choose import Choice, Knowledge, choose
+from tdhil.protocol.design.expected import Evidence, half_width, longer
+from tdhil.protocol.design.predicted import predicted
+from tdhil.protocol.design.stopping import MARGIN, interval_confidence, least_scale
+from tdhil.protocol.excitation import LEAST_COUNTED, ExcitationWish, MachineLimits, Plan, RigGuess
+from tdhil.protocol.settings import ExcitationRequest
+
+NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
+_PILOT_SHARE = 0.6        # of the periods that are expected to be needed: the rest is decided by the pilot's scatter
+_EVER = 1000.0            # times as long: what is open then stays open
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
+
+    ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
+    """
+
+    tolerance: float
+    confidence: float
+    pilot_dof: float
+    pilot_periods: int
+    expected_periods: int
+    allowed_s: float
+    reachable: bool
+    advice: str = ""
+
+    def working(self, seen: int) -> float:
+        """Of the interval that is looked at after ``seen`` others."""
+        return interval_confidence(self.confidence, self.pilot_dof, seen)
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The plan (with a stopping rule: its pilot), and the relative half-width of J that may be expected at the end."""
+
+    plan: Plan
+    known: Knowledge
+    half_width: float
+    usual_half_width: float
+    stopping: Stopping | None = None
+    duration_s: float = 0.0
+
+    def said(self) -> str:
+        """One line for whoever watches."""
+        if not math.isfinite(self.half_width):
+            return NOTHING_TO_EXPECT
+        noise = f"noise {self.known.noise.source}"
+        expected = f"expected interval of J: ±{100.0 * self.half_width:.2g} % after {self.duration_s:.0f} s ({noise})"
+        if self.stopping is None or self.stopping.reachable:
+            return expected
+        return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        return {
+            "expected_half_width": _finite(self.half_width),
+            "usual_half_width": _finite(self.usual_half_width),
+            "duration_s": self.duration_s,
+            "noise": asdict(self.known.noise),
+            "guess": asdict(self.plan.guess),
+        }
+
+
+def wish_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
+    """The request as the excitation room takes it."""
+    return ExcitationWish(
+        kind=request.kind,
+        mode="speed" if mode == "speed" else "torque",
+        frequency_hz=request.frequency_hz,
+        amplitude_rad_s=request.amplitude_rad_s,
+        offsets_rad_s=None if request.offset_rad_s is None else (request.offset_rad_s,),
+        periods=request.periods,
+    )
+
+
+def adaptive(request: ExcitationRequest) -> bool:
+    """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor for a single tone."""
+    return request.tolerance is not None and request.periods is None and request.kind != "sine"
+
+
+def plan_acquisition(
+    request: ExcitationRequest, mode: str, limits: MachineLimits, guess: RigGuess, known: Knowledge, left_s: float
+) -> Planned:
+    """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
+    wish = wish_of(request, mode)
+    allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
+    if not adaptive(request):
+        chosen = choose(limits, guess, wish, known, request.confidence, request.max_time_s)
+        return Planned(chosen.plan, known, chosen.half_width, chosen.usual_half_width, None, chosen.plan.duration_s)
+    chosen = choose(limits, guess, wish, known, request.confidence)
+    if chosen.plan.duration_s > allowed_s:
+        chosen = choose(limits, guess, wish, known, request.confidence, allowed_s)
+    return _with_pilot(request, chosen, known, allowed_s)
+
+
+def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float) -> Planned:
+    """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
+    assert request.tolerance is not None
+    theta = known.theta(chosen.plan.guess)
+    least = chosen.plan.with_counted(LEAST_COUNTED)
+    evidence = predicted(least, theta, known.noise, known.prior)
+    working = interval_confidence(request.confidence, pilot_dof(least), 0)
+    most = max(LEAST_COUNTED, counted_in(chosen.plan, allowed_s))
+    scale, half, enough = least_scale(
+        lambda times: half_width(longer(evidence, times), working), request.tolerance / MARGIN, most / LEAST_COUNTED
+    )
+    periods = min(most, math.ceil(scale * LEAST_COUNTED - 1e-6))
+    pilot = max(LEAST_COUNTED, math.floor(_PILOT_SHARE * periods))
+    plan = chosen.plan.with_counted(pilot)
+    stopping = Stopping(
+        tolerance=request.tolerance,
+        confidence=request.confidence,
+        pilot_dof=pilot_dof(plan),
+        pilot_periods=pilot,
+        expected_periods=periods,
+        allowed_s=allowed_s,
+        reachable=enough,
+        advice="" if enough else _advice(evidence, working, request.tolerance, known),
+    )
+    after_pilot = extension_s(plan, periods - pilot) if periods > pilot else 0.0
+    return Planned(plan, known, half, chosen.usual_half_width, stopping, plan.duration_s + after_pilot)
+
+
+def pilot_dof(plan: Plan) -> float:
+    """Real degrees of freedom of a line's variance: two for every period but the first of each segment."""
+    return 2.0 * sum(segment.periods - segment.settle_periods - 1 for segment in plan.segments)
+
+
+def extension_s(plan: Plan, periods: int) -> float:
+    """So many more periods at each mean speed: on from the last one, then back to the others, which settle anew."""
+    others = plan.segments[:-1]
+    again = sum(one.settle_periods * one.reference.period_s for one in others)
+    ways = sum(
+        plan.transition(plan.segments[-1].reference.start_speed_rad_s, index).duration_s
+        for index in range(len(others))
+    )
+    return again + ways + periods * sum(one.reference.period_s for one in plan.segments)
+
+
+def counted_in(plan: Plan, time_s: float) -> int:
+    """How many periods that count at each mean speed fit into a time, with a pilot and one extension."""
+    period = sum(one.reference.period_s for one in plan.segments)
+    return math.floor((time_s - plan.with_counted(0).duration_s - extension_s(plan, 0)) / period + 1e-9)
+
+
+def _advice(evidence: Evidence, confidence: float, tolerance: float, known: Knowledge) -> str:
+    """What would bring the tolerance within reach."""
+    ever = half_width(longer(evidence, _EVER), confidence)
+    if ever > tolerance:
+        lags = "state the drive's filters on reported speed and torque (drive_data in rig.yaml)"
+        known_lags = known.prior.speed_lag_s is not None and known.prior.torque_lag_s is not None
+        what = "state them more exactly" if known_lags else lags
+        return f"the lags leave ±{100.0 * ever:.2g} % open however long it takes; {what}, or set both filters equal"
+    return "allow more time (--max-time, limits.time_s), a wider speed window or more torque"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

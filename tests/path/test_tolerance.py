@@ -1,0 +1,117 @@
+"""`--tolerance`, `--max-time` and `--dry-run` as their users meet them."""
+
+import pytest
+from path_runs import Shaft, identify, tdhil
+
+from tdhil.commands.quantities import seconds, share
+from tdhil.record.reader import read_run
+
+
+def half_width(document):
+    inertia = document["inertia_kg_m2"]
+    return 0.5 * (inertia["high"] - inertia["low"]) / inertia["value"]
+
+
+def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--seed", 2, "--tolerance", "1%", "--trace", trace)
+    assert done.code == 0, done.err
+    document = done.document
+    assert document["verdict"] == "valid"
+    assert half_width(document) <= 0.01
+    inertia = document["inertia_kg_m2"]
+    assert inertia["low"] <= 104.0 <= inertia["high"]
+    assert inertia["confidence"] == 0.95
+    assert "expected interval of J" in done.err.replace("\n", " ")
+    assert "scatter says" in done.err.replace("\n", " ") or "the interval is" in done.err.replace("\n", " ")
+    stopping = read_run(done.log).configuration["stopping"]
+    assert stopping["tolerance"] == 0.01
+    assert stopping["decisions"][-1]["periods"] == 0
+    assert stopping["decisions"][-1]["working_confidence"] > 0.95      # what looking costs
+    Shaft.read(trace).assert_at_rest()
+
+    replayed = tdhil("replay", "--json", done.log)
+    assert replayed.document == document
+
+
+def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
+    assert done.code == 0, done.err
+    assert done.document["verdict"] == "valid_wide"
+    said = done.err.replace("\n", " ")
+    assert said.index("is not to be expected") < said.index("stage acquire")
+    assert done.document["advice"] == read_run(done.log).configuration["stopping"]["advice"]
+    acquire = done.document["stages"][-1]
+    assert acquire["duration_s"] <= 160.0
+
+
+def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--tolerance", "0.1%", "--periods", 4)
+    assert done.code == 0, done.err
+    assert done.document["verdict"] == "valid_wide"
+    assert done.document["periods_used"] == 6
+    assert "stopping" not in read_run(done.log).configuration
+
+
+# -- dry run -------------------------------------------------------------------------------------------------
+
+
+def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("expected: {inertia_kg_m2: 90.0, load_noise_nm: 4.0}\n")
+    done = tdhil("identify", "--dry-run", "--rig", rig, "--json")
+    assert done.code == 0, done.err
+    document = done.document
+    assert document["dry_run"] is True
+    source = {figure["name"]: figure["source"] for figure in document["rests_on"]}
+    assert source["moment of inertia"] == source["disturbing torque (sd)"] == "rig.yaml:1"
+    assert source["viscous friction"] == source["lag of reported speed"] == "assumed"
+    assert 0.0 < document["expected_half_width"] < 0.05
+    assert document["limits"]["speed_max_rad_s"] > document["speed_rad_s"]["max"]
+    assert abs(document["torque_nm"]["max"]) < document["limits"]["torque_nm"]
+    assert {len(one["lines_hz"]) - len(one["amplitudes_rad_s"]) for one in document["segments"]} == {0}
+    assert list(tmp_path.iterdir()) == [rig]
+
+
+def test_a_dry_run_is_readable_in_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    done = tdhil("identify", "--dry-run", "--tolerance", "2%")
+    assert done.code == 0
+    assert max(map(len, done.out.splitlines())) <= 80
+    for wanted in ("DRY RUN", "nothing moves", "assumed", "expected interval of J", "±400", "rad/s", "pilot"):
+        assert wanted in done.out
+
+
+def test_a_dry_run_refuses_what_a_run_would_refuse(tmp_path, monkeypatch):
+    assert "amplitude of 9" in tdhil("identify", "--dry-run", "--amplitude", 9).err
+    assert tdhil("identify", "--dry-run", "--max-time", 20).code == 4
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    done = tdhil("identify", "--dry-run")                    # something real, and no limits
+    assert done.code == 4
+    assert "limits" in done.err
+
+
+def test_one_tone_is_known_beforehand_to_tell_nothing():
+    done = tdhil("identify", "--dry-run", "--excitation", "sine")
+    assert done.code == 0
+    assert "no interval of J is to be expected" in done.out.replace("\n", " ")
+
+
+# -- quantities ----------------------------------------------------------------------------------------------
+
+
+def test_quantities_as_people_type_them():
+    assert share("1%") == share(" 0.01 ") == 0.01
+    assert share("0.35 %") == 0.0035
+    assert [seconds(text) for text in ("300", "300s", "5min", "0.5h")] == [300.0, 300.0, 300.0, 1800.0]
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--tolerance", "x%"), ("--tolerance", "100%"), ("--tolerance", "0"), ("--max-time", "5 parsecs"),
+                  ("--max-time", "-1"), ("--max-time", "nan")]
+)
+def test_what_is_no_quantity_is_a_wrong_command_line(arguments):
+    done = tdhil("identify", "--simulate", *arguments)
+    assert done.code == 2
+    assert arguments[0] in done.err
