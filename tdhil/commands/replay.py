@@ -89,7 +89,8 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
         console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
     print_result(document, namespace.json)
     save_report(document, found.recording, namespace.report)
-    return int(code if found.recording.complete or code is not ExitCode.OK else ExitCode.PARTIAL)
+    whole = found.recording.complete and all(stage.outcome != "aborted" for stage in found.recording.stages)
+    return int(code if whole or code is not ExitCode.OK else ExitCode.PARTIAL)
 
 
 def _run_trace(namespace: argparse.Namespace, path: Path) -> int:

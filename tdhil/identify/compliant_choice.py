@@ -69,6 +69,11 @@ def choose(
         forced = fit_compliant(TwoMassShaft() if asked == "two-mass" else StringShaft(), lines, tie, priors, held)
         return Chosen(forced, rejected=rejects(forced.residual))
     two = fit_compliant(TwoMassShaft(), lines, tie, priors, held)
+    if two.residual is None:      # a shaft taken in place of one that was contradicted must be one that could be, too
+        return Refusal(
+            f"{len(lines)} excited lines leave nothing to test two masses on a spring with",
+            "excite more lines about two mean speeds, from well below the resonance to well above it",
+        )
     if _refuse_count(StringShaft(), lines, tie, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
     string = fit_compliant(StringShaft(), lines, tie, priors, held, two)

@@ -13,7 +13,7 @@ from tdhil.identify.identification import Estimate, ResidualTest
 from tdhil.identify.interval import estimate
 from tdhil.identify.likelihood import GaussianPrior, Likelihood
 from tdhil.identify.model import Model
-from tdhil.identify.residual import residual_test
+from tdhil.identify.residual import fitted_count, residual_test
 from tdhil.identify.shaft import INERTIA, VISCOUS, RigidShaft
 from tdhil.identify.spectrum import Line
 from tdhil.identify.string_shaft import STRING_SHARE, StringShaft
@@ -79,7 +79,9 @@ def fit_compliant(
     if near is not None:
         starts = [np.insert(near.fitted.simple.theta, STRING_SHARE, _LIGHT), *starts]
     fitted = fit_model(lines, model, tie, priors, held, starts, problem)
-    return CompliantFit(fitted, residual_test(problem, fitted.whole.theta, len(fitted.free)))
+    return CompliantFit(fitted, residual_test(
+        problem, fitted.whole.theta, fitted_count(fitted.whole.theta, fitted.free, fitted.limits)
+    ))
 
 
 def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:

@@ -10,7 +10,7 @@ from tdhil.identify.friction import Levels, coulomb_level
 from tdhil.identify.identification import BudgetLine, Compliant, Estimate
 from tdhil.identify.interval import half_width_first_order
 from tdhil.identify.profile import standard_deviation, student_quantile
-from tdhil.identify.rigid_result import _lags
+from tdhil.identify.rigid_result import lags_of
 from tdhil.identify.shaft import INERTIA, VISCOUS
 from tdhil.identify.string_shaft import STRING_SHARE
 from tdhil.identify.two_mass import DAMPING, LOAD, LOAD_VISCOUS, SWING
@@ -42,7 +42,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     """Of the model that stands; where two masses stand, their intervals hold what a string would say too."""
     alone = intervals(chosen.fit, confidence)
     held = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
-    speed_lag, torque_lag, skew = _lags(chosen.fit.fitted, confidence)
+    speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
     return CompliantResult(
         inertia=held.inertia,
         shaft=Compliant(

@@ -104,7 +104,8 @@ class Compliant:
     """A shaft that is not rigid: what turns behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
     ``total_inertia`` is J_r + J_L, known even where the two can't be told apart. A quantity that the data leave open is
-    None. ``antiresonance_hz``: where torque moves the motor most easily; ``resonance_hz``: where the load alone swings.
+    None. ``antiresonance_hz``: √(k/J_L)/2π, where the load swings and torque hardly moves the motor; ``resonance_hz``:
+    where little torque moves both much.
     """
 
     total_inertia: Estimate

@@ -12,7 +12,7 @@ from tdhil.identify.interval import estimate, first_order_estimate
 from tdhil.identify.likelihood import GaussianPrior, Likelihood
 from tdhil.identify.model import Model
 from tdhil.identify.profile import standard_deviation, student_quantile
-from tdhil.identify.residual import rejects, residual_test
+from tdhil.identify.residual import fitted_count, rejects, residual_test
 from tdhil.identify.shaft import INERTIA, VISCOUS
 from tdhil.identify.spectrum import Line
 from tdhil.identify.structure import Fitted, fit_model
@@ -48,12 +48,14 @@ def fit_rigid(
     model = Model()
     problem = Likelihood(lines, model, tie, priors)
     fitted = fit_model(lines, model, tie, priors, held, rigid_starts(problem), problem, rigid_rivals)
-    residual = residual_test(problem, fitted.whole.theta, len(fitted.free))
+    residual = residual_test(
+        problem, fitted.whole.theta, fitted_count(fitted.whole.theta, fitted.free, fitted.limits)
+    )
     if rejects(residual):            # then no interval will be shown, and none is sought
         return _bare(fitted, residual)
     inertia = estimate(fitted, INERTIA, confidence)
     viscous = estimate(fitted, VISCOUS, confidence)
-    speed_lag, torque_lag, skew = _lags(fitted, confidence)
+    speed_lag, torque_lag, skew = lags_of(fitted, confidence)
     return RigidResult(
         inertia=inertia,
         viscous=viscous,
@@ -78,7 +80,7 @@ def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
     )
 
 
-def _lags(fitted: Fitted, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
+def lags_of(fitted: Fitted, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
     """Delay of slow motion in either report, and what torque is late besides.
 
     Where first-order lags are the answer, their intervals are those of first-order lags. The whole family counts half

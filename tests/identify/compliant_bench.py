@@ -20,7 +20,7 @@ LINES = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9)
 PHASES = (0.3, 2.1, 5.2, 1.1, 3.9, 0.2, 4.4, 2.7, 5.9, 1.6, 3.3)
 OFFSETS = (3.2, 5.7)
 FADE_S = 20.0                          # the excitation grows over so long, for a swing takes minutes to die down
-MOST_SWING_RAD_S = 0.6                 # of the load, at one line
+MOST_SWING_RAD_S = 0.8                 # of the load, at one line
 SETTLE, USED = 4, 6                    # periods about each mean speed: 240 s used
 
 
