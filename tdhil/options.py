@@ -36,6 +36,7 @@ OPTIONS = (
     Option("periods", "--periods", "run.periods"),
     Option("tolerance", "--tolerance", "run.tolerance", 0.05),
     Option("max_time_s", "--max-time", "run.max_time_s"),
+    Option("model", "--model", "run.model", "auto"),
     Option("confidence", "--confidence", "run.confidence", 0.95),
     Option("seed", "--seed", "run.seed"),
     Option("simulate", "--simulate", "run.simulate", False),

@@ -108,6 +108,9 @@ class Run(DataModel):
     periods: int | None = Field(default=None, ge=1, le=10_000)
     tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
     max_time_s: Positive | None = Field(default=None, description="s; longest stage 5")
+    model: Literal["auto", "rigid", "two-mass", "string", "paper"] | None = Field(
+        default=None, description="of the shaft; auto: the simplest that fits"
+    )
     confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
     seed: int | None = Field(default=None, ge=0, le=2**63 - 1, description="repeats a simulated run")
     simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")

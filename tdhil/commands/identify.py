@@ -124,7 +124,7 @@ def _run(
     if (older := make_room(path)) is not None:
         console.print(f"an older {path} was kept as {older}", style="dim", markup=False)
     writer = RunWriter(path, epoch_ns=peer.epoch_ns, block=peer.stepped)
-    log = RunLog(writer, _configuration(options, bus, peer, rig, namespace.model))
+    log = RunLog(writer, _configuration(options, bus, peer, rig))
     rated_nm = rig.drive_data.rated_torque_nm if rig is not None else None
     trace = None if options["trace"] is None else Path(options["trace"])
     try:
@@ -223,9 +223,7 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     return int(code)
 
 
-def _configuration(
-    options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None, model: str | None
-) -> dict[str, Any]:
+def _configuration(options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
     """What the log keeps of how the run was set up; everything that identification needs is in it."""
     return {
         "tdhil": __version__,
@@ -235,8 +233,7 @@ def _configuration(
         "stepped": peer.stepped,
         "seed": peer.seed,
         "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
-        "identify": {"confidence": options["confidence"], "tolerance": options["tolerance"]}
-        | ({} if model is None else {"model": model}),
+        "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
 

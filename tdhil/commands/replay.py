@@ -9,6 +9,7 @@ from typing import Any
 
 from tdhil.commands.conclude import conclude, print_result, save_report
 from tdhil.commands.models import MODELS
+from tdhil.commands.quantities import share
 from tdhil.errors import ExitCode, UsageError
 from tdhil.record.errors import LogError
 
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
     parser.add_argument("--model", choices=MODELS, help="of the shaft (default: the run's, or auto)")
     parser.add_argument("--confidence", type=float, metavar="P", help="of the interval (default: the run's, or 0.95)")
-    parser.add_argument("--tolerance", type=float, metavar="SHARE",
+    parser.add_argument("--tolerance", type=share, metavar="SHARE",
                         help="half-width of the interval that is enough (default: the run's, or 0.05)")
     trace = parser.add_argument_group("a trace in CSV (a run.mcap brings all this along)")
     trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",

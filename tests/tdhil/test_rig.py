@@ -55,6 +55,7 @@ run:
   plant: plant.yaml
   trace: shaft.csv
   max_time_s: 300
+  model: two-mass
 """
 
 
