@@ -10,23 +10,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.identify.beside import with_second_look
-from tdhil.identify.compliant_choice import may_swing, usable_lines
-from tdhil.identify.compliant_verdict import identify_compliant
-from tdhil.identify.friction import Levels, ViscousTie, measure_levels, tie_viscous
-from tdhil.identify.friction_curve import friction_curve
-from tdhil.identify.friction_curve_points import Inertia
-from tdhil.identify.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
+from tdhil.identify.beside.friction_curve import friction_curve
+from tdhil.identify.beside.friction_curve_points import Inertia
+from tdhil.identify.beside.second_look import with_second_look
+from tdhil.identify.compliant.choice import may_swing, usable_lines
+from tdhil.identify.compliant.verdict import identify_compliant
+from tdhil.identify.faults.line_faults import hints, refuse_lines
+from tdhil.identify.faults.quality import Refusal, refuse_motion, refuse_samples
 from tdhil.identify.identification import Identification
-from tdhil.identify.likelihood import GaussianPrior
-from tdhil.identify.line_faults import hints, refuse_lines
+from tdhil.identify.lines.friction import Levels, ViscousTie, measure_levels, tie_viscous
+from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
+from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.rigid_result import RigidResult, fit_rigid
+from tdhil.identify.lines.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.identify.options import Options
 from tdhil.identify.paper_method import paper_estimate
-from tdhil.identify.quality import Refusal, refuse_motion, refuse_samples
 from tdhil.identify.record_route import identify_record
-from tdhil.identify.rigid_result import RigidResult, fit_rigid
 from tdhil.identify.samples import Samples, Stretch, excited_window, stretches, usable_samples
-from tdhil.identify.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.identify.verdict import Evidence, conclude, refused
 from tdhil.record.recording import Recording
 

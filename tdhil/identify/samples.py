@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.left_out import good_samples
+from tdhil.identify.faults.left_out import good_samples
 from tdhil.record.recording import FloatArray, Recording, Segment
 
 _LEAST_SHARE = 0.6        # of a period's samples that must be there

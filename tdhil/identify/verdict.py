@@ -3,17 +3,17 @@
 import math
 from dataclasses import dataclass
 
-from tdhil.identify.friction import ViscousTie
+from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.identification import Identification, InertiaEstimate, PaperEstimate, Verdict
-from tdhil.identify.likelihood import GaussianPrior
-from tdhil.identify.line_points import fitted_points
-from tdhil.identify.model import Model
+from tdhil.identify.lines.friction import ViscousTie
+from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.line_points import fitted_points
+from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.reports import SKEW
+from tdhil.identify.lines.residual import REJECT_P, rejects
+from tdhil.identify.lines.rigid_result import RigidResult, turned, widened
 from tdhil.identify.options import Options
-from tdhil.identify.profile import student_quantile
-from tdhil.identify.quality import Refusal
-from tdhil.identify.reports import SKEW
-from tdhil.identify.residual import REJECT_P, rejects
-from tdhil.identify.rigid_result import RigidResult, turned, widened
 from tdhil.record.recording import LagPrior, Recording
 
 _OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number

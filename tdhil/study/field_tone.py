@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.identify.identification import LineFit
+from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.paper_method import STEP_S, paper_estimate
 from tdhil.identify.samples import Samples, excited_window, stretches, usable_samples
-from tdhil.identify.spectrum import period_lines
 from tdhil.record.recording import FloatArray, Recording
 
 SETTLE_S = 10.0

@@ -9,12 +9,12 @@ from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from sim_bus.plant import Params
 from tdhil.identify import Options
-from tdhil.identify.friction import Levels, measure_levels
-from tdhil.identify.friction_curve import FrictionCurve, friction_curve
-from tdhil.identify.friction_curve_points import Inertia
-from tdhil.identify.momentum_fit import Delay
+from tdhil.identify.beside.friction_curve import FrictionCurve, friction_curve
+from tdhil.identify.beside.friction_curve_points import Inertia
+from tdhil.identify.beside.momentum_fit import Delay
+from tdhil.identify.lines.friction import Levels, measure_levels
+from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import stretches, usable_samples
-from tdhil.identify.spectrum import period_lines
 from tdhil.record.recording import Recording
 
 KNOWN = Inertia(104.0, 0.3, Delay(0.25, 0.02, True))

@@ -87,7 +87,7 @@ SMALL = np.array([1e-3, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])
 
 @pytest.mark.parametrize("u", (0.2, -0.3, 1e-6, 0.0))
 def test_jacobian_is_the_derivative(u):
-    from tdhil.identify.model import Model
+    from tdhil.identify.lines.model import Model
 
     s = 2j * np.pi * np.array([0.05, 0.2, 0.7])
     theta = THETA.copy()
@@ -106,7 +106,7 @@ def test_impedance_against_a_simulated_filter():
     """An independent oracle: scipy's frequency response of the same rational function."""
     from scipy.signal import freqs
 
-    from tdhil.identify.model import Model
+    from tdhil.identify.lines.model import Model
 
     omega = np.array([0.3, 1.0, 4.0])
     numerator = np.polymul([104.0, 8.0], [0.1 * 0.4**2, 0.4, 1.0])
@@ -118,7 +118,7 @@ def test_impedance_against_a_simulated_filter():
 @pytest.mark.parametrize("over", ("speed", "torque"))
 def test_an_average_is_one_of_the_family(over):
     """A mean over w of a rotating phasor, summed up sample by sample: half of w is delay, the rest u."""
-    from tdhil.identify.reports import log_ratio
+    from tdhil.identify.lines.reports import log_ratio
 
     w, omega = 0.5, np.array([0.6, 2.0, 5.0])
     steps = (np.arange(20000) + 0.5) * w / 20000
@@ -129,10 +129,10 @@ def test_an_average_is_one_of_the_family(over):
 
 
 def test_likelihood_jacobian_is_the_derivative():
-    from tdhil.identify.friction import ViscousTie
-    from tdhil.identify.likelihood import GaussianPrior, Likelihood
-    from tdhil.identify.model import Model
-    from tdhil.identify.spectrum import Line
+    from tdhil.identify.lines.friction import ViscousTie
+    from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
+    from tdhil.identify.lines.model import Model
+    from tdhil.identify.lines.spectrum import Line
 
     rng = np.random.default_rng(3)
 
@@ -157,7 +157,7 @@ def test_descent_against_scipy(seed):
     """The same bounded minimum as scipy's solver, on a curved valley with a bound across it."""
     from scipy.optimize import least_squares
 
-    from tdhil.identify.descent import Box, descend
+    from tdhil.identify.lines.descent import Box, descend
 
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(0.5, 3.0, 2)

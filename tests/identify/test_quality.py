@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from analytic import closed_form
 
-from tdhil.identify.clipped import flat_share
-from tdhil.identify.frozen import frozen
+from tdhil.identify.faults.clipped import flat_share
+from tdhil.identify.faults.frozen import frozen
+from tdhil.identify.faults.spikes import spikes
+from tdhil.identify.faults.timebase import wrong_period
+from tdhil.identify.faults.undeclared import undeclared_warning
+from tdhil.identify.lines.spectrum import period_lines
+from tdhil.identify.lines.warming import warming_of
 from tdhil.identify.samples import stretches, usable_samples
-from tdhil.identify.spectrum import period_lines
-from tdhil.identify.spikes import spikes
-from tdhil.identify.timebase import wrong_period
-from tdhil.identify.undeclared import undeclared_warning
-from tdhil.identify.warming import warming_of
 
 
 def wave(seed, quantum, noise, flat=False):

@@ -13,11 +13,11 @@ from shaft_bench import Rig, simulate
 from stages_bench import Stages, run_stages, usual_runs
 
 from tdhil.identify import Compliant, Estimate, Identification, InertiaEstimate, Options, Verdict
-from tdhil.identify.friction import measure_levels
-from tdhil.identify.momentum_rows import through
+from tdhil.identify.beside.momentum_rows import through
+from tdhil.identify.beside.second_opinion import disagreements, second_opinions
+from tdhil.identify.lines.friction import measure_levels
+from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import Samples, stretches, usable_samples
-from tdhil.identify.second_opinion import disagreements, second_opinions
-from tdhil.identify.spectrum import period_lines
 from tdhil.protocol.excitation import ExcitationWish
 from tdhil.record.recording import Recording
 

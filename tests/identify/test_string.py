@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from test_two_mass import KNOWN, MILD, S, parameters
 
 from tdhil.identify import Verdict, identify
-from tdhil.identify.string_shaft import StringShaft, resonances
-from tdhil.identify.two_mass import TwoMassShaft
+from tdhil.identify.compliant.string_shaft import StringShaft, resonances
+from tdhil.identify.compliant.two_mass import TwoMassShaft
 
 few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.generate])
 

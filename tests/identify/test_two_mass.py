@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 
 from tdhil.commands.models import MODELS as OFFERED
 from tdhil.identify import Options, Verdict, identify
-from tdhil.identify.compliant_choice import Chosen, choose, may_swing
-from tdhil.identify.compliant_fit import fit_compliant, inertias
-from tdhil.identify.compliant_views import RESONANCE, STIFFNESS, TOTAL, ViewedShaft
-from tdhil.identify.friction import Levels, ViscousTie
+from tdhil.identify.compliant.choice import Chosen, choose, may_swing
+from tdhil.identify.compliant.fit import fit_compliant, inertias
+from tdhil.identify.compliant.string_shaft import StringShaft
+from tdhil.identify.compliant.two_mass import TwoMassShaft, resonances, stiffness
+from tdhil.identify.compliant.views import RESONANCE, STIFFNESS, TOTAL, ViewedShaft
+from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.lines.friction import Levels, ViscousTie
+from tdhil.identify.lines.rigid_result import fit_rigid
+from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.options import MODELS
-from tdhil.identify.refusal import Refusal
-from tdhil.identify.rigid_result import fit_rigid
-from tdhil.identify.spectrum import Line
-from tdhil.identify.string_shaft import StringShaft
-from tdhil.identify.two_mass import TwoMassShaft, resonances, stiffness
 from tdhil.record.recording import LagPrior
 
 S = 2j * np.pi * np.array(LINES)

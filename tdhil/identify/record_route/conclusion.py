@@ -2,14 +2,14 @@
 
 import math
 
-from tdhil.identify.identifiable import lag_priors
 from tdhil.identify.identification import Estimate, Identification, InertiaEstimate, PaperEstimate, Verdict
+from tdhil.identify.lines.identifiable import lag_priors
+from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
+from tdhil.identify.lines.residual import rejects
+from tdhil.identify.lines.rigid_result import widened
 from tdhil.identify.options import Options
-from tdhil.identify.profile import student_quantile
 from tdhil.identify.record_route.solve import Solved, torque_scale_line
-from tdhil.identify.reports import LAG_BOUND_S, SKEW_BOUND_S
-from tdhil.identify.residual import rejects
-from tdhil.identify.rigid_result import widened
 from tdhil.record.recording import Recording
 
 MODEL = "rigid+lags (time domain)"

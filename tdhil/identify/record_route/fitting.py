@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.identify.record_route.bins import Bins
 from tdhil.identify.record_route.equation import (
     INERTIA,
@@ -22,7 +23,6 @@ from tdhil.identify.record_route.equation import (
     VISCOUS,
     evaluate,
 )
-from tdhil.identify.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.record.recording import FloatArray
 
 _TOLERANCE = 1e-9

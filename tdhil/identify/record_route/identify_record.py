@@ -6,12 +6,12 @@ seen through smooth windows at the frequencies that stand clear of the noise?  4
 
 import numpy as np
 
-from tdhil.identify.identifiable import lag_priors
+from tdhil.identify.faults.left_out import left_out_warnings
+from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.identification import Identification, PaperEstimate
-from tdhil.identify.left_out import left_out_warnings
-from tdhil.identify.likelihood import GaussianPrior
+from tdhil.identify.lines.identifiable import lag_priors
+from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.options import Options
-from tdhil.identify.quality import Refusal
 from tdhil.identify.record_route.bins import joined, measure, windows
 from tdhil.identify.record_route.conclusion import conclude_record, is_open
 from tdhil.identify.record_route.equation import SKEW, SPEED_LAG, TORQUE_LAG

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.identification import Estimate
-from tdhil.identify.profile import student_quantile
+from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.record_route.equation import SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, evaluate
 from tdhil.identify.record_route.fitting import Fit, Problem, covariance, minimise
 from tdhil.identify.record_route.moments import sandwich

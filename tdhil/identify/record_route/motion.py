@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tdhil.identify.quality import Refusal
+from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.record_route.stretches import Run
 from tdhil.identify.samples import Samples
 from tdhil.record.recording import FloatArray, Recording

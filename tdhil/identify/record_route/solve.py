@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.identification import BudgetLine, Estimate, ResidualTest
-from tdhil.identify.likelihood import GaussianPrior
-from tdhil.identify.profile import student_quantile
+from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.record_route.bins import Bins, Window
 from tdhil.identify.record_route.equation import (
     BACK,

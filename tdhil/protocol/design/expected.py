@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.identify.friction import Levels, tie_viscous
-from tdhil.identify.identifiable import known_structure, lag_priors, refuse_count, with_skew
-from tdhil.identify.rigid_result import RigidResult, fit_rigid
-from tdhil.identify.spectrum import Line
+from tdhil.identify.lines.friction import Levels, tie_viscous
+from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, with_skew
+from tdhil.identify.lines.rigid_result import RigidResult, fit_rigid
+from tdhil.identify.lines.spectrum import Line
 from tdhil.protocol.design.noise import RIGID
 from tdhil.record.recording import FloatArray, LagPrior
 

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from tdhil.identify import reports
-from tdhil.identify.shaft import VISCOUS
+from tdhil.identify.lines import reports
+from tdhil.identify.lines.shaft import VISCOUS
 from tdhil.protocol.design.noise import RIGID, Noise
 from tdhil.protocol.excitation import Plan
 from tdhil.record.recording import FloatArray, LagPrior

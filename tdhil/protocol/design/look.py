@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tdhil.identify.friction import measure_levels, tie_viscous
 from tdhil.identify.identify import identify
+from tdhil.identify.lines.friction import measure_levels, tie_viscous
+from tdhil.identify.lines.spectrum import period_lines, pooled_lines
 from tdhil.identify.options import Options
 from tdhil.identify.samples import stretches, usable_samples
-from tdhil.identify.spectrum import period_lines, pooled_lines
 from tdhil.protocol.design.expected import (
     LEAST_NU,
     Evidence,

@@ -17,10 +17,10 @@ from typing import Literal
 
 import numpy as np
 
-from tdhil.identify.model import Model
-from tdhil.identify.reports import SPEED_LAG, TORQUE_LAG
+from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.reports import SPEED_LAG, TORQUE_LAG
+from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import Samples, Stretch
-from tdhil.identify.spectrum import period_lines
 from tdhil.record.recording import FloatArray, LagPrior, Segment
 
 RIGID = Model()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tdhil.identify.friction import Levels
-from tdhil.identify.reports import SPEED_LAG
-from tdhil.identify.spectrum import Line
+from tdhil.identify.lines.friction import Levels
+from tdhil.identify.lines.reports import SPEED_LAG
+from tdhil.identify.lines.spectrum import Line
 from tdhil.protocol.design.expected import Evidence, Fitted, noise_free, safe_half_width
 from tdhil.protocol.design.noise import RIGID, Noise
 from tdhil.protocol.excitation import Plan

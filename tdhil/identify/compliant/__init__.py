@@ -1,0 +1,1 @@
+"""A shaft that swings: two masses on a spring, or a string."""

@@ -1,0 +1,46 @@
+"""The error budget of J: what each thing that isn't known adds to the half-width, line by line.
+
+Unknowns are set free one group after another: J alone (noise), then the skew (timing), the lags, the friction, and last
+the structure of the lags; a line is what its group adds, in squares: √(h_n² − h_(n−1)²); they add up to the interval.
+Friction comes behind the lags since without them a line tells J and B apart by itself (imaginary and real part); it is
+lags that mix the two.
+"""
+
+import math
+
+from tdhil.identify.identification import BudgetLine, Estimate
+from tdhil.identify.lines import reports
+from tdhil.identify.lines.interval import half_width_first_order
+from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.shaft import INERTIA
+from tdhil.identify.lines.structure import Fitted
+
+
+def budget_of(
+    fitted: Fitted, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+) -> tuple[BudgetLine, ...]:
+    """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
+    model = fitted.problem.model
+    lags = (model.at(reports.SPEED_LAG), model.at(reports.TORQUE_LAG))
+    timing = (model.at(reports.SKEW),)
+    friction = tuple(range(1, model.mechanical))
+    half = 0.5 * (inertia.high - inertia.low)
+    grown = (
+        ("noise", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing, *friction)),
+         "scatter from period to period, everything else known"),
+        ("timing", half_width_first_order(fitted, INERTIA, confidence, (*lags, *friction)),
+         "skew between speed and torque"),
+        ("lags", half_width_first_order(fitted, INERTIA, confidence, friction),
+         "time constants of the reports' filters"),
+        ("friction model", half_width_first_order(fitted, INERTIA, confidence),
+         "its slope" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
+        ("lag structure", half, "filters of two poles, moving averages"),
+    )
+    found, before = [], 0.0
+    for source, reached, note in grown:
+        total = min(max(reached, before), max(half, before))
+        found.append(BudgetLine(source, math.sqrt(max(total**2 - before**2, 0.0)), note))
+        before = total
+    scale = student_quantile(confidence, 1e6) * torque_scale_rel_sd * abs(inertia.value)
+    found.append(BudgetLine("torque scale", scale, "of the drive; in the total interval only"))
+    return tuple(found)

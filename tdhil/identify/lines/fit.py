@@ -1,0 +1,111 @@
+"""Where to begin: rough sizes, and linear least squares for shafts behind first-order lags; then the best of many."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from tdhil.identify.lines import reports
+from tdhil.identify.lines.descent import Box, Fit, descend
+from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.shaft import INERTIA, VISCOUS
+from tdhil.record.recording import FloatArray
+
+# τ_w, τ_T, d to start from besides what linear least squares proposes: the field rig's, and its mirror image
+_STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
+_SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
+_PROPOSALS = 3
+
+Held = dict[int, float]
+
+
+def box(problem: Likelihood, rough_inertia: float) -> Box:
+    """Bounds of theta; wider where a prior says so."""
+    low, high = problem.model.bounds(rough_inertia, problem.s)
+    for prior in problem.priors:
+        high[prior.index] = max(high[prior.index], prior.mean + 6.0 * prior.sd)
+    return Box(low, high, problem.model.scales(rough_inertia, problem.s))
+
+
+def rough_inertia_of(problem: Likelihood) -> float:
+    """|T|/(ω|W|) of the lowest line: the right size, whatever the lags."""
+    first = problem.owner == 0
+    ratio = np.abs(problem.torque[first]) / np.maximum(np.abs(problem.speed[first] * problem.s[0]), 1e-300)
+    return float(np.median(ratio))
+
+
+def minimise(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
+    """One descent; the parameters in ``held`` keep the value that stands there."""
+    free = np.ones(len(start), dtype=np.bool_)
+    begin = np.array(start, dtype=np.float64)
+    for index, value in held.items():
+        free[index], begin[index] = False, value
+    return descend(problem.linearised, problem.residuals, begin, free, limits)
+
+
+def best_fit(problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray]) -> Fit:
+    """The lowest of several descents; the first of equals, so that the same data give the same bits."""
+    return min((minimise(problem, limits, start, held) for start in starts), key=lambda fit: fit.objective)
+
+
+def rigid_starts(problem: Likelihood) -> list[FloatArray]:
+    """The most promising of the linear proposals, and two guesses."""
+    proposals = sorted(_proposals(problem), key=problem.objective)
+    return proposals[:_PROPOSALS] + [_start(problem, lags) for lags in _STARTS]
+
+
+def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
+    """Where a rigid shaft's lag and the lag of its speed's report have changed places.
+
+    (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report can't be told apart if both J/B and τ_w are
+    plausible lags of a report. An answer has this rival, and so has an interval.
+    """
+    inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + reports.SPEED_LAG]
+    if viscous <= 0.0 or inertia > 1.2 * reports.LAG_BOUND_S * viscous:
+        return []
+    rival = theta.copy()
+    rival[INERTIA], rival[2 + reports.SPEED_LAG] = viscous * max(lag, 1e-3), inertia / viscous
+    return [rival]
+
+
+def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
+    """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
+    phi = np.zeros(reports.COUNT)
+    phi[[reports.SPEED_LAG, reports.TORQUE_LAG, reports.SKEW]] = lags
+    seen = problem.torque / (np.exp(reports.log_ratio(phi, problem.s))[problem.owner] * problem.speed)
+    s = problem.s[problem.owner]
+    weight = np.abs(problem.speed)
+    inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))
+    viscous = float(np.sum(weight * seen.real) / np.sum(weight))
+    if inertia <= 0.0:
+        inertia = rough_inertia_of(problem)
+    theta = np.concatenate([np.zeros(problem.model.mechanical), phi])
+    theta[INERTIA], theta[VISCOUS] = inertia, viscous
+    return theta
+
+
+def _proposals(problem: Likelihood) -> list[FloatArray]:
+    """Starts by linear least squares: for a given skew, first-order lags make the equation linear.
+
+    With T' = T e^(ds):  T' = (J τ_w) s² W + (J + B τ_w) s W + B W − τ_T s T', four real unknowns, each equation divided
+    by its standard deviation. J and τ_w follow from a = J τ_w and b = J + B τ_w, hence B τ_w² − b τ_w + a = 0, smaller
+    root.
+    """
+    found = []
+    s = problem.s[problem.owner]
+    w = problem.speed
+    ratio = np.bincount(problem.owner, weights=np.abs(problem.torque / w)) / problem.segments
+    weight = problem.root_periods / np.sqrt(problem.variance(ratio.astype(np.complex128)))[problem.owner]
+    for skew in _SKEWS:
+        shifted = problem.torque * np.exp(skew * s)
+        columns = np.stack([s * s * w, s * w, w, -s * shifted], axis=1) * weight[:, None]
+        target = shifted * weight
+        both = np.concatenate([columns.real, columns.imag])
+        scale = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
+        x = np.linalg.lstsq(both / scale, np.concatenate([target.real, target.imag]), rcond=1e-10)[0] / scale
+        a, b, viscous, torque_lag = (float(value) for value in x)
+        root = b * b - 4.0 * viscous * a
+        denominator = b + np.sign(b) * np.sqrt(max(root, 0.0))
+        speed_lag = 2.0 * a / denominator if denominator != 0.0 else 0.0
+        lags = np.clip([speed_lag, torque_lag], 0.0, reports.LAG_BOUND_S)
+        found.append(_start(problem, (float(lags[0]), float(lags[1]), skew)))
+    return found

@@ -1,0 +1,106 @@
+"""First-order lags or not: both answers fitted, and how much each weighs.
+
+The reports' family (reports.py) is fitted twice: with first-order lags alone, and whole. The first is the sharper where
+it is true and biased where it isn't; the second is right in both cases and less sharp. Its three parameters more must
+lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be preferred; about there, both count:
+
+    weight of the first-order fit = 1/(1 + e^((D − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0.
+
+That is for the value. An interval rests on the whole family always, whatever the weight.
+
+The descents of the whole family begin near the first-order fit. Lower minima far from it exist now and then, in corners
+where filters of the two reports all but cancel; they are noise fitted, and following them costs both scatter and
+coverage (tried on the plants of the coverage study).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.identify.lines.descent import Box, Fit
+from tdhil.identify.lines.fit import Held, best_fit, box, minimise, rough_inertia_of
+from tdhil.identify.lines.friction import ViscousTie
+from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
+from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.reports import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
+from tdhil.identify.lines.spectrum import Line
+from tdhil.record.recording import FloatArray
+
+# where the whole family's descents begin, besides the first-order fit itself
+_SHAPES = ((SPEED_SHAPE, 0.25), (TORQUE_SHAPE, 0.25), (AVERAGE, 0.1), (AVERAGE, -0.1))
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model's two fits. ``held``: parameters that are known for certain, whatever the structure."""
+
+    problem: Likelihood
+    limits: Box
+    held: Held
+    simple: Fit             # first-order lags
+    whole: Fit              # the whole family
+    simple_weight: float    # of the first-order fit, 0 to 1
+    rivals: tuple[Fit, ...] = ()     # other answers of the whole family, elsewhere
+
+    @property
+    def simple_held(self) -> Held:
+        """What is held in the first-order fit."""
+        return {**dict.fromkeys(self.problem.model.structure, 0.0), **self.held}
+
+    @property
+    def free(self) -> list[int]:
+        """Parameters of the whole family that are free."""
+        return [index for index in range(self.problem.model.size) if index not in self.held]
+
+    @property
+    def first_order(self) -> bool:
+        """Are first-order lags the likelier answer?"""
+        return self.simple_weight >= 0.5
+
+    def value(self, row: FloatArray) -> float:
+        """The estimate of a linear combination of theta, row (P,)."""
+        share = self.simple_weight
+        return float(share * (row @ self.simple.theta) + (1.0 - share) * (row @ self.whole.theta))
+
+
+def fit_model(
+    lines: tuple[Line, ...],
+    model: Model,
+    tie: ViscousTie | None,
+    priors: tuple[GaussianPrior, ...],
+    held: Held,
+    starts: Sequence[FloatArray],
+    problem: Likelihood | None = None,
+    rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
+) -> Fitted:
+    """Fit ``model`` to ``lines`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be."""
+    problem = problem or Likelihood(lines, model, tie, priors)
+    limits = box(problem, rough_inertia_of(problem))
+    first_order = {**dict.fromkeys(model.structure, 0.0), **held}
+    simple = best_fit(problem, limits, first_order, starts)
+    open_structure = [index for index in model.structure if index not in held]
+    others = tuple(minimise(problem, limits, start, held) for start in (rivals_of(simple.theta) if rivals_of else []))
+    if not open_structure:
+        return Fitted(problem, limits, held, simple, simple, 1.0, others)
+    whole = simple
+    for shape, value in _SHAPES:
+        start = simple.theta.copy()
+        if model.at(shape) not in held:
+            start[model.at(shape)] = value
+            found = minimise(problem, limits, start, held)
+            whole = found if found.objective < whole.objective else whole
+    from_simple = minimise(problem, limits, simple.theta, held)
+    whole = from_simple if from_simple.objective < whole.objective else whole
+    numbers = 2.0 * len(problem.owner) + len(priors) + (tie is not None)
+    excess = simple.objective - whole.objective - len(open_structure) * math.log(numbers)
+    weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
+    return Fitted(problem, limits, held, simple, whole, weight, others)
+
+
+def unit(fitted: Fitted, index: int) -> FloatArray:
+    """The row (P,) that picks one parameter."""
+    row = np.zeros(fitted.problem.model.size)
+    row[index] = 1.0
+    return row
