@@ -12,9 +12,10 @@ import numpy as np
 
 from tdhil.identify.identification import Estimate
 from tdhil.identify.lines.descent import Fit
-from tdhil.identify.lines.fit import Held
+from tdhil.identify.lines.fit import Held, minimise
 from tdhil.identify.lines.profile import profile_edge, standard_deviation, student_quantile
 from tdhil.identify.lines.structure import Fitted, unit
+from tdhil.record.recording import FloatArray
 
 
 def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
@@ -70,8 +71,12 @@ def _edges(
     sd, _ = standard_deviation(problem, fit.theta, index, [i for i in range(len(fit.theta)) if i not in held])
     natural = float(limits.scale[index])
     step = min(max(quantile * sd, 1e-7 * natural), 0.3 * max(abs(float(fit.theta[index])), natural))
+
+    def refit(start: FloatArray, value: float) -> Fit:
+        return minimise(problem, limits, start, {**held, index: value})
+
     rise = quantile**2 - behind
-    low, high = (profile_edge(problem, limits, fit, index, side * step, rise, held) for side in (-1.0, 1.0))
+    low, high = (profile_edge(refit, limits, fit, index, side * step, rise) for side in (-1.0, 1.0))
     return low, high
 
 

@@ -6,11 +6,11 @@ bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-squa
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from tdhil.identify.lines.descent import Box, Fit
-from tdhil.identify.lines.fit import minimise
 from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.record.recording import FloatArray
 
@@ -42,9 +42,11 @@ def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free:
     return math.sqrt(max(variance, 0.0)), max(1.0, min(dof, 1e6))
 
 
-def profile_edge(
-    problem: Likelihood, limits: Box, best: Fit, index: int, step: float, rise: float, held: dict[int, float]
-) -> float:
+Refit = Callable[[FloatArray, float], Fit]
+"""The best fit with the parameter held at a value, from a start (P,) nearby."""
+
+
+def profile_edge(refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float) -> float:
     """Where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound, or ±inf, if it never does.
 
     The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood.
@@ -59,7 +61,7 @@ def profile_edge(
     x = centre + step
     for _ in range(_TRIES):
         x = min(x, bound) if step > 0.0 else max(x, bound)
-        fit = minimise(problem, limits, inside_theta, {**held, index: x})
+        fit = refit(inside_theta, x)
         root = math.sqrt(max(fit.objective - best.objective, 0.0))
         if abs(root - target) <= _CLOSE * target:
             return x

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.identify.lines.descent import Box, Fit
 from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.identify.record_route.bins import Bins
@@ -26,15 +27,6 @@ from tdhil.identify.record_route.equation import (
 from tdhil.record.recording import FloatArray
 
 _TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class Box:
-    """Bounds and natural scales of theta, (10,) each."""
-
-    low: FloatArray
-    high: FloatArray
-    scale: FloatArray
 
 
 @dataclass(frozen=True)
@@ -63,16 +55,8 @@ class Problem:
         return int(np.sum(np.where(self.bins.hertz > 0.0, 2, 1))) + len(self.priors)
 
 
-@dataclass(frozen=True)
-class Fit:
-    """The best theta (10,) and its −2 ln L."""
-
-    theta: FloatArray
-    objective: float
-
-
 def box(inertia: float, middle_rad_s: float, torque_nm: float, priors: tuple[GaussianPrior, ...]) -> Box:
-    """Lags in [0, 2] s, |skew| ≤ 0.3 s, κ in [0, ½], J ≥ 0; wider where a prior says so."""
+    """Lags in [0, 2] s, |skew| ≤ 1 s, κ in [0, ½], J ≥ 0; wider where a prior says so."""
     low, high, scale = np.full(PARAMETERS, -np.inf), np.full(PARAMETERS, np.inf), np.full(PARAMETERS, torque_nm)
     low[INERTIA], low[[SPEED_LAG, TORQUE_LAG, SPEED_SHAPE, TORQUE_SHAPE]] = 0.0, 0.0
     high[[SPEED_LAG, TORQUE_LAG]], high[[SPEED_SHAPE, TORQUE_SHAPE]] = LAG_BOUND_S, MOST_SHAPE

@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.identification import Estimate
-from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.descent import Fit
+from tdhil.identify.lines.profile import profile_edge, student_quantile
 from tdhil.identify.record_route.equation import SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, evaluate
-from tdhil.identify.record_route.fitting import Fit, Problem, covariance, minimise
+from tdhil.identify.record_route.fitting import Problem, covariance, minimise
 from tdhil.identify.record_route.moments import sandwich
 from tdhil.record.recording import FloatArray
 
-_TRIES = 14
-_CLOSE = 0.01
 _LEAST_DOF = 3.0
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))
 
@@ -90,34 +89,12 @@ def best_shapes(problem: Problem, near: Fit) -> Fit:
 
 def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) -> Estimate:
     """Where the profile has risen by reach² on either side of ``best``; a bound, or ±inf, if it never does."""
-    return Estimate(float(best.theta[index]), _edge(problem, best, index, reach, -step),
-                    _edge(problem, best, index, reach, step))
 
+    def refit(start: FloatArray, value: float) -> Fit:
+        return minimise(problem, start, {index: value})
 
-def _edge(problem: Problem, best: Fit, index: int, reach: float, step: float) -> float:
-    centre = float(best.theta[index])
-    bound = float(problem.box.high[index] if step > 0.0 else problem.box.low[index])
-    inside, inside_root, inside_theta = centre, 0.0, best.theta
-    outside: tuple[float, float] | None = None
-    x = centre + step
-    for _ in range(_TRIES):
-        x = min(x, bound) if step > 0.0 else max(x, bound)
-        fit = minimise(problem, inside_theta, {index: x})
-        root = math.sqrt(max(fit.objective - best.objective, 0.0))
-        if abs(root - reach) <= _CLOSE * reach:
-            return x
-        if root < reach:
-            if x == bound:
-                return bound
-            inside, inside_root, inside_theta = x, root, fit.theta
-        else:
-            outside = (x, root)
-        if outside is None:
-            x = centre + (x - centre) * min(max(reach / root if root > 0.0 else 4.0, 1.2), 4.0)
-        else:
-            share = (reach - inside_root) / (outside[1] - inside_root)
-            x = inside + min(max(share, 0.05), 0.95) * (outside[0] - inside)
-    return x if outside is not None else math.copysign(math.inf, step)
+    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2) for side in (-1.0, 1.0))
+    return Estimate(float(best.theta[index]), low, high)
 
 
 def _shares(problem: Problem, theta: FloatArray, direction: FloatArray) -> float:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.identify.lines.descent import Fit
 from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.record_route import noise
 from tdhil.identify.record_route.bins import Bins
@@ -25,7 +26,7 @@ from tdhil.identify.record_route.equation import (
     VISCOUS,
     evaluate,
 )
-from tdhil.identify.record_route.fitting import Fit, Problem, box, covariance, minimise
+from tdhil.identify.record_route.fitting import Problem, box, covariance, minimise
 from tdhil.record.recording import BoolArray, FloatArray
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.identification import BudgetLine, Estimate, ResidualTest
+from tdhil.identify.lines.descent import Fit
 from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.record_route.bins import Bins, Window
@@ -21,7 +22,7 @@ from tdhil.identify.record_route.equation import (
     TORQUE_SHAPE,
     VISCOUS,
 )
-from tdhil.identify.record_route.fitting import Fit, Problem, covariance, minimise
+from tdhil.identify.record_route.fitting import Problem, covariance, minimise
 from tdhil.identify.record_route.interval import Spread, best_shapes, profile, spread, with_shapes
 from tdhil.identify.record_route.misfit import local_test
 from tdhil.identify.record_route.moments import block_scores
