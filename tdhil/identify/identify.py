@@ -20,7 +20,7 @@ from tdhil.identify.faults.quality import Refusal, refuse_motion, refuse_samples
 from tdhil.identify.identification import Identification
 from tdhil.identify.lines.friction import Levels, ViscousTie, measure_levels, tie_viscous
 from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
-from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.rigid_result import RigidResult, fit_rigid
 from tdhil.identify.lines.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.identify.options import Options
@@ -53,8 +53,9 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     periods = sum(len(stretch.periods) for stretch in cut)
     used = sum(len(period) for stretch in cut for period in stretch.periods)
     warnings = _warnings(recording, cut)
-    levels = measure_levels(cut, fits, samples, recording.levels, _rough(fits))
-    tie = _tie(recording, samples, levels, _rough(fits), options)
+    rough = _rough(fits)
+    levels = measure_levels(cut, fits, samples, recording.levels, rough)
+    tie = _tie(recording, samples, levels, rough, options)
     warnings = (*warnings, *hints(recording, cut, fits, levels))
     every = pooled_lines(fits, tie.slope if tie is not None else 0.0, levels.warming.own)
     refusal = refuse_lines(samples, recording.speed_resolution_rad_s, cut, fits, every)

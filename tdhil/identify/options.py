@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 Model = Literal["auto", "rigid", "two-mass", "string", "paper"]
-MODELS: tuple[Model, ...] = ("auto", "rigid", "two-mass", "string", "paper")
+MODELS: tuple[Model, ...] = get_args(Model)
 
 
 @dataclass(frozen=True)

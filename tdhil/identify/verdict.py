@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.identification import Identification, InertiaEstimate, PaperEstimate, Verdict
 from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.lines.line_points import fitted_points
-from tdhil.identify.lines.model import Model
-from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.reports import SKEW
 from tdhil.identify.lines.residual import REJECT_P, rejects
-from tdhil.identify.lines.rigid_result import RigidResult, turned, widened
+from tdhil.identify.lines.rigid_result import RigidResult, turned
 from tdhil.identify.options import Options
+from tdhil.identify.torque_scale import with_total
 from tdhil.record.recording import LagPrior, Recording
 
 _OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
@@ -123,19 +122,8 @@ def _inertia(
     estimate = result.inertia
     if options.model == "paper" and evidence.paper is not None:
         estimate = turned(estimate, evidence.paper.stepped.inertia_kg_m2)
-    quantile = student_quantile(options.confidence, 1e6)
-    scale_sd = recording.torque_scale_rel_sd
-    below = widened(estimate.value, estimate.value - estimate.low, scale_sd, quantile)
-    above = widened(estimate.value, estimate.high - estimate.value, scale_sd, quantile)
-    return InertiaEstimate(
-        value=estimate.value,
-        low=estimate.low,
-        high=estimate.high,
-        low_total=estimate.value - below,
-        high_total=estimate.value + above,
-        confidence=options.confidence,
-        conditional_on=_conditions(result, options, recording, priors),
-    )
+    conditions = _conditions(result, options, recording, priors)
+    return with_total(estimate, recording.torque_scale_rel_sd, options.confidence, conditions)
 
 
 def _conditions(

@@ -130,8 +130,8 @@ def test_an_average_is_one_of_the_family(over):
 
 def test_likelihood_jacobian_is_the_derivative():
     from tdhil.identify.lines.friction import ViscousTie
-    from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
-    from tdhil.identify.lines.model import Model
+    from tdhil.identify.lines.likelihood import Likelihood
+    from tdhil.identify.lines.model import GaussianPrior, Model
     from tdhil.identify.lines.spectrum import Line
 
     rng = np.random.default_rng(3)

@@ -20,7 +20,7 @@ from tdhil.identify.compliant.two_mass import LOAD, SWING, TwoMassShaft
 from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.residual import rejects
 from tdhil.identify.lines.rigid_result import RigidResult
 from tdhil.identify.lines.shaft import INERTIA

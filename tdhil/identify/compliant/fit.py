@@ -14,9 +14,9 @@ from tdhil.identify.identification import Estimate, ResidualTest
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.interval import estimate
-from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
-from tdhil.identify.lines.model import Model
-from tdhil.identify.lines.residual import fitted_count, residual_test
+from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.model import GaussianPrior, Model
+from tdhil.identify.lines.residual import residual_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS, RigidShaft
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.lines.structure import Fitted, fit_model
@@ -40,8 +40,7 @@ class CompliantFit:
     @property
     def mechanical(self) -> FloatArray:
         """The shaft's m of the likelier structure of lags, (M,)."""
-        best = self.fitted.simple if self.fitted.first_order else self.fitted.whole
-        return best.theta[: self.fitted.problem.model.mechanical]
+        return self.fitted.likelier.theta[: self.fitted.problem.model.mechanical]
 
 
 @dataclass(frozen=True)
@@ -78,10 +77,8 @@ def fit_compliant(
     starts = compliant_starts(problem, held)
     if near is not None:
         starts = [np.insert(near.fitted.simple.theta, STRING_SHARE, _LIGHT), *starts]
-    fitted = fit_model(lines, model, tie, priors, held, starts, problem)
-    return CompliantFit(fitted, residual_test(
-        problem, fitted.whole.theta, fitted_count(fitted.whole.theta, fitted.free, fitted.limits)
-    ))
+    fitted = fit_model(problem, held, starts)
+    return CompliantFit(fitted, residual_of(fitted))
 
 
 def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:

@@ -9,11 +9,13 @@ from tdhil.identify.compliant.string_shaft import STRING_SHARE
 from tdhil.identify.compliant.two_mass import DAMPING, LOAD, LOAD_VISCOUS, SWING
 from tdhil.identify.identification import BudgetLine, Compliant, Estimate
 from tdhil.identify.lines import reports
+from tdhil.identify.lines.budget import grown_lines
 from tdhil.identify.lines.friction import Levels, coulomb_level
 from tdhil.identify.lines.interval import half_width_first_order
 from tdhil.identify.lines.profile import standard_deviation, student_quantile
 from tdhil.identify.lines.rigid_result import lags_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS
+from tdhil.identify.torque_scale import torque_scale_line
 
 _OPEN = 0.5     # relative half-width beyond which a quantity is left open
 
@@ -109,12 +111,6 @@ def _budget(
         ("lag structure", 0.5 * (alone.high - alone.low), "filters of two poles, moving averages"),
         ("shaft model", 0.5 * (held.high - held.low), "a spring that weighs something: a string"),
     )
-    found, before = [], 0.0
-    most = 0.5 * (held.high - held.low)
-    for source, reached, note in grown:
-        total = min(max(reached, before), max(most, before))
-        if source != "shaft model" or total > before:
-            found.append(BudgetLine(source, math.sqrt(max(total**2 - before**2, 0.0)), note))
-        before = total
-    scale = student_quantile(confidence, 1e6) * torque_scale_rel_sd * abs(held.value)
-    return (*found, BudgetLine("torque scale", scale, "of the drive; in the total interval only"))
+    lines = grown_lines(grown, 0.5 * (held.high - held.low))
+    told = (line for line in lines if line.source != "shaft model" or line.half_width_kg_m2 > 0.0)
+    return (*told, torque_scale_line(held.value, torque_scale_rel_sd, confidence))

@@ -12,13 +12,12 @@ from tdhil.identify.faults.refusal import Refusal
 from tdhil.identify.identification import Estimate, Identification, InertiaEstimate, Verdict
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import Levels, ViscousTie
-from tdhil.identify.lines.likelihood import GaussianPrior
 from tdhil.identify.lines.line_points import fitted_points
-from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.residual import REJECT_P
-from tdhil.identify.lines.rigid_result import widened
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.options import Options
+from tdhil.identify.torque_scale import with_total
 from tdhil.identify.verdict import Evidence, of_reports, refused
 from tdhil.record.recording import Recording
 
@@ -114,21 +113,12 @@ def name_of(fit: CompliantFit) -> str:
 
 
 def _inertia(one: Estimate, chosen: Chosen, recording: Recording, options: Options) -> InertiaEstimate:
-    quantile = student_quantile(options.confidence, 1e6)
-    scale_sd = recording.torque_scale_rel_sd
     if chosen.fit.is_string:
         shaft = "the motor turns a uniform string"
     else:
         shaft = "the spring weighs nothing" if chosen.beside is None else "the motor turns a spring or a uniform string"
-    return InertiaEstimate(
-        value=one.value,
-        low=one.low,
-        high=one.high,
-        low_total=one.value - widened(one.value, one.value - one.low, scale_sd, quantile),
-        high_total=one.value + widened(one.value, one.high - one.value, scale_sd, quantile),
-        confidence=options.confidence,
-        conditional_on=("torque scale exact", shaft, *of_reports(recording.lag_prior)),
-    )
+    conditions = ("torque scale exact", shaft, *of_reports(recording.lag_prior))
+    return with_total(one, recording.torque_scale_rel_sd, options.confidence, conditions)
 
 
 def _words(fit: CompliantFit, rigid: Identification | None, relative: float, options: Options) -> tuple[str, str]:

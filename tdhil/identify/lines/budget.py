@@ -7,13 +7,14 @@ lags that mix the two.
 """
 
 import math
+from collections.abc import Iterable
 
 from tdhil.identify.identification import BudgetLine, Estimate
 from tdhil.identify.lines import reports
 from tdhil.identify.lines.interval import half_width_first_order
-from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.lines.shaft import INERTIA
 from tdhil.identify.lines.structure import Fitted
+from tdhil.identify.torque_scale import torque_scale_line
 
 
 def budget_of(
@@ -36,11 +37,17 @@ def budget_of(
          "its slope" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
         ("lag structure", half, "filters of two poles, moving averages"),
     )
+    return (*grown_lines(grown, half), torque_scale_line(inertia.value, torque_scale_rel_sd, confidence))
+
+
+def grown_lines(grown: Iterable[tuple[str, float, str]], half: float) -> tuple[BudgetLine, ...]:
+    """What each step adds in squares.
+
+    ``grown`` are (source, half-width reached with it free, note), ``half`` the last of them.
+    """
     found, before = [], 0.0
     for source, reached, note in grown:
         total = min(max(reached, before), max(half, before))
         found.append(BudgetLine(source, math.sqrt(max(total**2 - before**2, 0.0)), note))
         before = total
-    scale = student_quantile(confidence, 1e6) * torque_scale_rel_sd * abs(inertia.value)
-    found.append(BudgetLine("torque scale", scale, "of the drive; in the total interval only"))
     return tuple(found)

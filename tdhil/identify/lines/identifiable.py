@@ -10,8 +10,7 @@ The parameters are those of the rigid model.
 
 from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.likelihood import GaussianPrior
-from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.reports import AVERAGE, SKEW, SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE
 from tdhil.record.recording import LagPrior
 

@@ -20,8 +20,6 @@ from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.spectrum import ComplexArray, Line
 from tdhil.record.recording import FloatArray
 
-__all__ = ["GaussianPrior", "Likelihood"]
-
 
 class Likelihood:
     """−2 ln L of a model's theta (P,), a sum of squares."""

@@ -18,9 +18,8 @@ from tdhil.identify.lines.structure import Fitted
 
 def fitted_points(fitted: Fitted, confidence: float) -> tuple[LinePoint, ...]:
     """The lines of a fit beside the likelier of its two answers."""
-    theta = fitted.simple.theta if fitted.first_order else fitted.whole.theta
     problem = fitted.problem
-    return line_points(problem.lines, problem.model.impedance(theta, problem.s), confidence)
+    return line_points(problem.lines, problem.model.impedance(fitted.likelier.theta, problem.s), confidence)
 
 
 def line_points(lines: tuple[Line, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:

@@ -15,8 +15,8 @@ import math
 import numpy as np
 
 from tdhil.identify.identification import ResidualTest
-from tdhil.identify.lines.descent import Box
 from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.structure import Fitted
 from tdhil.record.recording import FloatArray
 
 REJECT_P = 0.001
@@ -28,11 +28,12 @@ def rejects(test: ResidualTest | None) -> bool:
     return test is not None and not test.p_value >= REJECT_P
 
 
-def fitted_count(theta: FloatArray, free: list[int], limits: Box) -> int:
-    """How many of the free parameters lie inside their bounds."""
+def residual_of(fitted: Fitted) -> ResidualTest | None:
+    """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds."""
+    theta, limits = fitted.whole.theta, fitted.limits
     near = _AT_BOUND * limits.scale
     inside = (theta > limits.low + near) & (theta < limits.high - near)
-    return int(np.count_nonzero(inside[free]))
+    return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])))
 
 
 def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> ResidualTest | None:

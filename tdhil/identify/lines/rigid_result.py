@@ -9,14 +9,13 @@ from tdhil.identify.lines.budget import budget_of
 from tdhil.identify.lines.fit import Held, rigid_rivals, rigid_starts
 from tdhil.identify.lines.friction import Levels, ViscousTie, coulomb_level
 from tdhil.identify.lines.interval import estimate, first_order_estimate
-from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
-from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.profile import standard_deviation, student_quantile
-from tdhil.identify.lines.residual import fitted_count, rejects, residual_test
+from tdhil.identify.lines.residual import rejects, residual_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.lines.structure import Fitted, fit_model
-from tdhil.record.recording import FloatArray
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,9 @@ def fit_rigid(
     torque_scale_rel_sd: float = 0.0,
 ) -> RigidResult:
     """Fit, test, and profile. ``held``: parameters of theta known for certain (see Model)."""
-    model = Model()
-    problem = Likelihood(lines, model, tie, priors)
-    fitted = fit_model(lines, model, tie, priors, held, rigid_starts(problem), problem, rigid_rivals)
-    residual = residual_test(
-        problem, fitted.whole.theta, fitted_count(fitted.whole.theta, fitted.free, fitted.limits)
-    )
+    problem = Likelihood(lines, Model(), tie, priors)
+    fitted = fit_model(problem, held, rigid_starts(problem), rigid_rivals)
+    residual = residual_of(fitted)
     if rejects(residual):            # then no interval will be shown, and none is sought
         return _bare(fitted, residual)
     inertia = estimate(fitted, INERTIA, confidence)
@@ -107,16 +103,11 @@ def _coulomb(levels: Levels, fitted: Fitted, confidence: float) -> Estimate | No
     if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
         return None
     free = [index for index in fitted.free if index not in fitted.simple_held]
-    theta: FloatArray = fitted.simple.theta if fitted.first_order else fitted.whole.theta
+    theta = fitted.likelier.theta
     sd_viscous, dof = standard_deviation(fitted.problem, theta, VISCOUS, free)
     value, sd = coulomb_level(levels, float(theta[INERTIA]), float(theta[VISCOUS]), sd_viscous)
     half = student_quantile(confidence, min(dof, levels.dof)) * sd
     return Estimate(value, value - half, value + half) if math.isfinite(half) else None
-
-
-def widened(value: float, half: float, rel_sd: float, quantile: float) -> float:
-    """A half-width with the torque scale's uncertainty added in quadrature: J is proportional to the scale."""
-    return math.hypot(half, quantile * rel_sd * abs(value))
 
 
 def turned(estimate: Estimate, value: float) -> Estimate:

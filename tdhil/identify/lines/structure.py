@@ -21,11 +21,8 @@ import numpy as np
 
 from tdhil.identify.lines.descent import Box, Fit
 from tdhil.identify.lines.fit import Held, best_fit, box, minimise, rough_inertia_of
-from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.likelihood import GaussianPrior, Likelihood
-from tdhil.identify.lines.model import Model
+from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.identify.lines.reports import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
-from tdhil.identify.lines.spectrum import Line
 from tdhil.record.recording import FloatArray
 
 # where the whole family's descents begin, besides the first-order fit itself
@@ -59,6 +56,11 @@ class Fitted:
         """Are first-order lags the likelier answer?"""
         return self.simple_weight >= 0.5
 
+    @property
+    def likelier(self) -> Fit:
+        """The likelier of the two answers."""
+        return self.simple if self.first_order else self.whole
+
     def value(self, row: FloatArray) -> float:
         """The estimate of a linear combination of theta, row (P,)."""
         share = self.simple_weight
@@ -66,17 +68,13 @@ class Fitted:
 
 
 def fit_model(
-    lines: tuple[Line, ...],
-    model: Model,
-    tie: ViscousTie | None,
-    priors: tuple[GaussianPrior, ...],
+    problem: Likelihood,
     held: Held,
     starts: Sequence[FloatArray],
-    problem: Likelihood | None = None,
     rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
 ) -> Fitted:
-    """Fit ``model`` to ``lines`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be."""
-    problem = problem or Likelihood(lines, model, tie, priors)
+    """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be."""
+    model = problem.model
     limits = box(problem, rough_inertia_of(problem))
     first_order = {**dict.fromkeys(model.structure, 0.0), **held}
     simple = best_fit(problem, limits, first_order, starts)
@@ -93,7 +91,7 @@ def fit_model(
             whole = found if found.objective < whole.objective else whole
     from_simple = minimise(problem, limits, simple.theta, held)
     whole = from_simple if from_simple.objective < whole.objective else whole
-    numbers = 2.0 * len(problem.owner) + len(priors) + (tie is not None)
+    numbers = 2.0 * len(problem.owner) + len(problem.priors) + (problem.tie is not None)
     excess = simple.objective - whole.objective - len(open_structure) * math.log(numbers)
     weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
     return Fitted(problem, limits, held, simple, whole, weight, others)

@@ -2,14 +2,13 @@
 
 import math
 
-from tdhil.identify.identification import Estimate, Identification, InertiaEstimate, PaperEstimate, Verdict
+from tdhil.identify.identification import Estimate, Identification, PaperEstimate, Verdict
 from tdhil.identify.lines.identifiable import lag_priors
-from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.identify.lines.residual import rejects
-from tdhil.identify.lines.rigid_result import widened
 from tdhil.identify.options import Options
-from tdhil.identify.record_route.solve import Solved, torque_scale_line
+from tdhil.identify.record_route.solve import Solved
+from tdhil.identify.torque_scale import torque_scale_line, with_total
 from tdhil.record.recording import Recording
 
 MODEL = "rigid+lags (time domain)"
@@ -35,17 +34,8 @@ def conclude_record(
     """A number with its interval, or the model rejected."""
     rejected = rejects(solved.residual)
     found = solved.inertia
-    quantile = student_quantile(options.confidence, 1e6)
     scale = recording.torque_scale_rel_sd
-    inertia = InertiaEstimate(
-        value=found.value,
-        low=found.low,
-        high=found.high,
-        low_total=found.value - widened(found.value, found.value - found.low, scale, quantile),
-        high_total=found.value + widened(found.value, found.high - found.value, scale, quantile),
-        confidence=options.confidence,
-        conditional_on=_conditions(recording),
-    )
+    inertia = with_total(found, scale, options.confidence, _conditions(recording))
     relative = 0.5 * (found.high - found.low) / found.value
     verdict = Verdict.VALID if relative <= options.tolerance else Verdict.VALID_WIDE
     if rejected:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.identify.lines.descent import Box, Fit
-from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.identify.record_route.bins import Bins
 from tdhil.identify.record_route.equation import (

@@ -10,7 +10,7 @@ from tdhil.identify.faults.left_out import left_out_warnings
 from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.identification import Identification, PaperEstimate
 from tdhil.identify.lines.identifiable import lag_priors
-from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.options import Options
 from tdhil.identify.record_route.bins import joined, measure, windows
 from tdhil.identify.record_route.conclusion import conclude_record, is_open

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.lines.descent import Fit
-from tdhil.identify.lines.likelihood import GaussianPrior
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.record_route import noise
 from tdhil.identify.record_route.bins import Bins
 from tdhil.identify.record_route.equation import (

@@ -7,8 +7,7 @@ import numpy as np
 
 from tdhil.identify.identification import BudgetLine, Estimate, ResidualTest
 from tdhil.identify.lines.descent import Fit
-from tdhil.identify.lines.likelihood import GaussianPrior
-from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.record_route.bins import Bins, Window
 from tdhil.identify.record_route.equation import (
     BACK,
@@ -173,10 +172,3 @@ def _budget(
         BudgetLine("friction model", abs(shift), "friction with and without a part that grows with the speed's square"
                    + ("; it has one" if bent else "")),
     )
-
-
-def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetLine:
-    """J is proportional to the drive's torque scale."""
-    return BudgetLine("torque scale", student_quantile(confidence, 1e6) * rel_sd * abs(value), "of the drive's torque")
-
-

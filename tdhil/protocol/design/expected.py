@@ -60,7 +60,7 @@ def fit(evidence: Evidence, confidence: float) -> Fitted | None:
 def _fitted(found: RigidResult) -> Fitted | None:
     inertia = found.inertia
     half = 0.5 * (inertia.high - inertia.low) / inertia.value if inertia.value > 0.0 else math.inf
-    theta = found.fitted.simple.theta if found.first_order else found.fitted.whole.theta
+    theta = found.fitted.likelier.theta
     if not (half > 0.0 and np.all(np.isfinite(theta))):
         return None
     return Fitted(theta, half)
