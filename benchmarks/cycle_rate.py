@@ -30,7 +30,7 @@ from can.interfaces.virtual import VirtualBus
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, FrameTap, Limits, Mode, PowerState, Preflight
-from profiles.library import load_profile
+from profiles.library import load_canopen_profile
 from sim_bus.params import RigParams
 from sim_bus.simulator import EmbeddedSimulator
 from tdhil.protocol.bench import Bench
@@ -89,7 +89,7 @@ def turning_drive(tap: FrameTap | None = None) -> Iterator[tuple[EmbeddedSimulat
     """The default simulated rig, enabled in speed mode."""
     with EmbeddedSimulator(RigParams(), seed=1) as simulator:
         bus = can.Bus(simulator.channel, interface="virtual")
-        drive = Cia402Drive(bus, load_profile("generic/cia402"), SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
+        drive = Cia402Drive(bus, load_canopen_profile("generic/cia402"), SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
         try:
             drive.connect()
             preflight = drive.preflight(LIMITS)

@@ -3,13 +3,29 @@
 import difflib
 import re
 from pathlib import Path
+from typing import Literal
 
+from pydantic import ConfigDict
+
+from profiles.data_model import DataModel
 from profiles.errors import DataFileError, Problem
+from profiles.modbus_schema import ModbusProfile
 from profiles.schema import CanopenProfile
 from profiles.strict_yaml import load_model
 
+Profile = CanopenProfile | ModbusProfile
+
 _ROOT = Path(__file__).parent
 _SUFFIXES = (".yaml", ".yml")
+_MODELS: dict[str, type[CanopenProfile] | type[ModbusProfile]] = {"canopen": CanopenProfile, "modbus": ModbusProfile}
+
+
+class _Head(DataModel):
+    """The key that says which schema the rest follows."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    bus: Literal["canopen", "modbus"]
 
 
 def profile_names() -> tuple[str, ...]:
@@ -30,24 +46,45 @@ def profile_path(name_or_path: str) -> Path:
     raise DataFileError((Problem("profile", 0, _unknown(name_or_path, names)),))
 
 
-def load_profile(name_or_path: str) -> CanopenProfile:
-    """A profile that ships (``generic/cia402``) or a file of the user's (``./my-drive.yaml``).
+def load_profile(name_or_path: str) -> Profile:
+    """A profile that ships (``generic/cia402``) or a file of the user's (``./my-drive.yaml``), whatever its bus.
 
     DataFileError with every problem and its line.
     """
-    return load_model(profile_path(name_or_path), CanopenProfile)
+    path = profile_path(name_or_path)
+    return load_model(path, _MODELS[load_model(path, _Head).bus])
+
+
+def load_canopen_profile(name_or_path: str) -> CanopenProfile:
+    """As `load_profile`; DataFileError for a profile of another bus."""
+    profile = load_profile(name_or_path)
+    if not isinstance(profile, CanopenProfile):
+        raise _other_bus(name_or_path, profile.bus, "canopen")
+    return profile
+
+
+def load_modbus_profile(name_or_path: str) -> ModbusProfile:
+    """As `load_profile`; DataFileError for a profile of another bus."""
+    profile = load_profile(name_or_path)
+    if not isinstance(profile, ModbusProfile):
+        raise _other_bus(name_or_path, profile.bus, "modbus")
+    return profile
 
 
 def eds_path(name_or_path: str) -> Path | None:
     """The EDS that the profile names, beside it; None if it names none, DataFileError if the file isn't there."""
-    profile = profile_path(name_or_path)
-    name = load_model(profile, CanopenProfile).eds
-    if name is None:
+    profile = load_profile(name_or_path)
+    if not isinstance(profile, CanopenProfile) or profile.eds is None:
         return None
-    path = profile.parent / name
+    file = profile_path(name_or_path)
+    path = file.parent / profile.eds
     if not path.is_file():
-        raise DataFileError((Problem(str(profile), 0, f"eds: no file '{name}' beside this profile"),))
+        raise DataFileError((Problem(str(file), 0, f"eds: no file '{profile.eds}' beside this profile"),))
     return path
+
+
+def _other_bus(name: str, found: str, wanted: str) -> DataFileError:
+    return DataFileError((Problem(name, 0, f"is a profile for {found}, and --drive says {wanted}"),))
 
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:

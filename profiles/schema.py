@@ -10,23 +10,13 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from profiles.data_model import DataModel, refuse_if
-
-Confidence = Literal["verified", "likely", "unverified"]
-"""verified: read in the manufacturer's document or file · likely: a consistent second-hand source · unverified."""
+from profiles.entry import Confidence, Entry, Positive, ProfileName
 
 Index = Annotated[int, Field(ge=0x0001, le=0xFFFF)]
 SubIndex = Annotated[int, Field(ge=0, le=0xFF)]
 U32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 I16 = Annotated[int, Field(ge=-0x8000, le=0x7FFF)]
 I8 = Annotated[int, Field(ge=-0x80, le=0x7F)]
-Positive = Annotated[float, Field(gt=0)]
-
-
-class Entry(DataModel):
-    """What every section of a profile carries."""
-
-    source: str = Field(min_length=3, description="the document, file or measurement that says so")
-    confidence: Confidence = Field(description="verified, likely or unverified")
 
 
 class IdentityEntry(Entry):
@@ -134,7 +124,7 @@ class Cyclic(Entry):
 class CanopenProfile(DataModel):
     """One drive on CANopen."""
 
-    name: str = Field(pattern=r"^[a-z0-9_-]+/[a-z0-9._-]+$", description="vendor/model, as in --profile")
+    name: ProfileName = Field(description="vendor/model, as in --profile")
     title: str = Field(min_length=3, description="one line for tables and reports")
     bus: Literal["canopen"]
     eds: str | None = Field(default=None, description="an EDS file beside this one; null = none needed")
@@ -154,9 +144,11 @@ class CanopenProfile(DataModel):
             refuse_if([("eds", "must be the plain name of a file beside this profile, without a folder")])
         return self
 
-    @property
-    def unverified(self) -> tuple[str, ...]:
-        """Names of the sections that nobody has verified."""
-        sections: dict[str, Entry] = {name: part for name, part in self if isinstance(part, Entry)}
-        sections |= {f"filters[{number}]": part for number, part in enumerate(self.filters)}
-        return tuple(name for name, part in sections.items() if part.confidence == "unverified")
+    def entries(self) -> tuple[tuple[str, Entry], ...]:
+        """(name, entry) of everything that carries a source and a confidence."""
+        found: list[tuple[str, Entry]] = [(name, part) for name, part in self if isinstance(part, Entry)]
+        return (*found, *((f"filters.{part.signal}", part) for part in self.filters))
+
+    def below(self, confidence: Confidence) -> tuple[str, ...]:
+        """Names of the entries of exactly this confidence."""
+        return tuple(name for name, part in self.entries() if part.confidence == confidence)

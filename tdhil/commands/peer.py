@@ -12,7 +12,7 @@ from typing import Any
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import Clock, MonotonicClock, SteppedClock
 from drivers.drive import FrameTap
-from profiles.library import load_profile
+from profiles.library import load_canopen_profile
 from tdhil.bus_options import BusConfig
 from tdhil.options import Resolved
 
@@ -56,7 +56,7 @@ def plan_peer(options: Resolved, bus: BusConfig) -> PeerPlan:
 def open_drive(plan: PeerPlan, options: Resolved, bus: BusConfig, bench_torque_nm: float | None, tap: FrameTap,
                trace: Path | None) -> Iterator[Cia402Drive]:
     """The drive, closed with its bus and simulator afterwards."""
-    profile = load_profile(options["profile"])
+    profile = load_canopen_profile(options["profile"])
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     node = options["node"] if options["node"] is not None else profile.node
     with ExitStack() as stack:

@@ -39,9 +39,9 @@ def peer(wire):
 
 @pytest.fixture(scope="session")
 def profile():
-    from profiles.library import load_profile
+    from profiles.library import load_canopen_profile
 
-    return load_profile("generic/cia402")
+    return load_canopen_profile("generic/cia402")
 
 
 def _canopen():

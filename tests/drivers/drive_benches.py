@@ -16,7 +16,7 @@ import can
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
-from profiles.library import load_profile
+from profiles.library import load_canopen_profile
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from sim_bus.simulator import EmbeddedSimulator
 
@@ -81,7 +81,7 @@ class CanopenBench:
         self.bus = TamperedBus(can.Bus(interface="virtual", channel=self.simulated.channel))
         self.frames = []
         self.drive = Cia402Drive(
-            self.bus, load_profile("generic/cia402"), SteppedClock(), node=1, tap=self.frames.append, **options
+            self.bus, load_canopen_profile("generic/cia402"), SteppedClock(), node=1, tap=self.frames.append, **options
         )
 
     @property

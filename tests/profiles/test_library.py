@@ -28,7 +28,7 @@ def test_generic_says_what_the_driver_needs() -> None:
     assert profile.watchdog.reaction_value == 3
     assert profile.quick_stop.option_code == 6
     assert profile.identity.vendor is None
-    assert not profile.unverified
+    assert not profile.below("unverified")
 
 
 def test_profiles_are_frozen() -> None:
@@ -70,7 +70,7 @@ def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
         ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
         ("eds: cia402.eds", "eds: ../x.eds", "plain name"),
         ("rpm_per_lsb: 0.1", "rpm_per_lsb: 0", "greater than 0"),
-        ("bus: canopen", "bus: modbus", "'canopen' is wanted"),
+        ("bus: canopen", "bus: profibus", "'canopen' or 'modbus' is wanted"),
     ],
 )
 def test_wrong_profiles(tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -95,4 +95,4 @@ def test_an_eds_that_is_not_there(tmp_path: Path) -> None:
 def test_unverified_sections_are_named() -> None:
     data = load_profile("generic/cia402").model_dump()
     data["torque"]["confidence"] = "unverified"
-    assert CanopenProfile.model_validate(data).unverified == ("torque",)
+    assert CanopenProfile.model_validate(data).below("unverified") == ("torque",)
