@@ -89,7 +89,8 @@ def turning_drive(tap: FrameTap | None = None) -> Iterator[tuple[EmbeddedSimulat
     """The default simulated rig, enabled in speed mode."""
     with EmbeddedSimulator(RigParams(), seed=1) as simulator:
         bus = can.Bus(simulator.channel, interface="virtual")
-        drive = Cia402Drive(bus, load_canopen_profile("generic/cia402"), SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
+        profile = load_canopen_profile("generic/cia402")
+        drive = Cia402Drive(bus, profile, SteppedClock(), node=1, rate_hz=RATE_HZ, tap=tap)
         try:
             drive.connect()
             preflight = drive.preflight(LIMITS)
