@@ -26,14 +26,18 @@ class TdhilError(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with a data file; ``line`` counts from 1, 0 where no line can be named."""
+    """One thing wrong with a data file; ``line`` counts from 1, 0 where no line can be named.
+
+    As text it is one printable line, whatever the file holds: a key may be a line break or turn the writing around.
+    """
 
     file: str
     line: int
     message: str
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}: {self.message}" if self.line else f"{self.file}: {self.message}"
+        text = f"{self.file}:{self.line}: {self.message}" if self.line else f"{self.file}: {self.message}"
+        return text if text.isprintable() else "".join(sign if sign.isprintable() else "·" for sign in text)
 
 
 class DataFileError(TdhilError):

@@ -5,7 +5,8 @@ manufacturer's range, and no real drive does.
 """
 
 MARKER_INDEX = 0x5FFE
-"""Record. Sub 1 (VISIBLE_STRING, ro): `MARKER_TEXT`. Sub 2 (UNSIGNED8, rw): 1 = stepped time, 0 = its own clock."""
+"""Record. Sub 1 (VISIBLE_STRING, ro): `MARKER_TEXT`. Sub 2 (UNSIGNED8, rw): 1 = stepped time, 0 = its own clock.
+Sub 3 (UNSIGNED32, rw): period of a SYNC in stepped time, µs, for a simulated drive that wears one without 1006h."""
 
 MARKER_TEXT = "tdhil simulated drive"
 

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from profiles.data_model import DataModel, Finding, refuse_if
 from profiles.entry import Confidence, Entry, Positive, ProfileName
+from profiles.requirement import Require
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -142,21 +143,6 @@ class QuickStop(Entry):
 
     decelerates_in_torque_mode: bool = Field(description="false: the host asks for speed mode at zero speed first")
     ends: Literal["quick_stop", "off"] = Field(description="the state in which the drive is left once at rest")
-
-
-class Require(DataModel):
-    """What a parameter must read; in its unit."""
-
-    equals: float | None = None
-    one_of: tuple[float, ...] | None = None
-    at_least: float | None = None
-    at_most: float | None = None
-
-    @model_validator(mode="after")
-    def _something(self) -> Self:
-        if all(value is None for value in (self.equals, self.one_of, self.at_least, self.at_most)):
-            refuse_if([("", "say equals, one_of, at_least or at_most")])
-        return self
 
 
 class Parameter(Entry):

@@ -1,0 +1,171 @@
+"""Modbus profiles that ship: what each must say, and what a wrong one is told."""
+
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from profiles.errors import DataFileError
+from profiles.library import load_modbus_profile, profile_names, profile_path
+from profiles.modbus_schema import ModbusProfile, Register
+
+NAMES = (
+    "abb/acs880-classic", "abb/acs880-enhanced", "danfoss/fc302", "delta/ms300", "generic/modbus", "lenze/i550",
+    "schneider/atv320", "schneider/atv340-930", "siemens/g120", "siemens/g130-s120", "yaskawa/ga700",
+)
+SPEED_ONLY = {"danfoss/fc302", "delta/ms300", "lenze/i550", "schneider/atv320"}
+
+worn = cache(load_modbus_profile)
+
+
+def text_of(name: str) -> str:
+    return Path(profile_path(name)).read_text(encoding="utf-8")
+
+
+def places(profile: ModbusProfile) -> list[tuple[str, Register]]:
+    """Every register with what stands there; the mode's is left out where another entry has it by right."""
+    cycle = profile.cycle
+    found = [(f"cycle.{name}", getattr(cycle, name).register_)
+             for name in ("control", "status", "speed_setpoint", "torque_setpoint", "speed", "torque", "torque_demand")
+             if getattr(cycle, name) is not None]
+    found += [("modes", profile.modes.register_)] if profile.modes.register_ is not None else []
+    found += [("modes.display", profile.modes.display.register_)] if profile.modes.display is not None else []
+    found += [(f"parameters.{one.name}", one.register_) for one in profile.parameters if one.register_ is not None]
+    found += [(f"echoes.{one.setpoint}", one.register_) for one in profile.echoes]
+    return found
+
+
+def test_all_that_were_promised_ship() -> None:
+    assert set(NAMES) <= set(profile_names())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_loads_under_its_own_name_with_modes_as_promised(name: str) -> None:
+    profile = worn(name)
+    assert profile.name == name
+    assert profile.modes.torque is (name not in SPEED_ONLY)
+    assert profile.experimental is (name == "schneider/atv340-930")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_two_meanings_in_one_register(name: str) -> None:
+    taken: dict[tuple[str, int], str] = {}
+    for what, register in places(worn(name)):
+        for address in range(register.address, register.address + register.count):
+            assert address <= 0xFFFF, what
+            assert taken.setdefault((register.table, address), what) == what
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_functions_reach_every_register_of_the_cycle(name: str) -> None:
+    profile = worn(name)
+    functions = set(profile.cycle.functions)
+    for what, register in places(profile):
+        assert (3 if register.table == "holding" else 4) in functions, what
+        assert register.count <= profile.cycle.largest_read
+        if register.count == 2:
+            assert functions & {16, 23}, what          # or its halves would act one after the other
+    assert functions & {6, 16, 23}
+    written = [getattr(profile.cycle, one).register_ for one in ("control", "speed_setpoint")]
+    assert all(register.table == "holding" for register in written)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sources_are_stated(name: str) -> None:
+    for entry, part in worn(name).entries():
+        assert len(part.source) > 5, entry
+        # The word for second-hand knowledge must not stand beside the mark for first-hand knowledge.
+        assert part.confidence != "verified" or "from memory" not in part.source, entry
+        assert "facts.md" not in part.source
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_words_lead_from_off_to_enabled_and_no_word_is_two_wishes(name: str) -> None:
+    control = worn(name).control
+    onward = {state.means: state.onward for state in control.states if state.onward is not None}
+    assert {"off", "enabled"} <= set(onward)
+    assert all(state.onward is None for state in control.states if state.means in ("fault", "quick_stop"))
+    enabled = next(state.onward for state in control.states if state.means == "enabled")
+    assert enabled not in (control.off, control.quick_stop)
+    assert control.torque_bits == 0 or not control.torque_bits & control.speed_bits
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_state_can_be_seen(name: str) -> None:
+    """No state hides behind one that stands before it in the list."""
+    states = worn(name).control.states
+    for number, state in enumerate(states):
+        words = range(0x1_0000)
+        first = next(
+            (word for word in words if word & state.mask == state.value
+             and all(word & before.mask != before.value for before in states[:number])), None
+        )
+        assert first is not None, state
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_host_that_falls_silent_is_noticed(name: str) -> None:
+    profile = worn(name)
+    watchdog = profile.watchdog
+    assert watchdog.kind == "timeout"
+    assert watchdog.parameter is not None
+    time_out = profile.parameter(watchdog.parameter)
+    assert time_out.unit == "s"
+    # Read, it must be above zero, which switches it off on all of these drives; written, it will be.
+    assert time_out.set_to == "watchdog" or (time_out.require is not None and (time_out.require.at_least or 0.0) > 0.0)
+    if watchdog.reaction_parameter is not None:
+        assert profile.parameter(watchdog.reaction_parameter).require is not None
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_must_be_set_by_hand_says_how(name: str) -> None:
+    own_map = name == "generic/modbus"
+    for parameter in worn(name).parameters:
+        if parameter.require is not None and not own_map:
+            assert parameter.advice, parameter.name
+        if parameter.register_ is None:
+            assert parameter.advice, parameter.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_file_begins_with_what_is_special(name: str) -> None:
+    head = text_of(name).split("\nname:")[0]
+    assert head.startswith("#")
+    if name != "generic/modbus":
+        assert all(f"# {word}" in head for word in ("Special:", "To set:", "Unsure:"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("family: profidrive", "family: profibus", "family"),
+        ("confidence: verified", "confidence: sure", "'verified', 'likely' or 'unverified' is wanted"),
+        ("times: reference_torque", "times: reference_tork", "no parameter 'reference_tork'"),
+        ("parameter: monitoring_time", "parameter: p2040", "no parameter 'p2040'"),
+        ("torque: true", "torque: false", "none where torque is false"),
+        ("by: register", "by: control_bits", "belong to by: register"),
+        ("speed_value: 0", "speed_valve: 0", "speed_valve"),
+        ("address: 99,", "address: 70000,", "65535"),
+        ("per_lsb: 0.00006103515625", "per_lsb: 0", "greater than 0"),
+        ("means: fault", "means: failure", "failure"),
+        ("require: {equals: 63.0}", "require: {}", "say equals, one_of, at_least or at_most"),
+        ("functions: [3, 6, 16]", "functions: [3, 5]", "functions"),
+        ("    documented_s: 0.0\n", "", "give this or documented_s"),
+        ("- name: speed_source", "- name: torque_source", "stands there twice"),
+    ],
+)
+def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = text_of("siemens/g130-s120")
+    assert old in text
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(DataFileError) as caught:
+        load_modbus_profile(str(path))
+    assert words in str(caught.value)
+    assert all(problem.line and problem.file == str(path) for problem in caught.value.problems)
+    assert all("\n" not in str(problem) for problem in caught.value.problems)
+
+
+def test_a_canopen_profile_is_not_taken_for_one() -> None:
+    with pytest.raises(DataFileError, match="is a profile for canopen"):
+        load_modbus_profile("generic/cia402")
