@@ -157,6 +157,8 @@ class Counters:
     missed: int = 0                # cycles without feedback
     late: int = 0                  # feedback that came after its cycle
     overruns: int = 0              # cycles that began late by more than half a period
+    wall_offset_s: float | None = None     # stamps of frames minus control time; None where they bear no wall clock
+    wall_jumps: int = 0            # how often that offset jumped: somebody set the wall clock
 
 
 class Drive(Protocol):

@@ -5,15 +5,16 @@
     TdhilError                      what, where, next step
     ├── DataFileError               rig.yaml:12: unknown key 'speed_max'
     ├── PreflightRefused            the drive's identity is not the profile's; nothing has moved
-    │   └── ObjectRefused           SDO abort 06090030h on 6072h
-    ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out
-    ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck
+    │   └── ObjectRefused           SDO abort 06090030h on 6072h; Modbus exception 2 on register 40111
+    ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out; Modbus CRC
+    ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck; Modbus exception in motion
     │   └── ModeNotConfirmed        6061h did not follow 6060h in time
     ├── LimitHit                    speed left its window; torque or time limit reached
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
     └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
 
-`tdhil.errors` says which of them ends with which exit code.
+Those of one bus only are leaves of these (`drivers.modbus.errors`). `tdhil.errors` says which of them ends with which
+exit code.
 """
 
 from profiles.errors import DataFileError, Problem, TdhilError

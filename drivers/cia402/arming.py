@@ -4,49 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.cia402.mapping import layout, write_pdo
+from drivers.cia402.mapping import layout, write_pdo, written
 from drivers.cia402.objects import consumer_heartbeat
-from drivers.cia402.preflight import Table
 from drivers.cia402.sdo import Objects, name
-from drivers.errors import ObjectRefused
+from drivers.cia402.shape import Shape
+from drivers.cia402.table import Table
+from drivers.errors import ObjectRefused, PreflightRefused
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile, Watchdog
 
+GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 LEAST_CYCLES = 5
 """The watchdog must not bite on account of a lost frame or two."""
 
 
-def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile) -> bool:
+def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape) -> bool:
     """Map both pairs of PDOs; whether the slow one carries the torque demand 6074h too."""
     with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
+    pdos = layout(with_demand, shape)
 
     def work() -> tuple[str, bool]:
-        for pdo in layout(with_demand):
+        for pdo in pdos:
             write_pdo(objects, node, pdo)
         return "as wanted", True
 
-    table.attempt("PDO mapping", "6040+6071+60FF, 6041+6077+606C, 6060, 6061", "1600h, 1A00h", work)
+    table.attempt("PDO mapping", ", ".join(map(written, pdos)), "1600h, 1A00h", work)
     return with_demand
 
 
-def set_timing(table: Table, objects: Objects, period_s: float, heartbeat_s: float, stepped: bool) -> bool:
+def set_timing(
+    table: Table, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
+) -> bool:
     """Cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h; whether the drive produces one."""
     period_us = round(period_s * 1e6)
     try:
+        if not profile.cyclic.has_period:
+            raise ObjectRefused("not in the profile", where="1006h")
         back = objects.change(0x1006, 0, period_us, 32)
         table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
     except ObjectRefused:
         table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")
     if stepped:
+        if not profile.cyclic.has_period:
+            back = objects.change(MARKER_INDEX, 3, period_us, 32)
+            table.row("simulator's cycle", f"{period_us} µs", f"{back} µs", back == period_us, name(MARKER_INDEX, 3))
         on = objects.change(MARKER_INDEX, 2, 1, 8)
         table.row("stepped time", "on", "on" if on else "off", on == 1, name(MARKER_INDEX, 2))
-    time_ms = round(heartbeat_s * 1000)
+    # CiA 301 allows a node one of the two: while it produces a heartbeat it is not guarded.
+    time_ms = 0 if profile.watchdog.kind == "node_guarding" else round(heartbeat_s * 1000)
     try:
         back = objects.change(0x1017, 0, time_ms, 16)
     except ObjectRefused:
-        table.note("drive's heartbeat", "the drive produces none: its silence shows in missing feedback only", "1017h")
+        if time_ms:
+            table.note(
+                "drive's heartbeat", "the drive produces none: its silence shows in missing feedback only", "1017h"
+            )
         return False
-    return table.row("drive's heartbeat", f"{time_ms} ms", f"{back} ms", back == time_ms, "1017h")
+    good = table.row("drive's heartbeat", f"{time_ms} ms", f"{back} ms", back == time_ms, "1017h")
+    return good and time_ms > 0
 
 
 def arm_watchdog(
@@ -58,14 +73,19 @@ def arm_watchdog(
     watchdog_s: float,
     period_s: float,
     beat: Callable[[], None],
-) -> None:
-    """1016h and its reaction, written and read back. Supervision begins with the first beat, so one is sent."""
+    answered: Callable[[], bool],
+) -> float:
+    """The drive's watchdog and its reaction, written and read back; how often the host must feed it, in seconds.
+
+    Supervision begins with the first ``beat`` (heartbeat, or question of the node guarding), so one is sent before the
+    read-back; ``answered`` waits for the drive's answer to a question. 0 where nothing could be armed.
+    """
     if entry.kind == "none":
         table.row(
             "watchdog", "armed", "this drive has none", False, "profile",
             "A host that dies would leave the shaft turning: this drive can't be used",
         )
-        return
+        return 0.0
     index, sub, wanted = entry.reaction_index, entry.reaction_sub, entry.reaction_value
     if index is not None and wanted is not None:
 
@@ -80,7 +100,9 @@ def arm_watchdog(
             "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
             f"Give it at least {LEAST_CYCLES * period_s:g} s, or a higher rate",
         )
-        return
+        return 0.0
+    if entry.kind == "node_guarding":
+        return _arm_guarding(table, objects, time_ms, entry.life_time_factor, beat, answered)
     value = consumer_heartbeat(host_node, time_ms)
 
     def arm() -> tuple[str, bool]:
@@ -93,3 +115,30 @@ def arm_watchdog(
         "watchdog", f"node {host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm,
         "Without it a host that dies would leave the shaft turning",
     )
+    return watchdog_s / 5.0
+
+
+def _arm_guarding(
+    table: Table, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None], answered: Callable[[], bool]
+) -> float:
+    """100Ch guard time in ms x 100Dh factor = life time (CiA 301): the drive acts where it isn't asked for so long."""
+    factor = min(factor, time_ms)
+    guard_ms = time_ms // factor
+
+    def arm() -> tuple[str, bool]:
+        # 100Dh is one byte in the standard and two on some drives: it is written as long as it is read.
+        length = len(objects.read_bytes(LIFE_TIME_FACTOR))
+        objects.change_bytes(LIFE_TIME_FACTOR, 0, factor.to_bytes(length, "little"))
+        objects.change(GUARD_TIME, 0, guard_ms, 16)
+        ask()
+        if not answered():
+            raise PreflightRefused("no answer to the remote frame of node guarding", where="node guarding")
+        found = objects.read(GUARD_TIME), objects.read(LIFE_TIME_FACTOR)
+        return f"{found[0]} ms x {found[1]}, answered", found == (guard_ms, factor)
+
+    table.attempt(
+        "watchdog", f"{guard_ms} ms x {factor}", f"{name(GUARD_TIME)}, {name(LIFE_TIME_FACTOR)}", arm,
+        "Without it a host that dies would leave the shaft turning. Node guarding needs remote frames: python-can's "
+        "socketcand and some gateways don't carry them; use the adapter's own interface",
+    )
+    return guard_ms / 1000.0

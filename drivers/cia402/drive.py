@@ -6,7 +6,8 @@ One cycle, all of it sent by this loop and nothing by any other thread or by the
            700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
 
 Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
-switch and the torque target that seeds it therefore act together.
+switch and the torque target that seeds it therefore act together. A drive that knows no heartbeat consumer is asked
+by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in `shape`.
 """
 
 from __future__ import annotations
@@ -16,18 +17,13 @@ from typing import TYPE_CHECKING
 
 from drivers.cia402 import arming
 from drivers.cia402 import preflight as checks
+from drivers.cia402.guarding import Guarding
+from drivers.cia402.limits import set_limits
 from drivers.cia402.link import CanLink
-from drivers.cia402.objects import (
-    RPDO1,
-    RPDO2,
-    TPDO1,
-    TPDO2_MODE,
-    TPDO2_MODE_DEMAND,
-    Units,
-    encode_speed,
-    encode_torque,
-)
+from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
+from drivers.cia402.parameters import check_parameters
 from drivers.cia402.sdo import Objects, name
+from drivers.cia402.shape import RPDO1, RPDO1_SPEED, shape_of
 from drivers.cia402.state import (
     DISABLE_VOLTAGE,
     FAULT_RESET,
@@ -40,6 +36,8 @@ from drivers.cia402.state import (
     decode,
     power_state,
 )
+from drivers.cia402.table import Table
+from drivers.cia402.units import find_units
 from drivers.cia402.watch import OPERATIONAL, Watch
 from drivers.clock import Clock
 from drivers.drive import (
@@ -68,6 +66,8 @@ HEARTBEAT_S = 0.1
 """Both ways; the host's comes faster where the watchdog is shorter than five of them."""
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
+ANSWER_S = 0.2
+"""Wall time that the drive may take to answer the first question of the node guarding."""
 STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
 """Wall time that feedback may take in stepped time, and after a cycle that brought none."""
 _NO_WORD = b""
@@ -103,7 +103,10 @@ class Cia402Drive:
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
         self._watch = Watch(node, clock)
-        self._link.handlers[0x700 + node] = self._watch.on_heartbeat
+        self._guarding = Guarding(self._watch, lambda: self._link.ask(0x700 + node)) if _guarded(profile) else None
+        self._feed = self._send_heartbeat if self._guarding is None else self._ask_guarded
+        heard = self._watch.on_heartbeat if self._guarding is None else self._guarding.on_frame
+        self._link.handlers[0x700 + node] = heard
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
@@ -114,10 +117,17 @@ class Cia402Drive:
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
         self._modes: dict[int, Mode] = {}
-        self._slow_layout = TPDO2_MODE
+        self._shape = shape_of(profile)
+        self._layout = self._shape.feedback
+        self._data_size = self._shape.data_size()
+        self._wide = self._shape.wide
+        self._has_target = self._shape.target_torque
+        self._slow_layout = self._shape.slow(False)
+        self._data_half = self._status_half = _NO_WORD
         self._watchdog_s = 0.0
         self._heartbeat_every_s = HEARTBEAT_S
         self._wish = Wish.OFF
+        self._in_operation = False     # enabled, and seen enabled since
         self._state = State.NOT_READY
         self._status = 0
         self._speed_raw = 0
@@ -135,7 +145,11 @@ class Cia402Drive:
     @property
     def counters(self) -> Counters:
         """What went wrong on the bus so far."""
-        return Counters(self._cycles, self._missed, self._late, self._overruns)
+        stamps = self._link.stamps
+        return Counters(
+            self._cycles, self._missed, self._late, self._overruns,
+            wall_offset_s=stamps.offset_s, wall_jumps=stamps.jumps,
+        )
 
     # -- before motion ---------------------------------------------------------------------------------------
 
@@ -166,35 +180,45 @@ class Cia402Drive:
         """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
-        table, objects = checks.Table(), self._objects
+        table, objects, scaling = Table(), self._objects, Table()
+        self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
         checks.check_identity(table, self._identity, self._profile)
-        checks.check_state(table, objects)
+        checks.check_state(table, objects, self._units)
+        check_parameters(table, objects, self._profile)
         self._codes = checks.choose_modes(table, objects, self._profile)
         self._modes = {code: mode for mode, code in self._codes.items()}
-        self._units, rated_nm = checks.find_units(table, objects, self._profile, self._rated_torque_nm)
-        checks.set_limits(table, objects, self._profile, limits, rated_nm)
-        checks.clear_targets(table, objects)
+        table.checks += scaling.checks
+        set_limits(table, objects, self._profile, limits, rated_nm)
+        checks.clear_targets(table, objects, self._profile)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
-        with_demand = arming.map_pdos(table, objects, self._node, self._profile)
-        self._slow_layout = TPDO2_MODE_DEMAND if with_demand else TPDO2_MODE
+        with_demand = arming.map_pdos(table, objects, self._node, self._profile, self._shape)
+        self._slow_layout = self._shape.slow(with_demand)
         self._heartbeat_every_s = min(HEARTBEAT_S, limits.watchdog_s / 5.0)
-        heard = arming.set_timing(table, objects, self.period_s, HEARTBEAT_S, self.clock.stepped)
+        heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
         self._watchdog_s = limits.watchdog_s
-        arming.arm_watchdog(
+        feed_s = arming.arm_watchdog(
             table,
             objects,
             self._profile.watchdog,
             host_node=self._host_node,
             watchdog_s=limits.watchdog_s,
             period_s=self.period_s,
-            beat=self._send_heartbeat,
+            beat=self._feed,
+            answered=self._answered,
         )
+        self._heartbeat_every_s = min(HEARTBEAT_S, feed_s or HEARTBEAT_S)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
         )
-        self._start(DRIVE_SILENT_S if heard else 0.0)
+        guarded = self._guarding is not None and feed_s > 0.0
+        self._start(limits.watchdog_s if guarded else DRIVE_SILENT_S if heard else 0.0)
         return found
+
+    def _answered(self) -> bool:
+        """Waits for the first answer of a guarded drive."""
+        guarding = self._guarding
+        return guarding is None or self._link.pump_until(lambda: guarding.answers > 0, ANSWER_S)
 
     def _is_simulated(self) -> bool:
         try:
@@ -212,7 +236,7 @@ class Cia402Drive:
     def _pause(self) -> None:
         """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""
         if self._watchdog_s:
-            self._send_heartbeat()
+            self._feed()
         self._link.pump_until(lambda: False, 0.01)
 
     # -- the cycle -------------------------------------------------------------------------------------------
@@ -221,7 +245,7 @@ class Cia402Drive:
         """From the next cycle on move towards operation enabled in ``mode``."""
         if mode not in self._codes:
             raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
-        self._wish = Wish.ENABLED
+        self._wish, self._in_operation = Wish.ENABLED, False
 
     def quick_stop(self) -> None:
         """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling."""
@@ -253,20 +277,25 @@ class Cia402Drive:
         self._watch.check()
         now_s = self.clock.now_s()
         if now_s >= self._next_heartbeat_s:
-            self._send_heartbeat()
+            self._feed()
         code = self._codes[command.mode]
         self._since_mode_sent += 1
         if code != self._sent_code or (code != self._shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES):
-            self._link.send(self._rpdo2_id, RPDO2.pack(code))
+            if self._shape.mode:
+                self._link.send(self._rpdo2_id, RPDO2.pack(code))
             self._sent_code, self._since_mode_sent = code, 0
-        self._link.send(self._rpdo1_id, RPDO1.pack(controlword_towards(self._state, self._wish), torque_raw, speed_raw))
-        self._feedback = _NO_WORD
+        word = controlword_towards(self._state, self._wish)
+        self._link.send(
+            self._rpdo1_id,
+            RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
+        )
+        self._feedback = self._data_half = self._status_half = _NO_WORD
         self._link.send(SYNC, _NO_WORD)
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         fresh = self._heard = bool(self._feedback)
         if fresh:
-            self._status, self._torque_raw, self._speed_raw = TPDO1.unpack(self._feedback)
+            self._status, self._torque_raw, self._speed_raw = self._layout.unpack(self._feedback)
             self._state = decode(self._status)
             self._follow_state()
         else:
@@ -275,11 +304,19 @@ class Cia402Drive:
         return self._sample(now_s, age_s, fresh)
 
     def _follow_state(self) -> None:
-        """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us."""
-        if self._wish is Wish.ENABLED and self._state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            self._wish = Wish.OFF
-        elif self._wish is Wish.ENABLED and self._state is State.QUICK_STOP_ACTIVE:
+        """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.
+
+        Some drives leave by fault, some by quick stop, and some are simply found switched off, once their own watchdog
+        has brought the shaft to rest.
+        """
+        if self._wish is not Wish.ENABLED:
+            return
+        if self._state is State.OPERATION_ENABLED:
+            self._in_operation = True
+        elif self._state is State.QUICK_STOP_ACTIVE:
             self._wish = Wish.QUICK_STOP
+        elif self._in_operation or self._state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            self._wish = Wish.OFF
 
     def _wait_for_tick(self) -> None:
         clock = self.clock
@@ -331,18 +368,35 @@ class Cia402Drive:
         The heartbeats that are due in control time stay due.
         """
         due_s = self._next_heartbeat_s
-        self._send_heartbeat()
+        self._feed()
         self._next_heartbeat_s = due_s
 
     def _send_heartbeat(self) -> None:
         self._link.send(0x700 + self._host_node, bytes((OPERATIONAL,)))
         self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
 
+    def _ask_guarded(self) -> None:
+        assert self._guarding is not None
+        self._guarding.feed()
+        self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
+
     def _on_feedback(self, data: bytes) -> None:
-        if len(data) == TPDO1.size:
-            self._feedback = data
+        if len(data) == self._data_size:
+            if self._wide:
+                self._data_half = data
+                self._join()
+            else:
+                self._feedback = data
+
+    def _join(self) -> None:
+        """A wide drive's two TPDOs of one SYNC, in whichever order they came."""
+        if self._data_half and self._status_half:
+            self._feedback = self._status_half + self._data_half
 
     def _on_slow_feedback(self, data: bytes) -> None:
+        if self._wide and len(data) == 2 + self._slow_layout.size:
+            self._status_half, data = data[:2], data[2:]
+            self._join()
         if len(data) == self._slow_layout.size:
             values = self._slow_layout.unpack(data)
             self._shown_code = values[0]
@@ -388,6 +442,10 @@ class Cia402Drive:
         finally:
             self._link.close()
         return left
+
+
+def _guarded(profile: CanopenProfile) -> bool:
+    return profile.watchdog.kind == "node_guarding"
 
 
 __all__ = ["HOST_NODE", "Cia402Drive"]

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from drivers.cia402.stamps import FrameStamps
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
@@ -36,11 +37,24 @@ class CanLink:
         self._tap = tap
         self.handlers: dict[int, Handler] = {}
         self.error_frames = 0
+        self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
 
     def send(self, identifier: int, data: bytes) -> None:
         """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it."""
-        message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
+        self._put(self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False))
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
+
+    def ask(self, identifier: int) -> None:
+        """Put a remote frame of one byte on the bus (node guarding); tapped as a frame without data."""
+        self._put(self._message(
+            arbitration_id=identifier, is_remote_frame=True, dlc=1, is_extended_id=False, check=False
+        ))
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), True, identifier, b""))
+
+    def _put(self, message: can.Message) -> None:
         try:
             self._bus.send(message)
         except Exception as error:  # python-can's backends raise CanError, OSError, BrokenPipeError alike
@@ -49,8 +63,6 @@ class CanLink:
                 where=self.name,
                 next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
             ) from error
-        if self._tap is not None:
-            self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
         """The next frame as (identifier, data), already handed on; None after ``timeout_s`` of wall time."""
@@ -67,6 +79,8 @@ class CanLink:
         if message.is_error_frame:
             self.error_frames += 1
             return -1, b""
+        if not self._clock.stepped:
+            self.stamps.take(message.timestamp, self._clock.now_s())
         identifier, data = message.arbitration_id, bytes(message.data)
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), False, identifier, data))

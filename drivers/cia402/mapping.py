@@ -14,12 +14,12 @@ from drivers.cia402.objects import (
     STATUSWORD,
     TARGET_TORQUE,
     TARGET_VELOCITY,
-    TORQUE_ACTUAL,
     TORQUE_DEMAND,
     VELOCITY_ACTUAL,
     mapping_entry,
 )
 from drivers.cia402.sdo import Objects, name
+from drivers.cia402.shape import STANDARD, Shape
 from drivers.errors import PreflightRefused
 
 DISABLED = 1 << 31
@@ -50,15 +50,23 @@ class Pdo:
         return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
 
 
-def layout(with_demand: bool) -> tuple[Pdo, Pdo, Pdo, Pdo]:
-    """RPDO1, TPDO1, RPDO2, TPDO2 (see `objects`); ``with_demand`` adds 6074h where the drive has it."""
+def layout(with_demand: bool, shape: Shape = STANDARD) -> tuple[Pdo, ...]:
+    """RPDO1, TPDO1, RPDO2 (where the mode may change), TPDO2; ``with_demand`` adds 6074h where the drive has it."""
+    targets = (TARGET_TORQUE, TARGET_VELOCITY) if shape.target_torque else (TARGET_VELOCITY,)
     slow = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
-    return (
-        Pdo(True, 1, 1, (CONTROLWORD, TARGET_TORQUE, TARGET_VELOCITY)),
-        Pdo(False, 1, 1, (STATUSWORD, TORQUE_ACTUAL, VELOCITY_ACTUAL)),
-        Pdo(True, 2, 1, (MODE,)),
-        Pdo(False, 2, SLOW_SYNCS, slow),
-    )
+    first: tuple[tuple[int, int, int], ...]
+    second: tuple[tuple[int, int, int], ...]
+    if shape.wide:
+        first, second, syncs = (shape.torque, VELOCITY_ACTUAL), (STATUSWORD, *slow), 1
+    else:
+        first, second, syncs = (STATUSWORD, shape.torque, VELOCITY_ACTUAL), slow, SLOW_SYNCS
+    modes = (Pdo(True, 2, 1, (MODE,)),) if shape.mode else ()
+    return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
+
+
+def written(pdo: Pdo) -> str:
+    """The objects in it, as people write them: 6040+6071+60FF."""
+    return "+".join(f"{index:04X}:{sub}" if sub else f"{index:04X}" for index, sub, _ in pdo.mapped)
 
 
 def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:

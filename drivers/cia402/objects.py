@@ -7,7 +7,7 @@ Cyclic data, little endian, one instant for torque and speed::
     RPDO2  6060h modes of operation i8
     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰]
 
-‰ is of the rated torque (6076h); the velocity's LSB is the profile's.
+‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
 """
 
 import math
@@ -42,10 +42,11 @@ MODE_NAMES = {3: "profile velocity", 4: "profile torque", 9: "cyclic sync veloci
 
 @dataclass(frozen=True)
 class Units:
-    """What one LSB means on this drive."""
+    """What one LSB means on this drive: of the speed both ways, of the reported torque, of the target torque 6071h."""
 
     speed_rad_s_per_lsb: float
     torque_nm_per_lsb: float
+    target_nm_per_lsb: float | None = None      # None: as reported
 
 
 def encode_speed(speed_rad_s: float, units: Units) -> int:
@@ -55,7 +56,8 @@ def encode_speed(speed_rad_s: float, units: Units) -> int:
 
 def encode_torque(torque_nm: float, units: Units) -> int:
     """N·m at the motor shaft → 6071h. Raises CommandRejected outside i16 or if not finite."""
-    return _encode(torque_nm, units.torque_nm_per_lsb, 15, "target torque 6071h", "N·m")
+    per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
+    return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
 
 
 def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> int:

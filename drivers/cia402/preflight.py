@@ -5,47 +5,19 @@ A line that fails does not hide those after it: the whole table is worth more to
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from drivers.cia402.filters import read_filters
-from drivers.cia402.objects import MODE_NAMES, RPM, Units
-from drivers.cia402.sdo import Objects, name
+from drivers.cia402.objects import MODE_NAMES, Units
+from drivers.cia402.sdo import Objects
 from drivers.cia402.state import State, decode
-from drivers.drive import Check, Identity, Limits, Mode, Outcome, Preflight
+from drivers.cia402.table import Table
+from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
 from profiles.schema import CanopenProfile
 
-STILL_LSB = 5
-"""Velocity counts that are the noise of a shaft at rest."""
-
-
-class Table:
-    """Collects the rows."""
-
-    def __init__(self) -> None:
-        self.checks: list[Check] = []
-
-    def row(self, title: str, wanted: str, found: str, good: bool, where: str = "", next_step: str = "") -> bool:
-        outcome = Outcome.OK if good else Outcome.REFUSED
-        self.checks.append(Check(title, wanted, found, outcome, where, "" if good else next_step))
-        return good
-
-    def note(self, title: str, found: str, where: str = "") -> None:
-        self.checks.append(Check(title, "", found, Outcome.NOTE, where))
-
-    def attempt(
-        self, title: str, wanted: str, where: str, work: Callable[[], tuple[str, bool]], mend: str = ""
-    ) -> None:
-        """A row whose work may be refused by the drive: that refusal is then the row."""
-        try:
-            found, good = work()
-        except PreflightRefused as error:
-            self.checks.append(
-                Check(title, wanted, error.what, Outcome.REFUSED, error.where or where, mend or error.next_step)
-            )
-        else:
-            self.row(title, wanted, found, good, where, mend)
+STILL_LSB, STILL_RAD_S = 5, 0.05
+"""Velocity counts, or speed where a count is less, that are the noise of a shaft at rest."""
 
 
 def check_identity(table: Table, identity: Identity, profile: CanopenProfile) -> None:
@@ -74,7 +46,7 @@ def check_identity(table: Table, identity: Identity, profile: CanopenProfile) ->
         )
 
 
-def check_state(table: Table, objects: Objects) -> None:
+def check_state(table: Table, objects: Objects, units: Units) -> None:
     """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop."""
     state = decode(objects.read(0x6041))
     faulty = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -84,7 +56,7 @@ def check_state(table: Table, objects: Objects) -> None:
     if state is State.QUICK_STOP_ACTIVE:
         # Disabling would let it coast: it must have come to rest under its own quick stop.
         speed_lsb = objects.read(0x606C, signed=True)
-        braking = abs(speed_lsb) > STILL_LSB
+        braking = abs(speed_lsb) > max(STILL_LSB, STILL_RAD_S / units.speed_rad_s_per_lsb)
         found += f", velocity {speed_lsb}"
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
     table.row("state", "no fault, at rest", found, not faulty and not braking, "6041h", mend)
@@ -135,93 +107,16 @@ def check_mode_display(table: Table, objects: Objects, code: int, wait: Callable
     )
 
 
-def find_units(
-    table: Table, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
-) -> tuple[Units, float]:
-    """Scaling, from the drive where it has it, else from the rig; and the rated torque, N·m."""
-    per_lsb = profile.torque.rated_torque_nm_per_lsb
-    raw = None if per_lsb is None else objects.read_if_there(0x6076)
-    from_drive = raw * per_lsb if raw and per_lsb is not None else None
-    rated_nm = rated_torque_nm if rated_torque_nm is not None else from_drive
-    if rated_nm is None:
-        table.row(
-            "rated torque", "known", "the drive does not tell", False, "6076h",
-            "Give drive_data.rated_torque_nm in rig.yaml (motor name plate)",
-        )
-        rated_nm = 1.0
-    elif from_drive is None:
-        table.note("rated torque", f"{rated_nm:g} N·m, from the rig", "6076h")
-    else:
-        agree = abs(from_drive - rated_nm) <= 0.001 * rated_nm
-        table.row(
-            "rated torque", f"{rated_nm:g} N·m", f"{from_drive:g} N·m", agree, "6076h",
-            "rig.yaml and the drive disagree, and every torque is scaled by it: find out which is right",
-        )
-    units = Units(profile.speed.rpm_per_lsb * RPM, profile.torque.rated_per_lsb * rated_nm)
-    return units, rated_nm
-
-
-def set_limits(
-    table: Table, objects: Objects, profile: CanopenProfile, limits: Limits, rated_nm: float
-) -> None:
-    """The drive's own torque limit, speed limit and quick stop, written and read back."""
-    torque_lsb = profile.torque.max_torque_rated_per_lsb
-    if torque_lsb is None:
-        table.note("torque limit", "the drive has no 6072h: only the guard and the setpoint hold it")
-    else:
-        _limit(table, objects, "torque limit", 0x6072, limits.torque_nm, torque_lsb * rated_nm, 16, "N·m", math.floor)
-    if profile.speed.max_motor_speed_rpm_per_lsb is None:
-        table.note("speed limit", "the drive has no 6080h: set its own speed limit by hand")
-    else:
-        per_lsb = profile.speed.max_motor_speed_rpm_per_lsb * RPM
-        _limit(table, objects, "speed limit", 0x6080, limits.speed_rad_s, per_lsb, 32, "rad/s", math.ceil)
-    if profile.quick_stop.deceleration_rpm_s_per_lsb is not None:
-        per_lsb = profile.quick_stop.deceleration_rpm_s_per_lsb * RPM
-        _limit(
-            table, objects, "quick-stop ramp", 0x6085, limits.quick_stop_rad_s2, per_lsb, 32, "rad/s²", math.ceil
-        )
-    code = profile.quick_stop.option_code
-    if code is not None:
-        table.attempt(
-            "quick-stop option", str(code), "605Ah", lambda: _same(objects.change(0x605A, 0, code, 16), code)
-        )
-
-
-def clear_targets(table: Table, objects: Objects) -> None:
+def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> None:
     """No setpoint of an earlier run may act when the drive is enabled."""
+    targets = ((0x6071, 16), (0x60FF, 32)) if profile.modes.torque else ((0x60FF, 32),)
 
     def work() -> tuple[str, bool]:
-        for index, bits in ((0x6071, 16), (0x60FF, 32)):
+        for index, bits in targets:
             objects.write(index, 0, 0, bits)
         return "0", True
 
-    table.attempt("targets", "0", "6071h, 60FFh", work)
-
-
-def _limit(
-    table: Table,
-    objects: Objects,
-    title: str,
-    index: int,
-    value: float,
-    per_lsb: float,
-    bits: int,
-    unit: str,
-    rounding: Callable[[float], int],
-) -> None:
-    # One part in 10^9 of slack: a limit that is a whole number of LSB must not lose one to the last bit.
-    slack = 1e-9 if rounding is math.floor else -1e-9
-    raw = max(1, rounding(value / per_lsb * (1.0 + slack)))
-
-    def work() -> tuple[str, bool]:
-        back = objects.change(index, 0, raw, bits)
-        return f"{back * per_lsb:.6g} {unit}", back == raw
-
-    table.attempt(title, f"{raw * per_lsb:.6g} {unit}", name(index), work)
-
-
-def _same(found: int, wanted: int) -> tuple[str, bool]:
-    return str(found), found == wanted
+    table.attempt("targets", "0", ", ".join(f"{index:04X}h" for index, _ in targets), work)
 
 
 def report(

@@ -110,11 +110,15 @@ class Objects:
             data = value.to_bytes(bits // 8, "little", signed=value < 0)
         except OverflowError as error:
             raise ObjectRefused(f"{value} doesn't fit into {bits} bits", where=name(index, subindex)) from error
+        self.write_bytes(index, subindex, data, str(value))
+
+    def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
+        """``shown`` is the value as people read it."""
         try:
             self._client.download(index, subindex, data)
         except SdoAbortedError as error:
             raise ObjectRefused(
-                f"the drive did not take {value} for the object: {error}", where=name(index, subindex)
+                f"the drive did not take {shown or data.hex(' ')} for the object: {error}", where=name(index, subindex)
             ) from error
         except SdoCommunicationError as error:
             raise self._silent(index, subindex) from error
@@ -129,6 +133,16 @@ class Objects:
                 self.on_restore(lambda: self.write(index, subindex, before, bits))
             self.write(index, subindex, value, bits)
         return self.read(index, subindex, signed=signed)
+
+    def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
+        """As `change`, for an object of any type."""
+        before = self.read_bytes(index, subindex)
+        if before != data:
+            if (index, subindex) not in self._changed:
+                self._changed.add((index, subindex))
+                self.on_restore(lambda: self.write_bytes(index, subindex, before))
+            self.write_bytes(index, subindex, data)
+        return self.read_bytes(index, subindex)
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called by `restore`."""

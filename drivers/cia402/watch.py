@@ -4,6 +4,8 @@ Each kind of trouble is kept until it has been raised, once, in the order in whi
 goes on exchanging is then not disturbed by it again.
 """
 
+from collections.abc import Callable
+
 from drivers.clock import Clock
 from drivers.errors import CommunicationLost, DriveFault, TdhilError
 
@@ -54,7 +56,10 @@ def emcy_text(code: int) -> str:
 
 
 class Watch:
-    """Follows one node. ``allowed_silence_s`` is how long its heartbeat may fail to come (0 = not watched)."""
+    """Follows one node. ``allowed_silence_s`` is how long its heartbeat may fail to come (0 = not watched).
+
+    Where the drive is guarded instead, `Guarding` hands on its answers as if they were heartbeats.
+    """
 
     def __init__(self, node: int, clock: Clock) -> None:
         self._node = node
@@ -67,6 +72,7 @@ class Watch:
         self.allowed_silence_s = 0.0
         self.expect_operational = False
         self.emcy_code = 0
+        self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
 
     def on_heartbeat(self, data: bytes) -> None:
         """700h + node: the NMT state, or 0 for boot-up."""
@@ -119,11 +125,12 @@ class Watch:
         if self.allowed_silence_s and self._heard_s is not None:
             silent_s = self._clock.now_s() - self._heard_s
             if silent_s > self.allowed_silence_s:
+                missing, where = self.sign_of_life()
                 self._keep(
                     "heartbeat",
                     CommunicationLost(
-                        f"the drive's heartbeat has been missing for {silent_s:.2f} s",
-                        where=f"node {self._node}, 1017h",
+                        f"the drive's {missing} for {silent_s:.2f} s",
+                        where=f"node {self._node}, {where}",
                         next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
                     ),
                 )

@@ -50,7 +50,25 @@ def _canopen():
     return CanopenBench
 
 
-MAKERS = {"canopen": _canopen}
+def _modbus():
+    from modbus_bench import ModbusBench
+
+    return ModbusBench
+
+
+def _epos4():
+    from profile_benches import Epos4Bench
+
+    return Epos4Bench
+
+
+def _s120():
+    from profile_benches import S120Bench
+
+    return S120Bench
+
+
+MAKERS = {"canopen": _canopen, "epos4": _epos4, "modbus": _modbus, "s120-canopen": _s120}
 
 
 @pytest.fixture(params=sorted(MAKERS))

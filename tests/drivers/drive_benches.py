@@ -4,7 +4,9 @@ A bench has ``drive`` (not yet connected), ``frames`` (what its tap saw), ``limi
 
 - ``settings()``: what stands in the drive, read by a client of the tests' own;
 - ``decode(frames)``: the feedback in the tapped frames as [(status, speed, torque, demand, mode)], one a cycle;
-- ``setpoints(frames)``: the setpoints in them as [(speed, torque)].
+- ``setpoints(frames)``: the setpoints in them as [(speed, torque)];
+- ``modes``; ``ends``, the state that a quick stop leaves the drive in, after a ramp of ``ramp_rad_s2``;
+- ``heard()``: what another station heard, as [(identifier, data)]; ``LEAST_FRAMES`` in 1,500 cycles.
 """
 
 import math
@@ -71,18 +73,29 @@ class CanopenBench:
                                                    (0x1A00, range(5))) for sub in subs
     )
     WATCHDOG = (0x1016, 1)
+    LEAST_FRAMES = 4000
+    OWN_IDENTIFIERS = True         # by its identifier a frame's direction is known
+
+    PROFILE, WORN = "generic/cia402", False
+    modes = frozenset({Mode.SPEED, Mode.TORQUE})
+    ends = PowerState.QUICK_STOP
+    speed_lsb, torque_lsb = 0.1 * RPM, 1.0
+    ramp_rad_s2 = LIMITS.quick_stop_rad_s2
 
     def __init__(self, params=None, *, seed=0, **options):
         self.limits = LIMITS
         self.rated_nm = 1000.0
-        self.speed_lsb, self.torque_lsb = 0.1 * RPM, 1.0
-        self.simulated = EmbeddedSimulator(params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed).open()
+        profile = load_canopen_profile(self.PROFILE)
+        self.simulated = EmbeddedSimulator(
+            params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed, profile=profile if self.WORN else None
+        ).open()
         self._second = can.Bus(interface="virtual", channel=self.simulated.channel)
         self.bus = TamperedBus(can.Bus(interface="virtual", channel=self.simulated.channel))
         self.frames = []
-        self.drive = Cia402Drive(
-            self.bus, load_canopen_profile("generic/cia402"), SteppedClock(), node=1, tap=self.frames.append, **options
-        )
+        self.drive = Cia402Drive(self.bus, profile, SteppedClock(), node=1, tap=self._tap, **options)
+
+    def _tap(self, frame):
+        self.frames.append(frame)
 
     @property
     def true_speed_rad_s(self):
@@ -114,7 +127,8 @@ class CanopenBench:
                 return int.from_bytes(data[4 : 8 - (data[0] >> 2 & 3)], "little")
         raise AssertionError("the simulated drive does not answer")
 
-    def settings(self, keys=SETTINGS):
+    def settings(self, keys=None):
+        keys = self.SETTINGS if keys is None else keys
         return {f"{index:04X}h:{sub}": self.read(index, sub) for index, sub in keys}
 
     def decode(self, frames):
@@ -177,8 +191,13 @@ class Run:
         self.enable()
         return self.go(6.0, speed=speed)
 
+    def rests(self, sample):
+        """As the drive says: some switch themselves off once they are at rest."""
+        off = self.bench.ends is PowerState.OFF and sample.state is PowerState.OFF
+        return sample.standstill or off
+
     def stop(self):
         self.drive.quick_stop()
-        self.until(lambda sample: sample.standstill, 30.0)
+        self.until(self.rests, 30.0)
         self.drive.disable()
         self.until(lambda sample: sample.state is PowerState.OFF, 1.0)

@@ -11,7 +11,26 @@ from drivers.drive import Command, Counters, Mode, Outcome, PowerState
 from drivers.errors import CommandRejected, PreflightRefused, TdhilError
 from sim_bus.params import RigParams
 
+SPEED_GAIN = 300.0                                 # of its speed loop, N·m·s/rad
 VISCOUS, COULOMB, INERTIA = 8.0, 60.0, 104.0       # the simulated rig
+
+
+@pytest.fixture
+def torque_run(run):
+    """A drive that can regulate torque; the others refuse to, which is all that there is to see on them."""
+    if Mode.TORQUE not in run.bench.modes:
+        run.ready()
+        with pytest.raises(PreflightRefused, match="torque"):
+            run.drive.enable(Mode.TORQUE)
+        with pytest.raises(CommandRejected, match="torque"):
+            run.cycle(Mode.TORQUE)
+        pytest.skip("a drive without torque mode: it refused, as it must")
+    return run
+
+
+def other_mode(run):
+    """Torque where the drive has it."""
+    return Mode.TORQUE if Mode.TORQUE in run.bench.modes else Mode.SPEED
 
 
 def test_identity_and_preflight(run):
@@ -21,7 +40,7 @@ def test_identity_and_preflight(run):
     found = run.drive.preflight(run.bench.limits)
     assert found.refused == ()
     assert found.identity == identity
-    assert found.modes == {Mode.SPEED, Mode.TORQUE}
+    assert found.modes == run.bench.modes
     assert found.rated_torque_nm == pytest.approx(run.bench.rated_nm)
     assert found.torque_resolution_nm == pytest.approx(run.bench.torque_lsb)
     assert found.speed_resolution_rad_s == pytest.approx(run.bench.speed_lsb)
@@ -56,7 +75,8 @@ def test_the_whole_order(run):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_torque_drives_speed_of_its_own_sign(run, sign):
+def test_torque_drives_speed_of_its_own_sign(torque_run, sign):
+    run = torque_run
     run.ready()
     run.enable(Mode.TORQUE)
     begin = run.samples[-1]
@@ -65,7 +85,7 @@ def test_torque_drives_speed_of_its_own_sign(run, sign):
     # J dω/dt = T − T_c − B ω, solved by hand
     elapsed_s = last.time_s - begin.time_s
     wanted = sign * (150.0 - COULOMB) / VISCOUS * (1.0 - math.exp(-VISCOUS * elapsed_s / INERTIA))
-    assert last.speed_rad_s == pytest.approx(wanted, rel=0.02)
+    assert last.speed_rad_s == pytest.approx(wanted, rel=0.02, abs=0.6 * run.bench.speed_lsb)
 
 
 @pytest.mark.parametrize("speed", [5.0, -3.0, 12.5])
@@ -73,13 +93,15 @@ def test_the_steady_speed_is_the_one_commanded(run, speed):
     run.ready()
     run.enable()
     last = run.go(12.0, speed=speed)
-    assert last.speed_rad_s == pytest.approx(speed, abs=1.1 * run.bench.speed_lsb)
-    assert run.bench.true_speed_rad_s == pytest.approx(speed, abs=1.1 * run.bench.speed_lsb)
+    near = max(1.1 * run.bench.speed_lsb, 0.01)
+    assert last.speed_rad_s == pytest.approx(speed, abs=near)
+    assert run.bench.true_speed_rad_s == pytest.approx(speed, abs=near)
     friction = math.copysign(COULOMB, speed) + VISCOUS * speed
-    assert last.torque_nm == pytest.approx(friction, abs=2.0 * run.bench.torque_lsb)
+    assert last.torque_nm == pytest.approx(friction, abs=max(2.0 * run.bench.torque_lsb, 1.0))
 
 
-def test_switching_modes_both_ways_is_bumpless_and_confirmed(run):
+def test_switching_modes_both_ways_is_bumpless_and_confirmed(torque_run):
+    run = torque_run
     steady = run.turning(5.0)
     seed = steady.torque_nm
     run.until(lambda sample: sample.mode is Mode.TORQUE, 1.0, Mode.TORQUE, 5.0, seed)
@@ -88,11 +110,13 @@ def test_switching_modes_both_ways_is_bumpless_and_confirmed(run):
     run.go(1.0, Mode.SPEED, run.samples[-1].speed_rad_s, seed)
     after = [sample for sample in run.samples if sample.time_s > steady.time_s]
     assert {sample.state for sample in after} == {PowerState.ENABLED}
-    assert max(abs(sample.torque_nm - seed) for sample in after) < 8.0
-    assert max(abs(sample.speed_rad_s - 5.0) for sample in after) < 0.05
+    # Half a count of the speed that it is switched at is a kick of the speed loop's.
+    assert max(abs(sample.torque_nm - seed) for sample in after) < max(8.0, 0.55 * SPEED_GAIN * run.bench.speed_lsb)
+    assert max(abs(sample.speed_rad_s - 5.0) for sample in after) < max(0.05, 1.3 * run.bench.speed_lsb)
 
 
-def test_the_mode_that_is_shown_is_the_drives(run):
+def test_the_mode_that_is_shown_is_the_drives(torque_run):
+    run = torque_run
     run.ready()
     run.enable(Mode.TORQUE)
     assert run.go(0.1, Mode.TORQUE).mode is Mode.TORQUE
@@ -101,8 +125,9 @@ def test_the_mode_that_is_shown_is_the_drives(run):
 
 def test_the_limits_stand_in_the_drive_and_act(run):
     run.ready()
-    run.enable(Mode.TORQUE)
-    run.go(3.0, Mode.TORQUE, torque=390.0)
+    mode = other_mode(run)
+    run.enable(mode)
+    run.go(3.0, mode, speed=19.0, torque=390.0)
     assert max(sample.torque_nm for sample in run.samples) == pytest.approx(300.0, abs=run.bench.torque_lsb)
     assert run.samples[-1].limit_active
     run.go(1.0, Mode.SPEED, speed=run.samples[-1].speed_rad_s)
@@ -113,20 +138,22 @@ def test_the_limits_stand_in_the_drive_and_act(run):
 
 @pytest.mark.parametrize("mode", [Mode.SPEED, Mode.TORQUE])
 def test_a_quick_stop_brakes_on_the_ramp_and_holds(run, mode):
+    if mode not in run.bench.modes:
+        pytest.skip("a drive without torque mode")
     steady = run.turning(8.0)
     if mode is Mode.TORQUE:
         run.go(0.5, mode, 8.0, steady.torque_nm)
     run.drive.quick_stop()
     begin = len(run.samples)
-    run.until(lambda sample: sample.standstill, 20.0, mode, 8.0, steady.torque_nm)
+    run.until(run.rests, 20.0, mode, 8.0, steady.torque_nm)
     fall = [sample for sample in run.samples[begin:] if 1.0 < sample.speed_rad_s < 7.0]
     ramp = (fall[0].speed_rad_s - fall[-1].speed_rad_s) / (fall[-1].time_s - fall[0].time_s)
-    assert ramp == pytest.approx(run.bench.limits.quick_stop_rad_s2, rel=0.05)
+    assert ramp == pytest.approx(run.bench.ramp_rad_s2, rel=0.05)
     assert {sample.state for sample in fall} == {PowerState.QUICK_STOP}
     # setpoints that go on coming move nothing
     last = run.go(1.0, mode, 8.0, 200.0)
-    assert last.state is PowerState.QUICK_STOP
-    assert last.standstill
+    assert last.state is run.bench.ends
+    assert run.rests(last)
     assert abs(run.bench.true_speed_rad_s) < 0.01
 
 
@@ -178,14 +205,14 @@ def test_counters(run):
     run.ready()
     assert run.drive.counters == Counters()
     run.go(0.4)
-    assert run.drive.counters == Counters(cycles=100)
+    assert run.drive.counters == Counters(cycles=round(0.4 / run.drive.period_s))
 
 
 def test_the_frames_on_the_bus_say_what_the_samples_say(make_bench):
     """With lags, noise and quanta, decoded by formats typed in the tests."""
     run = Run(make_bench(RigParams(), seed=3))
     run.turning(4.0)
-    run.go(1.0, Mode.TORQUE, 4.0, 90.0)
+    run.go(1.0, other_mode(run), 4.0, 90.0)
     run.stop()
     decoded = run.bench.decode(run.bench.frames)
     assert len(decoded) == len(run.samples)
@@ -206,7 +233,8 @@ def test_the_frames_on_the_bus_carry_the_setpoints(run):
     assert len(sent) == len(wanted)
     for (speed, torque), (speed_sent, torque_sent) in zip(wanted, sent, strict=True):
         assert abs(speed - speed_sent) <= 0.5001 * run.bench.speed_lsb
-        assert abs(torque - torque_sent) <= 0.5001 * run.bench.torque_lsb
+        if torque_sent is not None:
+            assert abs(torque - torque_sent) <= 0.5001 * run.bench.torque_lsb
 
 
 def test_the_tap_sees_every_frame_in_order(run):
@@ -216,6 +244,12 @@ def test_the_tap_sees_every_frame_in_order(run):
     run.drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
     heard = run.bench.heard()
     tapped = [(frame.identifier, frame.data) for frame in run.bench.frames]
+    assert len(tapped) > run.bench.LEAST_FRAMES
+    times = [frame.time_s for frame in run.bench.frames]
+    assert times == sorted(times)
+    if not run.bench.OWN_IDENTIFIERS:
+        assert heard == tapped
+        return
     ours = [(frame.identifier, frame.data) for frame in run.bench.frames if frame.outgoing]
     theirs = [(frame.identifier, frame.data) for frame in run.bench.frames if not frame.outgoing]
     ids = {identifier for identifier, _ in ours}
@@ -224,9 +258,6 @@ def test_the_tap_sees_every_frame_in_order(run):
     others = [frame for frame in heard if frame[0] not in ids]
     assert theirs == others[: len(theirs)]
     assert len(others) - len(theirs) <= 2
-    assert len(tapped) > 4000
-    times = [frame.time_s for frame in run.bench.frames]
-    assert times == sorted(times)
 
 
 def test_nothing_is_sent_behind_the_loops_back(run):
@@ -286,7 +317,7 @@ def test_a_seed_repeats_a_run(make_bench):
     def once(seed):
         run = Run(make_bench(RigParams(), seed=seed))
         run.turning(3.0)
-        run.go(1.0, Mode.TORQUE, 3.0, 100.0)
+        run.go(1.0, other_mode(run), 3.0, 100.0)
         return run.samples
 
     first = once(7)

@@ -1,0 +1,129 @@
+"""The drive's own limits, written and read back: torque, speed, the ramp of a quick stop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from drivers.cia402.objects import RPM
+from drivers.cia402.parameters import Settings
+from drivers.cia402.sdo import Objects, name
+from drivers.cia402.table import Table
+from drivers.cia402.values import decode_value, encode_value
+from drivers.drive import Limits
+from drivers.errors import ObjectRefused
+from profiles.canopen_parameter import Parameter
+from profiles.schema import CanopenProfile
+
+_TITLES = {
+    "torque_limit": "torque limit", "torque_limit_reverse": "torque limit, reverse", "speed_limit": "speed limit",
+    "speed_limit_reverse": "speed limit, reverse", "quick_stop_time": "quick-stop ramp",
+    "quick_stop_deceleration": "quick-stop ramp",
+}
+
+
+def set_limits(
+    table: Table, objects: Objects, profile: CanopenProfile, limits: Limits, rated_nm: float
+) -> None:
+    """The drive's own torque limit, speed limit and quick stop, written and read back."""
+    elsewhere = {one.set_to for one in profile.parameters}
+    torque_lsb = profile.torque.max_torque_rated_per_lsb
+    if torque_lsb is not None:
+        _limit(table, objects, "torque limit", 0x6072, limits.torque_nm, torque_lsb * rated_nm, 16, "N·m", math.floor)
+    elif "torque_limit" not in elsewhere:
+        table.note("torque limit", "the drive has no 6072h: the host alone limits it, by the guard and the setpoint")
+    speed_lsb = profile.speed.max_motor_speed_rpm_per_lsb
+    if speed_lsb is not None:
+        _limit(table, objects, "speed limit", 0x6080, limits.speed_rad_s, speed_lsb * RPM, 32, "rad/s", math.ceil)
+    elif "speed_limit" not in elsewhere:
+        table.note("speed limit", "the drive has no 6080h: set its own speed limit by hand")
+    settings = Settings(objects, profile)
+    for one in profile.parameters:
+        # What a ramp begins at is itself a limit: it has to stand before the ramp is worked out.
+        if one.set_to is not None and one.from_speed is None:
+            _set(table, objects, settings, one, limits, rated_nm)
+    for one in profile.parameters:
+        if one.from_speed is not None:
+            _set(table, objects, settings, one, limits, rated_nm)
+    ramp_lsb = profile.quick_stop.deceleration_rpm_s_per_lsb
+    if ramp_lsb is not None:
+        ramp = limits.quick_stop_rad_s2
+        _limit(table, objects, "quick-stop ramp", 0x6085, ramp, ramp_lsb * RPM, 32, "rad/s²", math.ceil)
+    code = profile.quick_stop.option_code
+    if code is not None:
+        table.attempt(
+            "quick-stop option", str(code), "605Ah", lambda: _same(objects.change(0x605A, 0, code, 16), code)
+        )
+
+
+def _set(
+    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: Limits, rated_nm: float
+) -> None:
+    """One parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
+    where = name(one.index, one.sub)
+    unit = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s"}.get(one.unit, "")
+
+    def work() -> tuple[str, bool]:
+        per_lsb = settings.per_lsb(one)
+        wanted = encode_value(one.type, _count(settings, one, limits, rated_nm) / per_lsb, where)
+        back = objects.change_bytes(one.index, one.sub, wanted)
+        return f"{decode_value(one.type, back, where) * per_lsb:.6g}{unit}", back == wanted
+
+    wished = {
+        "torque_limit": f"{limits.torque_nm:g} N·m", "torque_limit_reverse": f"{-limits.torque_nm:g} N·m",
+        "speed_limit": f"{limits.speed_rad_s:g} rad/s", "speed_limit_reverse": f"{-limits.speed_rad_s:g} rad/s",
+    }.get(one.set_to or "", f"{limits.quick_stop_rad_s2:g} rad/s²")
+    table.attempt(_TITLES[one.set_to or ""], wished, where, work, one.advice or "")
+
+
+def _count(settings: Settings, one: Parameter, limits: Limits, rated_nm: float) -> float:
+    """The limit in the parameter's unit, rounded to its counts: torque down, speed and braking up."""
+    per_lsb = settings.per_lsb(one)
+    nm = 1.0 if one.unit == "nm" else 1.0 / rated_nm
+    if one.set_to == "torque_limit":
+        return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)
+    if one.set_to == "torque_limit_reverse":
+        return -_rounded(one, limits.torque_nm * nm, per_lsb, math.floor)
+    if one.set_to == "speed_limit":
+        return _rounded(one, limits.speed_rad_s / RPM, per_lsb, math.ceil)
+    if one.set_to == "speed_limit_reverse":
+        return -_rounded(one, limits.speed_rad_s / RPM, per_lsb, math.ceil)
+    ramp_rpm_s = limits.quick_stop_rad_s2 / RPM
+    if one.from_speed is None:
+        return _rounded(one, ramp_rpm_s, per_lsb, math.ceil)
+    return _rounded(one, settings.value(one.from_speed) / ramp_rpm_s, per_lsb, math.floor)
+
+
+def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[float], int]) -> float:
+    if one.type == "f32":
+        return value
+    counts = max(1, rounding(value / per_lsb * (1.0 + (1e-9 if rounding is math.floor else -1e-9))))
+    if counts > 0xFFFF_FFFF:
+        raise ObjectRefused(f"{value:g} is out of its range", where=name(one.index, one.sub))
+    return counts * per_lsb
+
+
+def _limit(
+    table: Table,
+    objects: Objects,
+    title: str,
+    index: int,
+    value: float,
+    per_lsb: float,
+    bits: int,
+    unit: str,
+    rounding: Callable[[float], int],
+) -> None:
+    # One part in 10^9 of slack: a limit that is a whole number of LSB must not lose one to the last bit.
+    slack = 1e-9 if rounding is math.floor else -1e-9
+    raw = max(1, rounding(value / per_lsb * (1.0 + slack)))
+
+    def work() -> tuple[str, bool]:
+        back = objects.change(index, 0, raw, bits)
+        return f"{back * per_lsb:.6g} {unit}", back == raw
+
+    table.attempt(title, f"{raw * per_lsb:.6g} {unit}", name(index), work)
+
+
+def _same(found: int, wanted: int) -> tuple[str, bool]:
+    return str(found), found == wanted

@@ -1,0 +1,126 @@
+"""One drive's registers over a `Link`: requests with their retries, and changes that can be given back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from drivers.clock import Clock
+from drivers.drive import FrameTap, RawFrame
+from drivers.errors import CommunicationLost
+from drivers.modbus import requests
+from drivers.modbus.errors import BUSY, BadReply, NoReply, RegisterRefused
+from drivers.modbus.link import Link
+from drivers.modbus.registers import WordOrder, from_words, register_name, to_words
+from profiles.modbus_schema import Register
+
+SETTING_TIMEOUT_S = 1.0
+"""For a reply before motion: a drive may take its time over a parameter (SINAMICS p2024 allows 1 s)."""
+TRIES = 3
+"""Of a request before motion that brought no reply, or none that could be trusted."""
+BUSY_TRIES, BUSY_PAUSE_S = 5, 0.05
+"""Of a request that the drive put off with exception 6, and the pause in between."""
+
+
+class Answer(NamedTuple):
+    """The registers that a request brought, and when it was under way (control time)."""
+
+    words: tuple[int, ...]
+    sent_s: float
+    received_s: float
+
+
+class Access:
+    """Reads and writes registers of one unit; ``tap`` sees every PDU.
+
+    Raises RegisterRefused for an exception reply and CommunicationLost (NoReply, BadReply, LinkLost) otherwise.
+    """
+
+    def __init__(
+        self, link: Link, unit: int, order: WordOrder, functions: frozenset[int], tap: FrameTap | None = None
+    ) -> None:
+        self._link = link
+        self._unit = unit
+        self._order = order
+        self._functions = functions
+        self._tap = tap
+        self._undo: dict[tuple[str, int], Callable[[], None]] = {}
+
+    @property
+    def clock(self) -> Clock:
+        """Control time."""
+        return self._link.clock
+
+    def once(self, pdu: bytes, timeout_s: float, where: str = "") -> Answer:
+        """One transaction, as it comes."""
+        if self._tap is not None:
+            self._tap(RawFrame(self.clock.now_s(), True, self._unit, pdu))
+        reply = self._link.transact(self._unit, pdu, timeout_s)
+        if self._tap is not None:
+            self._tap(RawFrame(reply.received_s, False, self._unit, reply.pdu))
+        return Answer(requests.words_of(pdu, reply.pdu, where), reply.sent_s, reply.received_s)
+
+    def ask(self, pdu: bytes, where: str = "") -> tuple[int, ...]:
+        """A request before motion: silence and garbage are asked again, and so is a drive that is busy."""
+        silent = busy = 0
+        while True:
+            try:
+                return self.once(pdu, SETTING_TIMEOUT_S, where).words
+            except (NoReply, BadReply) as error:
+                silent += 1
+                if silent >= TRIES:
+                    raise type(error)(error.what, where=where or error.where, next_step=error.next_step) from error
+            except RegisterRefused as error:
+                busy += 1
+                if error.code != BUSY or busy >= BUSY_TRIES:
+                    raise
+                self.clock.wait_until(self.clock.now_s() + BUSY_PAUSE_S)
+
+    def read_words(self, table: str, address: int, count: int, where: str = "") -> tuple[int, ...]:
+        """Neighbouring registers, in one request."""
+        function = requests.READ_HOLDING if table == "holding" else requests.READ_INPUT
+        return self.ask(requests.read(function, address, count), where or f"register {address}")
+
+    def read(self, register: Register) -> int:
+        """The number in a register, in counts."""
+        words = self.read_words(register.table, register.address, register.count, register_name(register))
+        return from_words(words, register.type, self._order)
+
+    def write(self, register: Register, counts: int) -> None:
+        """Write counts into a register. Raises CommandRejected if they don't fit."""
+        self.write_words(register.address, to_words(counts, register.type, self._order), register_name(register))
+
+    def write_words(self, address: int, words: tuple[int, ...], where: str = "") -> None:
+        """Neighbouring registers, in one request where the drive knows a function for that."""
+        if len(words) == 1 and requests.WRITE_ONE in self._functions:
+            self.ask(requests.write_one(address, words[0]), where)
+        elif requests.WRITE_MANY in self._functions or requests.READ_WRITE not in self._functions:
+            self.ask(requests.write_many(address, words), where)
+        else:
+            self.ask(requests.read_write(address, len(words), address, words), where)
+
+    def change(self, register: Register, counts: int) -> int:
+        """Write, remember what stood there before, and read back what stands there now.
+
+        What stands there already is left alone: many drives keep every write in a memory that wears out.
+        """
+        before = self.read(register)
+        if before == counts:
+            return before
+        self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
+        self.write(register, counts)
+        return self.read(register)
+
+    def restore(self) -> tuple[str, ...]:
+        """Undo every change, the last one first; what could not be given back, a line each."""
+        failed: list[str] = []
+        while self._undo:
+            _, undo = self._undo.popitem()
+            try:
+                undo()
+            except RegisterRefused as error:
+                failed.append(str(error))
+            except CommunicationLost as error:
+                failed.append(f"{error} ({len(self._undo)} more settings were not given back)")
+                self._undo.clear()
+        return tuple(failed)

@@ -1,0 +1,120 @@
+"""What preflight does last: measure what the line carries, and arm the watchdog, which wants feeding from then on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.drive import Limits
+from drivers.errors import CommunicationLost
+from drivers.modbus.access import Access
+from drivers.modbus.limits import write_setting
+from drivers.modbus.parameters import Parameters, show, where_of
+from drivers.modbus.rounds import Round
+from drivers.modbus.table import Table
+from profiles.modbus_schema import ModbusProfile
+
+LEAST_CYCLES = 5
+"""The watchdog must not bite on account of a lost reply or two."""
+MEASURED_ROUNDS = 20
+CARRIES, MARGIN = 1.02, 1.1
+"""The line carries a period that is this much longer than its slowest usual round; where it doesn't carry what was
+asked for, the period is longer by the second."""
+LEAST_TIMEOUT_S = 0.05
+"""For a reply in the cycle. A little late is better than lost: the sample then says how uncertain its time is."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast the cycle goes. ``timeout_s`` is for one transaction."""
+
+    period_s: float
+    timeout_s: float
+
+
+def measure_pace(
+    table: Table, line: str, asked_hz: float, watchdog_s: float, plan_text: str, go: Callable[[], Round],
+    now_s: Callable[[], float],
+) -> Pace:
+    """The longer of the asked period and what the line carries, measured over some rounds as they will be."""
+    took_s: list[float] = []
+    longest_s, failed = 0.0, 0
+    while len(took_s) < MEASURED_ROUNDS and failed < MEASURED_ROUNDS // 4:
+        begun_s = now_s()
+        try:
+            longest_s = max(longest_s, go().longest_s)
+        except CommunicationLost:
+            failed += 1
+            continue
+        took_s.append(now_s() - begun_s)
+    if len(took_s) < MEASURED_ROUNDS:
+        table.row(
+            "cycle rate", f"{asked_hz:g} Hz", f"{failed} of {failed + len(took_s)} cycles failed", False, line,
+            "The line is not good enough: check wiring, shielding, termination and baud rate",
+        )
+        return Pace(1.0 / asked_hz, LEAST_TIMEOUT_S)
+    # Four in five are faster: a few hiccups of the host must not slow the whole run down.
+    usual_s = sorted(took_s)[4 * len(took_s) // 5]
+    # To the µs; carried periods are rounded up, so that the line does carry them.
+    asked_us = round(1e6 / asked_hz)
+    slower = 1e6 * CARRIES * usual_s > asked_us
+    period_s = (math.ceil(1e6 * MARGIN * usual_s - 1e-6) if slower else asked_us) * 1e-6
+    text = f"{1.0 / period_s:.4g} Hz; {1e3 * usual_s:.3g} ms a cycle in {plan_text}"
+    if slower:
+        table.note("cycle rate", f"{text}: the line carries no {asked_hz:g} Hz", line)
+    else:
+        table.row("cycle rate", f"{asked_hz:g} Hz", text, True, line)
+    timeout_s = min(max(4.0 * longest_s, LEAST_TIMEOUT_S), 0.25 * watchdog_s)
+    return Pace(period_s, timeout_s)
+
+
+def arm_watchdog(
+    table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float, found: Parameters,
+    period_s: float, feed: Callable[[], object],
+) -> None:
+    """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back."""
+    entry = profile.watchdog
+    if entry.kind == "none":
+        table.row(
+            "watchdog", "armed", "this drive has none", False, "profile",
+            "A host that dies would leave the shaft turning: this drive can't be used",
+        )
+        return
+    table.note("watchdog reaction", entry.reaction.replace("_", " "), "profile, watchdog.reaction")
+    if limits.watchdog_s < LEAST_CYCLES * period_s:
+        table.row(
+            "watchdog time", f"at least {LEAST_CYCLES} cycles", f"{limits.watchdog_s:g} s", False, "limits.watchdog_s",
+            f"Give it at least {LEAST_CYCLES * period_s:.2g} s, or a faster line",
+        )
+        return
+    if entry.parameter is None:
+        table.row(
+            "watchdog", "armed and read back", "this profile doesn't say where its time stands", False, "profile",
+            "Name its parameter in the profile (watchdog.parameter): what can't be read back isn't known to be armed",
+        )
+        return
+    parameter = profile.parameter(entry.parameter)
+    where = where_of(parameter)
+    mend = parameter.advice or "Without it a host that dies would leave the shaft turning"
+    if parameter.set_to == "watchdog":
+        if not write_setting(table, access, parameter, limits, rated_nm, found.values):
+            return
+        register = parameter.register_
+        assert register is not None
+        counts = access.read(register)
+
+        def fed() -> tuple[str, bool]:
+            feed()
+            back = access.read(register)
+            return f"{back} counts", back == counts and back > 0
+
+        table.attempt("watchdog", f"{counts} counts, once it was fed", where, fed, mend)
+        return
+    value = found.values.get(parameter.name)
+    if value is None:
+        return              # refused already, where it was read
+    feed()
+    good = LEAST_CYCLES * period_s <= value <= limits.watchdog_s * (1.0 + 1e-9)
+    wanted = f"{LEAST_CYCLES * period_s:.2g} to {limits.watchdog_s:g} s"
+    table.row("watchdog", wanted, show(value, parameter), good, where, mend)

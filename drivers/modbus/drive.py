@@ -1,0 +1,344 @@
+"""A drive on Modbus, as `drivers.drive.Drive` asks for it.
+
+One cycle, sent by this loop and nothing else::
+
+    tick ─ setpoints (─ control word) ─ read status, speed, torque   (one transaction where the drive has function 23)
+
+A sample's time is the middle of the transactions that brought speed and torque, give or take half of what they took.
+A cycle without a good reply is retried by the next one, with fresh setpoints; when half of the drive's watchdog time
+has gone by like that, the drive counts as lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PowerState, Preflight, Sample
+from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
+from drivers.modbus import preflight as checks
+from drivers.modbus.access import Access
+from drivers.modbus.arming import arm_watchdog, measure_pace
+from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
+from drivers.modbus.echoes import check_setpoints, clear_setpoints
+from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
+from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped
+from drivers.modbus.limits import set_limits
+from drivers.modbus.link import Link, late_replies
+from drivers.modbus.parameters import find_filters
+from drivers.modbus.plan import Transaction, plan_cycle
+from drivers.modbus.registers import register_name
+from drivers.modbus.rounds import Round, go_round
+from drivers.modbus.scales import Scales
+from drivers.modbus.standstill import Standstill
+from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
+from drivers.modbus.table import Table
+from drivers.modbus.ticks import Ticks
+from profiles.modbus_schema import ModbusProfile, StatusState
+
+REPEAT_MODE_CYCLES = 25
+"""A mode that isn't displayed yet is asked for again after so many cycles: one lost write must not end a run."""
+LOOK_AT_MODE_CYCLES = 20
+"""How often the mode display is read where it costs a transaction of its own."""
+RESET_PAUSE_S = 0.1
+"""Between the words of a fault reset, for drives that look at their field bus every few ten milliseconds."""
+BUDGET_SHARE = 0.5
+"""Of the watchdog time that may go by without a good reply, or with this loop standing still."""
+
+_NO_SETPOINTS = Setpoints(0, 0, False)
+_NOTHING_YET = Feedback(0, 0.0, 0.0, None, None)
+_NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT, PowerState.NOT_READY)
+
+
+class ModbusDrive:
+    """One unit on a link.
+
+    ``rated_torque_nm`` replaces what the drive doesn't say, ``given`` the values of parameters that can't be
+    read over the bus (in the profile's units); ``tap`` sees every PDU.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        profile: ModbusProfile,
+        *,
+        unit: int,
+        rate_hz: float | None = None,
+        rated_torque_nm: float | None = None,
+        given: Mapping[str, float] | None = None,
+        tap: FrameTap | None = None,
+    ) -> None:
+        self.clock = link.clock
+        self._asked_hz = rate_hz or profile.cycle.rate_hz
+        self.period_s = round(1e6 / self._asked_hz) * 1e-6
+        self._link = link
+        self._profile = profile
+        self._access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
+        self._where = f"{link.description}, unit {unit}"
+        self._rated_torque_nm = rated_torque_nm
+        self._given = dict(given or {})
+        self._plan = plan_cycle(profile)
+        self._moving = (profile.cycle.speed.register_, profile.cycle.torque.register_)
+        self._codec = Codec(profile, Scales(1.0, 1.0, 1.0, 1.0, 1.0), has_demand=self._plan.has_demand)
+        self._standstill = Standstill(1.0, 1.0, self.period_s)
+        self._identity: Identity | None = None
+        self._modes: frozenset[Mode] = frozenset()
+        self._watchdog_s = self._timeout_s = 0.0
+        self._wish = Wish.OFF
+        self._was_enabled = self._told_fault = self._reverse = self._at_rest = False
+        self._state: StatusState | None = None
+        self._feedback = _NOTHING_YET
+        self._shown: Mode | None = None
+        self._sent_mode = Mode.SPEED
+        self._since_mode_sent = self._since_looked = 0
+        self._failing_since_s: float | None = None
+        self._told_loss = False
+        self._ticks = Ticks(self.clock, self.period_s)
+        self._cycles = self._missed = self._late_before = 0
+
+    @property
+    def counters(self) -> Counters:
+        """What went wrong on the line so far."""
+        late = late_replies(self._link) - self._late_before
+        return Counters(self._cycles, self._missed, late, self._ticks.overruns)
+
+    # -- before motion ---------------------------------------------------------------------------------------
+
+    def connect(self) -> Identity:
+        """Find the drive and tell whether it is simulated. Writes nothing."""
+        refuse_if_driven(self._access, self._profile, self._where)
+        marker = read_marker(self._access)
+        if self.clock.stepped:
+            refuse_unless_stepped(marker)
+        self._identity = Identity(0, 0, 0, 0, self._profile.title, marker.simulated)
+        return self._identity
+
+    def preflight(self, limits: Limits) -> Preflight:
+        """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""
+        if self._identity is None:
+            raise PreflightRefused("preflight before connect", where="driver")
+        table, access, profile = Table(), self._access, self._profile
+        table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
+        found, scales, rated_nm = checks.read_only_checks(
+            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s
+        )
+        filters = find_filters(table, profile, found)
+        if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
+            self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
+            set_limits(table, access, profile, limits, rated_nm, found)
+            check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
+            checks.check_modes(table, access, profile)
+            pace = measure_pace(
+                table, self._link.description, self._asked_hz, limits.watchdog_s,
+                "; ".join(map(str, self._plan.cycle)), self._idle_round, self.clock.now_s,
+            )
+            self.period_s, self._timeout_s = pace.period_s, pace.timeout_s
+            arm_watchdog(table, access, profile, limits, rated_nm, found, self.period_s, self._idle_round)
+            self._watchdog_s = limits.watchdog_s
+            self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
+        scales = self._codec.scales
+        self._standstill = Standstill(scales.speed, limits.speed_rad_s, self.period_s)
+        self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
+        self._late_before = late_replies(self._link)
+        return Preflight(
+            identity=self._identity,
+            checks=tuple(table.checks),
+            modes=self._modes,
+            switch_while_enabled=profile.modes.switch_while_enabled,
+            quick_stop_in_torque_mode=profile.quick_stop.decelerates_in_torque_mode,
+            rated_torque_nm=rated_nm,
+            torque_resolution_nm=scales.torque,
+            speed_resolution_rad_s=scales.speed,
+            watchdog_s=limits.watchdog_s,
+            safe_action=profile.watchdog.reaction,
+            filters=filters,
+        )
+
+    def _off_word(self) -> int:
+        return controlword_towards(self._profile.control, None, Wish.OFF, Mode.SPEED)
+
+    def _idle_round(self) -> Round:
+        """A whole cycle that asks for nothing: disabled, setpoints of zero; with the mode display's own read."""
+        image = self._codec.image(self._off_word(), _NO_SETPOINTS, Mode.SPEED)
+        return go_round(self._access, (*self._plan.cycle, *self._plan.mode_reads), image, 1.0, self._moving)
+
+    # -- the cycle -------------------------------------------------------------------------------------------
+
+    def enable(self, mode: Mode) -> None:
+        """From the next cycle on move towards operation enabled in ``mode``."""
+        if mode not in self._modes:
+            raise PreflightRefused(
+                f"the drive has no {mode.value} mode, or was not prepared for it", where="profile, modes",
+                next_step="Use --mode speed",
+            )
+        self._wish, self._was_enabled, self._told_fault = Wish.ENABLED, False, False
+
+    def quick_stop(self) -> None:
+        """From the next cycle on the profile's quick-stop word; it isn't ended by enabling."""
+        self._wish = Wish.QUICK_STOP
+
+    def disable(self) -> None:
+        """From the next cycle on off; a shaft that still turns under power is braked first."""
+        self._wish = Wish.OFF
+
+    def reset_fault(self) -> None:
+        """The profile's words one after the other, between connect and preflight; only on an operator's word."""
+        control = self._profile.control
+        for word in control.fault_reset:
+            self._access.write(self._profile.cycle.control.register_, word | control.speed_bits)
+            self.clock.wait_until(self.clock.now_s() + RESET_PAUSE_S)
+
+    def exchange(self, command: Command) -> Sample:
+        """One cycle: wait for the tick, write, read.
+
+        Raises CommunicationLost (no good reply within half the watchdog time, line gone, a loop that was frozen),
+        DriveFault (fault state, a refused request) and CommandRejected; each trouble of the drive once, so that a stop
+        can go on exchanging.
+        """
+        if command.mode not in self._modes:
+            raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="driver")
+        setpoints = self._codec.setpoints(command)
+        try:
+            self._ticks.wait()
+        except CommunicationLost:
+            self._stay_out()
+            raise
+        if setpoints.speed:
+            self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction it is braked from
+        turning = not self._standstill.near(self._feedback.speed_rad_s)
+        word = controlword_towards(
+            self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
+        )
+        image = self._codec.image(word, setpoints, command.mode)
+        begun_s = self.clock.now_s()
+        self._cycles += 1
+        try:
+            got = go_round(
+                self._access, self._transactions(command.mode), image, self._timeout_s, self._moving
+            )
+        except (CommunicationLost, RegisterRefused) as error:
+            self._missed += 1
+            self._ticks.done()
+            self._at_rest = False
+            self._standstill.gap()
+            self._fail(error, begun_s)
+            return self._sample(begun_s, self.clock.now_s() - begun_s, 0.0, fresh=False)
+        self._ticks.done()
+        self._failing_since_s, self._told_loss = None, False
+        self._take(self._codec.feedback(got.words), command.mode)
+        self._follow_state()
+        half_s = 0.5 * (got.received_s - got.sent_s)
+        return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def _transactions(self, mode: Mode) -> tuple[Transaction, ...]:
+        """The plan's, with those that only a mode switch needs: the mode after its setpoint, then its display."""
+        plan, found = self._plan, self._plan.cycle
+        self._since_mode_sent += 1
+        self._since_looked += 1
+        repeat = self._shown is not mode and self._since_mode_sent >= REPEAT_MODE_CYCLES
+        if plan.mode_writes and (mode is not self._sent_mode or repeat):
+            self._since_mode_sent = 0
+            found += plan.mode_writes
+        self._sent_mode = mode
+        if plan.mode_reads and (self._shown is not mode or self._since_looked >= LOOK_AT_MODE_CYCLES):
+            self._since_looked = 0
+            found += plan.mode_reads
+        return found
+
+    def _fail(self, error: CommunicationLost | RegisterRefused, begun_s: float) -> None:
+        """A cycle without feedback: raise what must be, each once."""
+        if isinstance(error, LinkLost):
+            self._stay_out()
+            raise error
+        if isinstance(error, RegisterRefused) and error.code != BUSY:
+            self._stay_out()
+            if not self._told_loss:
+                self._told_loss = True
+                raise CycleRefused(error.code, f"{self._where}, {error.where}") from error
+            return
+        if self._failing_since_s is None:
+            self._failing_since_s = begun_s
+        silent_s = self.clock.now_s() - self._failing_since_s
+        if silent_s > BUDGET_SHARE * self._watchdog_s and not self._told_loss:
+            self._told_loss = True
+            self._stay_out()
+            raise CommunicationLost(
+                f"no good reply for {silent_s:.2f} s, last: {error.what}",
+                where=self._where,
+                next_step="Check cable, supply and termination; the drive's own watchdog stops the shaft",
+            ) from error
+
+    def _stay_out(self) -> None:
+        """Whatever comes back on the line must not find an enable and a setpoint: a new enable is needed."""
+        if self._wish is Wish.ENABLED:
+            self._wish = Wish.QUICK_STOP
+
+    def _take(self, feedback: Feedback, sent: Mode) -> None:
+        self._state = decode(self._profile.control, feedback.status)
+        if self._profile.modes.display is None:
+            self._shown = sent
+        elif feedback.mode_word is not None:
+            self._shown = shown_mode(self._profile, feedback.mode_word)
+        self._feedback = feedback
+        at_zero = self._standstill.add(feedback.speed_rad_s)
+        said = self._profile.control.standstill
+        self._at_rest = at_zero if said is None else seen(said, feedback.status)
+
+    def _follow_state(self) -> None:
+        """A drive that fell out of operation stays out until it is asked in again. Raises DriveFault, once."""
+        power = power_state(self._state)
+        if power is PowerState.FAULT:
+            asked, self._wish = self._wish, Wish.OFF
+            if asked is not Wish.OFF and not self._told_fault:
+                self._told_fault = True
+                raise DriveFault(
+                    f"the drive went into fault, status {self._feedback.status:04X}h",
+                    where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
+                    next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
+                )
+        elif self._wish is Wish.ENABLED:
+            if power is PowerState.ENABLED:
+                self._was_enabled = True
+            elif power is PowerState.QUICK_STOP:
+                self._wish = Wish.QUICK_STOP
+            elif self._was_enabled:
+                self._wish = Wish.OFF
+
+    def _sample(self, time_s: float, age_s: float, half_width_s: float, *, fresh: bool) -> Sample:
+        feedback, control = self._feedback, self._profile.control
+        return Sample(
+            time_s,
+            age_s,
+            half_width_s,
+            fresh,
+            feedback.speed_rad_s,
+            feedback.torque_nm,
+            feedback.torque_demand_nm,
+            self._shown,
+            power_state(self._state),
+            self._at_rest,
+            seen(control.limit_active, feedback.status),
+            feedback.status,
+        )
+
+    # -- afterwards ------------------------------------------------------------------------------------------
+
+    def close(self) -> tuple[str, ...]:
+        """Give the drive its former settings back and let go of the line; setpoints stay at zero.
+
+        Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that follows
+        makes it act. What could not be given back is returned.
+        """
+        left: tuple[str, ...] = ()
+        try:
+            if power_state(self._state) in _NOT_DRIVEN:
+                if self._modes:
+                    clear_setpoints(Table(), self._access, self._profile, self._off_word())
+                left = self._access.restore()
+        except CommunicationLost as error:
+            left = (str(error),)
+        finally:
+            self._link.close()
+        return left
+
+
+__all__ = ["ModbusDrive"]

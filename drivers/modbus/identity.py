@@ -1,0 +1,66 @@
+"""Who is at the other end: whether it bears the simulator's marker, and in whose time it lives."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+from drivers.drive import PowerState
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus.access import Access
+from drivers.modbus.errors import NoReply, RegisterRefused
+from drivers.modbus.registers import register_name
+from drivers.modbus.states import decode, power_state
+from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_TEXT
+from profiles.modbus_schema import ModbusProfile
+
+
+class Marker(NamedTuple):
+    """``stepped`` only of a simulated peer."""
+
+    simulated: bool
+    stepped: bool
+
+
+def read_marker(access: Access) -> Marker:
+    """The marker block and the register after it. A drive that refuses these addresses, or is silent there, is real."""
+    where = f"register {MARKER_REGISTER}"
+    try:
+        words = access.read_words("holding", MARKER_REGISTER, MARKER_REGISTERS + 1, where)
+    except (RegisterRefused, NoReply):
+        return Marker(False, False)
+    text = struct.pack(f">{MARKER_REGISTERS}H", *words[:MARKER_REGISTERS]).rstrip(b"\0")
+    simulated = text == MARKER_TEXT.encode("ascii")
+    return Marker(simulated, simulated and words[MARKER_REGISTERS] == 1)
+
+
+def refuse_if_driven(access: Access, profile: ModbusProfile, where: str) -> None:
+    """Before anything is sent that could change what a turning shaft does. Raises PreflightRefused."""
+    register = profile.cycle.status.register_
+    where = f"{where}, {register_name(register)}"
+    try:
+        status = access.read(register) & 0xFFFF
+    except CommunicationLost as error:
+        raise PreflightRefused(
+            f"no drive answers: {error.what}",
+            where=where,
+            next_step="Check that it is powered, its unit number (--unit), and on a serial line baud rate, parity and "
+            "the two wires' polarity",
+        ) from error
+    if power_state(decode(profile.control, status)) is PowerState.ENABLED:
+        raise PreflightRefused(
+            f"the drive is enabled already (status {status:04X}h): another master drives it",
+            where=where,
+            next_step="Take that master off the bus, or disable the drive there; nothing was written to it",
+        )
+
+
+def refuse_unless_stepped(marker: Marker) -> None:
+    """Stepped time is for a simulated peer that steps along. Raises PreflightRefused."""
+    if not marker.stepped:
+        what = "lives in its own time" if marker.simulated else "does not bear the simulator's marker"
+        raise PreflightRefused(
+            f"stepped time was asked for, but the peer {what}",
+            where=f"register {MARKER_REGISTER}",
+            next_step="Leave --stepped out: a real shaft moves in real time",
+        )

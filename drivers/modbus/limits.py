@@ -1,0 +1,115 @@
+"""Limits of rig.yaml written into the drive's own parameters (`set_to`), and read back.
+
+Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from drivers.drive import Limits
+from drivers.errors import CommandRejected
+from drivers.modbus.access import Access
+from drivers.modbus.parameters import Parameters, show, where_of
+from drivers.modbus.registers import to_counts
+from drivers.modbus.scales import RPM, per_count
+from drivers.modbus.table import Table
+from profiles.modbus_schema import ModbusProfile, Parameter
+
+_SLACK = 1e-9
+"""One part in 10^9: a limit that is a whole number of counts must not lose or gain one to the last bit."""
+
+
+class Setting(NamedTuple):
+    """Counts that are to stand in a parameter's register, and the unit for one count."""
+
+    counts: int
+    per_count: float
+
+
+def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float,
+               found: Parameters) -> None:
+    """Every parameter with `set_to` but the watchdog, which comes last of all; a row each."""
+    kinds = set()
+    for parameter in profile.parameters:
+        if parameter.set_to is None or parameter.set_to == "watchdog":
+            continue
+        kinds.add(parameter.set_to)
+        write_setting(table, access, parameter, limits, rated_nm, found.values)
+    for kind, title in (("speed_limit", "speed limit"), ("torque_limit", "torque limit")):
+        if kind not in kinds:
+            text = "the drive's own can't be set over the bus: set it by hand"
+            if kind == "torque_limit":
+                text += "; only the guard and the setpoint hold it"
+            table.note(title, text, "profile")
+
+
+def write_setting(
+    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float]
+) -> bool:
+    """Write one parameter and read it back; whether it stands as wanted."""
+    register, where = parameter.register_, where_of(parameter)
+    assert register is not None
+    try:
+        counts, lsb = wanted_setting(parameter, limits, rated_nm, values)
+    except CommandRejected as error:
+        return table.row(parameter.title, "set from rig.yaml", error.what, False, error.where, error.next_step)
+    wanted = show(counts * lsb, parameter)
+    if not parameter.writable_in_operation:
+        back = access.read(register)
+        advice = parameter.advice or f"Set '{parameter.title}' at the drive; it takes effect after a restart only"
+        return table.row(parameter.title, wanted, show(back * lsb, parameter), back == counts, where, advice)
+
+    def work() -> tuple[str, bool]:
+        back = access.change(register, counts)
+        return show(back * lsb, parameter), back == counts
+
+    advice = parameter.advice or "The drive took the value but didn't keep it: is it locked, or its range narrower?"
+    return table.attempt(parameter.title, wanted, where, work, advice)
+
+
+def wanted_setting(parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float]) -> Setting:
+    """The counts that say what rig.yaml wants. Raises CommandRejected where the unit or the register can't hold it."""
+    register, kind, where = parameter.register_, parameter.set_to, where_of(parameter)
+    assert register is not None
+    lsb = per_count(parameter, values)
+    if lsb is None or not math.isfinite(lsb) or lsb <= 0.0:
+        raise CommandRejected(
+            f"its scale is unknown: '{parameter.times}' could not be read", where=where, next_step="See that row"
+        )
+    signless = register.type in ("u16", "u32")
+    sign = -1.0 if kind in ("speed_limit_reverse", "torque_limit_reverse") and not signless else 1.0
+    rounding: Callable[[float], int] = math.ceil
+    if kind in ("speed_limit", "speed_limit_reverse"):
+        value = limits.speed_rad_s / _unit(parameter, {"rpm": RPM})
+    elif kind in ("torque_limit", "torque_limit_reverse"):
+        value = limits.torque_nm / _unit(parameter, {"nm": 1.0, "rated": rated_nm})
+        rounding = math.floor
+    elif kind == "quick_stop_deceleration":
+        value = limits.quick_stop_rad_s2 / _unit(parameter, {"rpm_s": RPM})
+    elif kind == "quick_stop_time":
+        from_rpm = values.get(parameter.times) if parameter.times is not None else limits.speed_rad_s / RPM
+        if from_rpm is None:
+            raise CommandRejected(f"the speed '{parameter.times}' that it counts from is unknown", where=where)
+        value = abs(from_rpm) * RPM / limits.quick_stop_rad_s2 / _unit(parameter, {"s": 1.0})
+        rounding = math.floor
+    else:
+        value = limits.watchdog_s / _unit(parameter, {"s": 1.0})
+        rounding = math.floor
+    slack = _SLACK if rounding is math.floor else -_SLACK
+    counts = to_counts(value * (1.0 + slack), lsb, register, where, rounding)
+    # A limit of no count at all would switch it off on many drives.
+    return Setting(int(sign) * max(1, counts), lsb)
+
+
+def _unit(parameter: Parameter, known: Mapping[str, float]) -> float:
+    """SI for the parameter's unit. Raises CommandRejected for a unit that such a limit can't have."""
+    if parameter.unit not in known:
+        raise CommandRejected(
+            f"a limit in '{parameter.unit}' can't be set for {parameter.set_to}: {' or '.join(known)} can",
+            where=where_of(parameter),
+            next_step="Correct its unit in the profile",
+        )
+    return known[parameter.unit]

@@ -1,0 +1,215 @@
+"""The drive's parameters as preflight reads them: values, what they must be, scales, name plate, filters.
+
+Nothing is written here: what is wrong with addresses, word order, sign or scale is to show before the first write.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.drive import ReportingFilters
+from drivers.errors import PreflightRefused
+from drivers.modbus.access import Access
+from drivers.modbus.registers import RANGES, register_name
+from drivers.modbus.scales import RPM, per_count, settle
+from drivers.modbus.table import Table
+from profiles.modbus_schema import ModbusProfile, Parameter
+from profiles.requirement import Require
+
+UNITS = {"rpm": "rpm", "rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "s": "s", "hz": "Hz", "kw": "kW"}
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What the drive and rig.yaml told: counts as read, values in their own units."""
+
+    counts: Mapping[str, int]
+    values: Mapping[str, float]
+
+
+def read_parameters(table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float]) -> Parameters:
+    """Read every parameter that has a register; what is needed and can't be told is a refused row."""
+    counts: dict[str, int] = {}
+    for parameter in profile.parameters:
+        if parameter.register_ is None:
+            continue
+        try:
+            counts[parameter.name] = access.read(parameter.register_)
+        except PreflightRefused as error:
+            where = register_name(parameter.register_)
+            if needed(profile, parameter):
+                table.row(parameter.title, "readable", error.what, False, where, error.next_step)
+            else:
+                table.note(parameter.title, f"not told: {error.what}", where)
+    values = settle(profile, counts, given)
+    for parameter in profile.parameters:
+        if parameter.name not in values and parameter.register_ is None and needed(profile, parameter):
+            table.row(
+                parameter.title, "known", "can't be read over the bus", False, parameter.name,
+                f"Give drive_data.parameters.{parameter.name} in rig.yaml, as it stands on the drive's panel",
+            )
+        elif parameter.name in given and parameter.name in counts and not _close(
+            values.get(parameter.name, math.nan), given[parameter.name], _lsb(parameter, values)
+        ):
+            table.row(
+                parameter.title, show(given[parameter.name], parameter), show(values[parameter.name], parameter), False,
+                where_of(parameter), "rig.yaml and the drive disagree: find out which is right",
+            )
+    return Parameters(counts, values)
+
+
+def needed(profile: ModbusProfile, parameter: Parameter) -> bool:
+    """Does anything rest on this parameter's value?"""
+    if parameter.require is not None or parameter.set_to is not None:
+        return True
+    cycle, watchdog, plate = profile.cycle, profile.watchdog, profile.name_plate
+    signals = (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque, cycle.torque_demand)
+    used = {signal.times for signal in signals if signal is not None}
+    used |= {other.times for other in profile.parameters} | {echo.times for echo in profile.echoes}
+    used |= {profile.rated_torque, watchdog.parameter, watchdog.reaction_parameter}
+    if plate is not None:
+        used |= {plate.power, plate.speed, plate.torque}
+    return parameter.name in used
+
+
+def check_required(table: Table, profile: ModbusProfile, found: Parameters) -> None:
+    """The checklist: parameters that must stand as the profile says; they are set at the drive, never from here."""
+    for parameter in profile.parameters:
+        require, value = parameter.require, found.values.get(parameter.name)
+        if require is None:
+            continue
+        if value is None:
+            continue        # refused already, where it was read
+        good = satisfied(require, value, _lsb(parameter, found.values))
+        advice = parameter.advice or f"Set '{parameter.title}' at the drive to {wanted_text(require, parameter)}"
+        table.row(
+            parameter.title, wanted_text(require, parameter), show(value, parameter), good, where_of(parameter), advice
+        )
+
+
+def satisfied(require: Require, value: float, lsb: float) -> bool:
+    """Within half a count of what is required."""
+    half = 0.5 * lsb
+    return (
+        (require.equals is None or abs(value - require.equals) <= half)
+        and (require.one_of is None or any(abs(value - one) <= half for one in require.one_of))
+        and (require.at_least is None or value >= require.at_least - half)
+        and (require.at_most is None or value <= require.at_most + half)
+    )
+
+
+def find_rated_torque(
+    table: Table, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
+) -> float | None:
+    """N·m that are 100 %, from the drive where it tells, else from rig.yaml; None where neither does."""
+    name = profile.rated_torque
+    from_drive = found.values.get(name) if name is not None else None
+    where = "profile, rated_torque" if name is None else where_of(profile.parameter(name))
+    if rated_torque_nm is None and from_drive is not None:
+        good = math.isfinite(from_drive) and from_drive > 0.0
+        step = "Set the motor's data at the drive, or check the register in the profile"
+        table.row("rated torque", "above 0 N·m", f"{from_drive:g} N·m", good, where, step)
+        return from_drive if good else None
+    if rated_torque_nm is None:
+        table.row(
+            "rated torque", "known", "the drive does not tell", False, where,
+            "Give drive_data.rated_torque_nm in rig.yaml (motor name plate)",
+        )
+        return None
+    if from_drive is None:
+        table.note("rated torque", f"{rated_torque_nm:g} N·m, from the rig", where)
+    else:
+        agree = abs(from_drive - rated_torque_nm) <= 0.001 * rated_torque_nm
+        table.row(
+            "rated torque", f"{rated_torque_nm:g} N·m", f"{from_drive:g} N·m", agree, where,
+            "rig.yaml and the drive disagree, and every torque is scaled by it: find out which is right",
+        )
+    return rated_torque_nm
+
+
+def check_name_plate(table: Table, profile: ModbusProfile, found: Parameters, rated_nm: float) -> None:
+    """P = T·ω: a wrong address, scale, sign or word order in one of the three doesn't fit."""
+    plate = profile.name_plate
+    if plate is None:
+        table.note("name plate", "this profile names no power, speed and torque that must fit each other", "profile")
+        return
+    power, speed, torque = (found.values.get(name) for name in (plate.power, plate.speed, plate.torque))
+    if power is None or speed is None or torque is None:
+        return              # refused already, where it was read
+    power_w = power * {"kw": 1e3}.get(profile.parameter(plate.power).unit, 1.0)
+    torque_nm = torque * (rated_nm if profile.parameter(plate.torque).unit == "rated" else 1.0)
+    product_w = torque_nm * speed * RPM
+    good = power_w > 0.0 and torque_nm > 0.0 and abs(product_w - power_w) <= plate.tolerance * power_w
+    table.row(
+        "name plate: torque × speed",
+        f"{power_w / 1e3:.4g} kW within {100.0 * plate.tolerance:g} %",
+        f"{torque_nm:.4g} N·m × {speed:.4g} rpm = {product_w / 1e3:.4g} kW",
+        good,
+        ", ".join(where_of(profile.parameter(name)) for name in (plate.power, plate.speed, plate.torque)),
+        "Address, word order or scale of one of them is wrong in the profile, or the motor's data at the drive are",
+    )
+
+
+def find_filters(table: Table, profile: ModbusProfile, found: Parameters) -> ReportingFilters:
+    """First-order lags of the reported signals; None where the drive doesn't tell. A cut-off f_c is 1/(2π f_c)."""
+    lags: dict[str, float] = {}
+    sources = []
+    for entry in profile.filters:
+        title = f"{entry.signal} filter"
+        if entry.documented_s is not None:
+            lag_s, where, how = entry.documented_s, entry.source, "fixed, as documented"
+        else:
+            parameter = profile.parameter(entry.parameter or "")
+            value, where, how = found.values.get(parameter.name), where_of(parameter), parameter.title
+            if value is None or not math.isfinite(value) or value < 0.0:
+                table.note(title, "the drive does not tell", where, entry.advice or "")
+                continue
+            hertz = parameter.unit == "hz"
+            lag_s = value if not hertz else 1.0 / (2.0 * math.pi * value) if value > 0.0 else 0.0
+        table.note(title, f"{lag_s * 1000.0:.4g} ms ({how})", where, entry.advice or "")
+        lags[entry.signal] = lag_s
+        sources.append(f"{entry.signal}: {where}" + (f"; {entry.advice}" if entry.advice else ""))
+    return ReportingFilters(lags.get("speed"), lags.get("torque"), ", ".join(sources))
+
+
+def where_of(parameter: Parameter) -> str:
+    """Its register, or its name where it has none."""
+    return register_name(parameter.register_) if parameter.register_ is not None else parameter.name
+
+
+def show(value: float, parameter: Parameter) -> str:
+    """A value with its unit."""
+    plain = f"{value:.0f}" if parameter.unit == "none" and value.is_integer() else f"{value:.6g}"
+    return f"{plain} {UNITS.get(parameter.unit, '')}".strip()
+
+
+def wanted_text(require: Require, parameter: Parameter) -> str:
+    """A requirement in words."""
+    parts = []
+    if require.equals is not None:
+        parts.append(show(require.equals, parameter))
+    if require.one_of is not None:
+        parts.append(" or ".join(show(one, parameter) for one in require.one_of))
+    if require.at_least is not None:
+        parts.append(f"at least {show(require.at_least, parameter)}")
+    if require.at_most is not None:
+        parts.append(f"at most {show(require.at_most, parameter)}")
+    return ", ".join(parts)
+
+
+def fits(parameter: Parameter, counts: int) -> bool:
+    """Do these counts fit into its register?"""
+    if parameter.register_ is None:
+        return False
+    low, high = RANGES[parameter.register_.type]
+    return low <= counts <= high
+
+
+def _lsb(parameter: Parameter, values: Mapping[str, float]) -> float:
+    return per_count(parameter, values) or parameter.per_lsb
+
+
+def _close(one: float, other: float, lsb: float) -> bool:
+    return abs(one - other) <= max(0.5 * lsb, 1e-6 * abs(other))

@@ -1,0 +1,91 @@
+"""Request and reply PDUs of the five functions that are used, pure.
+
+Modbus Application Protocol V1.1b3: 3 read holding registers (section 6.3), 4 read input registers (6.4), 6 write
+single register (6.6), 16 write multiple registers (6.12), 23 read/write multiple registers (6.17), exceptions (7).
+"""
+
+import struct
+from collections.abc import Sequence
+
+from drivers.modbus.errors import BadReply, RegisterRefused
+
+READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY, READ_WRITE = 3, 4, 6, 16, 23
+EXCEPTION = 0x80
+MOST_READ, MOST_WRITTEN, MOST_WRITTEN_WITH_READ = 125, 123, 121
+
+
+def read(function: int, address: int, count: int) -> bytes:
+    """Functions 3 and 4."""
+    _within(address, count, MOST_READ)
+    return struct.pack(">BHH", function, address, count)
+
+
+def write_one(address: int, word: int) -> bytes:
+    """Function 6."""
+    return struct.pack(">BHH", WRITE_ONE, address, word)
+
+
+def write_many(address: int, words: Sequence[int]) -> bytes:
+    """Function 16."""
+    _within(address, len(words), MOST_WRITTEN)
+    return struct.pack(f">BHHB{len(words)}H", WRITE_MANY, address, len(words), 2 * len(words), *words)
+
+
+def read_write(read_address: int, read_count: int, write_address: int, words: Sequence[int]) -> bytes:
+    """Function 23: the drive writes first, then reads."""
+    _within(read_address, read_count, MOST_READ)
+    _within(write_address, len(words), MOST_WRITTEN_WITH_READ)
+    return struct.pack(
+        f">BHHHHB{len(words)}H",
+        READ_WRITE, read_address, read_count, write_address, len(words), 2 * len(words), *words,
+    )
+
+
+def words_of(request: bytes, reply: bytes, where: str = "") -> tuple[int, ...]:
+    """The registers in the reply to this request; none for a write.
+
+    Raises RegisterRefused for an exception reply, BadReply for what is no reply to this request.
+    """
+    function = request[0]
+    if len(reply) == 2 and reply[0] == function | EXCEPTION:
+        raise RegisterRefused(reply[1], where)
+    if not reply or reply[0] != function:
+        raise _bad(f"a reply {reply[:8].hex(' ') or 'without content'} to a request of function {function}", where)
+    if function in (WRITE_ONE, WRITE_MANY):
+        # Address and value, or address and count, come back as they were sent.
+        if reply != request[:5]:
+            raise _bad(f"the drive acknowledged {reply[:8].hex(' ')}, not {request[:5].hex(' ')}", where)
+        return ()
+    count = struct.unpack_from(">H", request, 3)[0]
+    if len(reply) != 2 + 2 * count or reply[1] != 2 * count:
+        said = f", its own count says {reply[1]}" if len(reply) > 1 else ""
+        raise _bad(f"{len(reply)} bytes{said}, where {2 + 2 * count} were asked for", where)
+    return struct.unpack_from(f">{count}H", reply, 2)
+
+
+def answers(request: bytes, reply: bytes) -> bool:
+    """Could this PDU be the reply to that request, by its function? Exceptions are replies too."""
+    return bool(reply) and reply[0] & ~EXCEPTION == request[0]
+
+
+def reply_length(head: bytes) -> int | None:
+    """How long the reply PDU is that begins with ``head``; None if that can't be told from its function."""
+    if not head:
+        return None
+    function = head[0]
+    if function & EXCEPTION:
+        return 2
+    if function in (WRITE_ONE, WRITE_MANY):
+        return 5
+    if function in (READ_HOLDING, READ_INPUT, READ_WRITE) and len(head) > 1:
+        return 2 + head[1]
+    return None
+
+
+def _within(address: int, count: int, most: int) -> None:
+    if not (1 <= count <= most and address >= 0 and address + count <= 0x1_0000):
+        raise ValueError(f"{count} registers from {address} on don't fit into a request")
+
+
+def _bad(what: str, where: str) -> BadReply:
+    return BadReply(what, where=where, next_step="Check wiring, shielding and termination; is a second master there?")

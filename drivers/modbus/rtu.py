@@ -1,0 +1,203 @@
+"""Modbus over a serial line (RTU): one master, frames told apart by length, CRC and silence.
+
+pymodbus frames the requests and reckons the CRC. Its synchronous client is not used: it drops a reply with a wrong CRC
+without a word, takes a reply of any function for the one it waits for, and doesn't wait for a late one
+(`FramerRTU.decode`, `FramerBase.handleFrame`, 3.16).
+
+RTU has no transaction id. So after a reply that failed to come, the line is listened to before the next request, and a
+reply after that is believed only when no second one follows it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+from typing import Any, Literal
+
+from pymodbus.framer import FramerRTU
+from pymodbus.pdu import DecodePDU
+
+from drivers.clock import Clock
+from drivers.errors import PreflightRefused
+from drivers.modbus.errors import BadReply, LinkLost, NoReply
+from drivers.modbus.link import Reply
+from drivers.modbus.requests import answers, reply_length
+from drivers.modbus.serial_port import refusal
+
+CHARACTER_BITS = 11
+SILENT_CHARACTERS = 3.5
+LEAST_SILENCE_S = 0.00175
+"""Between frames, above 19,200 baud (Modbus over serial line V1.02, section 2.5.1.1)."""
+QUIET_S = 0.02
+"""A line on which nothing has come for so long has finished what it was saying; adapters hand over in lumps."""
+LISTEN_SHARE, LONGEST_LISTEN_S = 0.5, 0.25
+"""How long a late reply is waited for before the next request: a share of the time that it had, and at most so much."""
+SLICE_S = 0.005
+UNIT_AND_CRC = 3
+
+
+class RtuLink:
+    """A serial device; opens it at once. Raises PreflightRefused if that fails."""
+
+    def __init__(
+        self, device: str, clock: Clock, *, baud: int = 19200, parity: Literal["N", "E", "O"] = "E",
+        stop_bits: Literal[1, 2] = 1,
+    ) -> None:
+        self.clock = clock
+        self.description = f"{device}, {baud} baud 8{parity}{stop_bits}"
+        self.late = 0
+        self._framer = FramerRTU(DecodePDU(False))
+        self._silence_s = max(SILENT_CHARACTERS * CHARACTER_BITS / baud, LEAST_SILENCE_S)
+        self._quiet_from_s = 0.0
+        self._listen_s = 0.0        # before the next request; 0: the line is in step
+        self._owed = False          # a reply is outstanding that may yet come
+        self._usual_s = 0.0         # the longest that a good reply took
+        self._lost = ""
+        try:
+            serial: Any = importlib.import_module("serial")
+        except ImportError as error:
+            raise PreflightRefused(
+                "serial lines need pyserial, which isn't installed", where=device, next_step="pip install pyserial"
+            ) from error
+        try:
+            self._port: Any = serial.Serial(
+                device, baudrate=baud, parity=parity, stopbits=stop_bits, timeout=SLICE_S, write_timeout=1.0,
+                exclusive=True if os.name == "posix" else None,
+            )
+        except (OSError, ValueError) as error:
+            raise refusal(device, error) from error
+
+    def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
+        """One request and its reply; a reply that comes too late is dropped before the next request, and counted."""
+        if self._lost:
+            raise self._gone(self._lost)
+        self._come_into_step()
+        self.clock.wait_until(self._quiet_from_s)
+        sent_s = self.clock.now_s()
+        deadline_s = sent_s + timeout_s
+        try:
+            self._port.write(self._framer.encode(pdu, unit, 0))
+        except Exception as error:      # pyserial passes on what the driver below it raises
+            raise self._gone(str(error)) from error
+        try:
+            reply = self._await(unit, pdu, deadline_s)
+            received_s = self.clock.now_s()
+            if self._owed:
+                reply, received_s = self._doubt(reply, received_s, unit, pdu)
+        except (NoReply, BadReply) as error:
+            self._owed = isinstance(error, NoReply)
+            self._listen_s = min(max(LISTEN_SHARE * timeout_s, QUIET_S), LONGEST_LISTEN_S)
+            raise
+        finally:
+            self._quiet_from_s = self.clock.now_s() + self._silence_s
+        self._usual_s = max(self._usual_s, received_s - sent_s)
+        return Reply(reply, sent_s, received_s)
+
+    def close(self) -> None:
+        """Let go of the device; what hasn't been sent yet is thrown away."""
+        with contextlib.suppress(Exception):
+            self._port.reset_output_buffer()
+        with contextlib.suppress(Exception):
+            self._port.close()
+        self._lost = self._lost or "it is closed"
+
+    # -- frames ----------------------------------------------------------------------------------------------
+
+    def _await(self, unit: int, pdu: bytes, deadline_s: float) -> bytes:
+        """The reply PDU. Raises NoReply, BadReply and LinkLost."""
+        frame = b""
+        while True:
+            wanted = self._length(frame)
+            if wanted is not None and len(frame) >= wanted:
+                if not self._sound(frame[:wanted]):
+                    raise self._bad(f"a reply with a wrong CRC: {_shown(frame)}")
+                reply = frame[1 : wanted - 2]
+                if frame[0] == unit and answers(pdu, reply) and len(frame) == wanted:
+                    return reply
+                if not self._owed:
+                    raise self._bad(f"a reply of unit {frame[0]}, function {reply[0]} to unit {unit}, {pdu[0]}")
+                # Sound, but to another request: the one whose time is over.
+                self._owed = False
+                self.late += 1
+                frame = frame[wanted:]
+                continue
+            if len(frame) >= 2 and wanted is None and len(frame) > 2:
+                raise self._bad(f"what came is no reply: {_shown(frame)}")
+            if self.clock.now_s() >= deadline_s:
+                if frame:
+                    raise self._bad(f"a short reply: {_shown(frame)}")
+                raise NoReply(
+                    "no reply in time", where=self.description,
+                    next_step="Check unit number, baud rate, parity and the two wires' polarity",
+                )
+            frame += self._read()
+
+    def _doubt(self, reply: bytes, received_s: float, unit: int, pdu: bytes) -> tuple[bytes, float]:
+        """One reply is outstanding: was this it? Then the right one follows within the usual time."""
+        until_s = received_s + max(self._usual_s, QUIET_S)
+        try:
+            second = self._await(unit, pdu, until_s)
+        except NoReply:
+            second = b""
+        if not second:
+            self._owed = False
+            return reply, received_s
+        self._owed = False
+        self.late += 1
+        return second, self.clock.now_s()
+
+    def _come_into_step(self) -> None:
+        """Throw away what came after its time, and wait for it where it may yet come."""
+        late = bool(self._port_waiting())
+        if not late and not self._listen_s:
+            return
+        until_s = self.clock.now_s() + self._listen_s
+        heard_s = self.clock.now_s() if late else None
+        while heard_s is not None or self.clock.now_s() < until_s:
+            if self._read():
+                late, heard_s = True, self.clock.now_s()
+            elif heard_s is not None and self.clock.now_s() - heard_s >= QUIET_S:
+                break
+        self.late += late
+        self._owed = self._owed and not late
+        self._listen_s = 0.0
+
+    def _length(self, frame: bytes) -> int | None:
+        length = reply_length(frame[1:])
+        return None if length is None else length + UNIT_AND_CRC
+
+    def _sound(self, frame: bytes) -> bool:
+        return self._framer.check_CRC(frame[:-2], int.from_bytes(frame[-2:], "big"))
+
+    # -- the device ------------------------------------------------------------------------------------------
+
+    def _port_waiting(self) -> int:
+        try:
+            return int(self._port.in_waiting)
+        except Exception as error:      # see transact
+            raise self._gone(str(error)) from error
+
+    def _read(self) -> bytes:
+        """What has come, or within a slice of time does."""
+        try:
+            return bytes(self._port.read(max(1, int(self._port.in_waiting))))
+        except Exception as error:      # see transact
+            raise self._gone(str(error)) from error
+
+    def _gone(self, what: str) -> LinkLost:
+        self._lost = what
+        return LinkLost(
+            f"the serial line is lost: {what}",
+            where=self.description,
+            next_step="Is the adapter plugged in? The drive's own watchdog stops the shaft. Then start anew",
+        )
+
+    def _bad(self, what: str) -> BadReply:
+        step = "Check baud rate, parity, shielding and termination, and that no second master is on the line"
+        return BadReply(what, where=self.description, next_step=step)
+
+
+def _shown(frame: bytes) -> str:
+    """For a message: a line that babbles fills no screen."""
+    return f"{frame[:16].hex(' ')}{' …' if len(frame) > 16 else ''}"

@@ -1,0 +1,207 @@
+"""Modbus over TCP: one socket, one request at a time, transaction ids that are believed.
+
+pymodbus frames the requests. Its synchronous client is not used: it connects anew by itself before a request, which a
+drive that is enabled must not see, reports a foreign transaction id as mere silence, and takes up to twice its time-out
+(`ModbusBaseSyncClient.execute`, `TransactionManager.sync_get_response`, 3.16).
+
+What TCP would add by itself is kept away from the drive: requests that a dead connection has not taken are not queued
+up, and closing throws away what is queued, so that no old setpoint arrives when the cable is back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import struct
+import sys
+from collections import deque
+from typing import NoReturn
+
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU
+
+from drivers.clock import Clock
+from drivers.errors import PreflightRefused
+from drivers.modbus.errors import BadReply, LinkLost, NoReply
+from drivers.modbus.link import Reply
+from drivers.modbus.requests import answers
+
+CONNECT_S = 3.0
+DEAD_AFTER_MS = 1000
+"""Data that the peer doesn't acknowledge for so long ends the connection (TCP_USER_TIMEOUT, where there is one)."""
+HEADER = struct.Struct(">HHHB")
+"""Transaction id, protocol id, length of what follows, unit (Modbus Messaging on TCP/IP, section 3.1.3)."""
+_AT_ONCE = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)
+REMEMBERED = 64
+"""Ids of requests whose time is over: their replies are late, not foreign."""
+
+
+class TcpLink:
+    """A connection to ``host``; opens it at once. Raises PreflightRefused if that fails."""
+
+    def __init__(self, host: str, port: int, clock: Clock, *, connect_s: float = CONNECT_S) -> None:
+        self.clock = clock
+        self.description = f"{host}:{port}"
+        self.late = 0
+        self._address = (host, port)
+        self._connect_s = connect_s
+        self._framer = FramerSocket(DecodePDU(False))
+        self._given_up: deque[int] = deque(maxlen=REMEMBERED)
+        self._buffer = b""
+        self._transaction = 0
+        self._renew = False
+        try:
+            self._socket: socket.socket | None = self._connect()
+        except OSError as error:
+            raise self._unreachable(error) from error
+
+    def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
+        """One request and its reply. A connection that was reset stays lost; nothing is sent twice."""
+        if self._renew:
+            self._reconnect()
+        if self._socket is None:
+            self._lost("the connection is gone")
+        deadline_s = self.clock.now_s() + timeout_s
+        while self._untaken():
+            # The other end hasn't even taken the request before: another one would only queue up behind it.
+            if self.clock.now_s() >= deadline_s:
+                raise self._silent(timeout_s, "the connection takes nothing: half open, or the cable is out")
+            self._read(0.005)
+        self._transaction = self._transaction % 0xFFFF + 1
+        sent_s = self.clock.now_s()
+        try:
+            self._socket.settimeout(timeout_s)
+            self._socket.sendall(self._framer.encode(pdu, unit, self._transaction))
+        except TimeoutError as error:
+            raise self._silent(timeout_s, "the connection takes nothing") from error
+        except OSError as error:
+            self._lost(str(error), error)
+        while True:
+            frame = self._frame()
+            if frame is not None and self._accepts(frame, unit, pdu):
+                return Reply(frame[HEADER.size :], sent_s, self.clock.now_s())
+            if frame is None:
+                left_s = deadline_s - self.clock.now_s()
+                if left_s <= 0.0:
+                    self._given_up.append(self._transaction)
+                    raise self._silent(timeout_s, f"no reply within {timeout_s:.3g} s")
+                self._read(left_s)
+
+    def close(self) -> None:
+        """Let go at once; what the other end hasn't taken yet is thrown away."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+            self._socket.close()
+        self._socket, self._renew = None, False
+
+    # -- replies ---------------------------------------------------------------------------------------------
+
+    def _frame(self) -> bytes | None:
+        """The next whole frame of what was received. Raises BadReply if that can't be a frame."""
+        if len(self._buffer) < HEADER.size:
+            return None
+        _, protocol, length, _ = HEADER.unpack_from(self._buffer)
+        if protocol != 0 or not 2 <= length <= 254:
+            raise self._untrusted(f"what came is no Modbus frame: {self._buffer[:16].hex(' ')}")
+        end = HEADER.size - 1 + length
+        if len(self._buffer) < end:
+            return None
+        frame, self._buffer = self._buffer[:end], self._buffer[end:]
+        return frame
+
+    def _accepts(self, frame: bytes, unit: int, pdu: bytes) -> bool:
+        """Is this the reply? A late one is dropped; anything else raises BadReply."""
+        transaction, _, _, sender = HEADER.unpack_from(frame)
+        if transaction in self._given_up:
+            self._given_up.remove(transaction)
+            self.late += 1
+            return False
+        if transaction != self._transaction:
+            raise self._untrusted(f"a reply with transaction id {transaction}, not {self._transaction}")
+        if sender != unit:
+            raise self._bad(f"a reply of unit {sender}, not {unit}")
+        if not answers(pdu, frame[HEADER.size :]):
+            raise self._bad(f"a reply of function {frame[HEADER.size]} to a request of function {pdu[0]}")
+        return True
+
+    def _read(self, timeout_s: float) -> None:
+        """Take what has come, or wait for it. Raises LinkLost at the end of the connection."""
+        if self._socket is None:
+            self._lost("the connection is gone")
+        try:
+            self._socket.settimeout(timeout_s)
+            data = self._socket.recv(4096)
+        except (TimeoutError, BlockingIOError):
+            return
+        except OSError as error:
+            self._lost(str(error), error)
+        if not data:
+            self._lost("the drive closed the connection")
+        self._buffer += data
+
+    # -- the connection --------------------------------------------------------------------------------------
+
+    def _connect(self) -> socket.socket:
+        connection = socket.create_connection(self._address, timeout=self._connect_s)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD_AFTER_MS)
+        return connection
+
+    def _reconnect(self) -> None:
+        """After a frame that can't be ours: what follows it on this connection can't be trusted either."""
+        self.close()
+        self._buffer = b""
+        self._given_up.clear()
+        try:
+            self._socket = self._connect()
+        except OSError as error:
+            self._lost(f"it could not be opened anew: {error}", error)
+
+    def _untaken(self) -> bool:
+        """Has the other end's system not acknowledged all that was sent? Known on Linux only."""
+        if not sys.platform.startswith("linux") or self._socket is None:
+            return False
+        import fcntl
+        import termios
+
+        try:
+            waiting = fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4))
+        except OSError:
+            return False
+        return bool(struct.unpack("i", waiting)[0])
+
+    def _silent(self, timeout_s: float, what: str) -> NoReply:
+        step = "Check cable and drive; is another master holding the drive's only connection?"
+        return NoReply(what, where=self.description, next_step=step)
+
+    def _bad(self, what: str) -> BadReply:
+        step = "Is a gateway or a second master between here and the drive? Check the unit number (--unit)"
+        return BadReply(what, where=self.description, next_step=step)
+
+    def _untrusted(self, what: str) -> BadReply:
+        self._renew = True
+        return self._bad(what)
+
+    def _lost(self, what: str, error: Exception | None = None) -> NoReturn:
+        self.close()
+        raise LinkLost(
+            f"the connection to the drive is lost: {what}",
+            where=self.description,
+            next_step="Check cable and supply; the drive's own watchdog stops the shaft. Then start anew",
+        ) from error
+
+    def _unreachable(self, error: OSError) -> PreflightRefused:
+        host, port = self._address
+        if isinstance(error, ConnectionRefusedError):
+            what, step = "nothing listens there", f"Switch Modbus TCP on at the drive; is its port {port}?"
+        elif isinstance(error, socket.gaierror):
+            what, step = f"no such host: {error.strerror}", "Give the drive's address with --host, such as 192.0.2.10"
+        elif isinstance(error, TimeoutError) or error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):
+            what = "no answer to the connection"
+            step = f"Check cable and address: is this computer in the drive's network? Try: ping {host}"
+        else:
+            what, step = str(error), "Check address and port"
+        return PreflightRefused(f"can't connect: {what}", where=self.description, next_step=step)

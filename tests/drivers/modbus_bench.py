@@ -1,0 +1,104 @@
+"""ModbusDrive on the embedded simulator that wears generic/modbus, over a line that takes no time, in stepped time.
+
+Registers and formats are typed here by hand from the map in profiles/generic/modbus.yaml; neither codec is used.
+"""
+
+import struct
+
+from drive_benches import LIMITS, RPM
+
+from drivers.clock import SteppedClock
+from drivers.drive import Mode, PowerState
+from drivers.modbus.drive import ModbusDrive
+from drivers.modbus.embedded import EmbeddedLink
+from profiles.library import load_modbus_profile
+from sim_bus.modbus.embedded import EmbeddedModbusDrive
+from sim_bus.modbus.timing import LineTiming
+from sim_bus.params import FAITHFUL, QUIET, RigParams
+
+
+class ModbusBench:
+    """See `drive_benches` for what a bench offers."""
+
+    SETTINGS = (36, 37, 38, 39, 40, 41)
+    MAPPING = ()
+    TARGETS = (4, 0, 1, 2, 3)
+    WATCHDOG = 40
+    LEAST_FRAMES = 3000            # one exchange of a request and a reply a cycle
+    OWN_IDENTIFIERS = False        # both directions bear the unit's number
+    modes = frozenset({Mode.SPEED, Mode.TORQUE})
+    ends = PowerState.QUICK_STOP
+    ramp_rad_s2 = LIMITS.quick_stop_rad_s2
+
+    def __init__(self, params=None, *, seed=0, timing=None, **options):
+        self.limits = LIMITS
+        self.rated_nm = 1000.0
+        self.speed_lsb, self.torque_lsb = 0.01 * RPM, 1.0
+        profile = load_modbus_profile("generic/modbus")
+        self.simulated = EmbeddedModbusDrive(
+            params or RigParams(noise=QUIET, reporting=FAITHFUL), profile, seed=seed,
+            timing=LineTiming() if timing is None else timing,
+        )
+        self.clock = SteppedClock()
+        self._heard = []
+        self.frames = []
+        options.setdefault("rate_hz", 250.0)
+        self._ask(struct.pack(">BHH", 6, 4, 1))           # somebody has left it in torque mode
+        self.drive = ModbusDrive(
+            EmbeddedLink(self._serve, self.clock), profile, unit=1, tap=self.frames.append, **options
+        )
+
+    def _serve(self, unit, pdu, now_s):
+        reply, complete_s = self.simulated.serve(unit, pdu, now_s)
+        self._heard += [(unit, pdu)] + ([(unit, reply)] if reply is not None else [])
+        return reply, complete_s
+
+    def _ask(self, pdu):
+        reply, _ = self.simulated.serve(1, pdu, self.clock.now_s())
+        return reply
+
+    @property
+    def true_speed_rad_s(self):
+        self.simulated.run_until(self.clock.now_s())
+        return self.simulated.speed_rad_s
+
+    def close(self):
+        self.simulated.close()
+
+    def heard(self):
+        """All that went over the line since it was last asked."""
+        heard, self._heard = self._heard, []
+        return heard
+
+    def settings(self, keys=SETTINGS):
+        """Registers by 'address:0', as a station of the tests' own reads them."""
+        found = {}
+        for address in keys:
+            function, size, value = struct.unpack(">BBH", self._ask(struct.pack(">BHH", 3, address, 1)))
+            assert (function, size) == (3, 2)
+            found[f"{address:04X}h:0"] = value
+        return found
+
+    def decode(self, frames):
+        """Cycles are function 23, one after the other; preflight's last request is another one."""
+        found, cycle = [], False
+        for frame in frames:
+            if frame.outgoing:
+                cycle = frame.data[0] == 23
+                if not cycle:
+                    found = []
+            elif cycle:
+                function, size, status, speed, torque, mode = struct.unpack(">BBHihH", frame.data)
+                assert (function, size) == (23, 10)
+                shown = {0: Mode.SPEED, 1: Mode.TORQUE}.get(mode)
+                found.append((status, speed * 0.01 * RPM, torque * 1.0, None, shown))
+        return found
+
+    def setpoints(self, frames):
+        found = []
+        for frame in frames:
+            if frame.outgoing and frame.data[0] == 23:
+                head, _, speed, torque, _ = struct.unpack(">10sHihH", frame.data)
+                assert head == bytes.fromhex("17 0010 0005 0000 0005 0a")
+                found.append((speed * 0.01 * RPM, torque * 1.0))
+        return found

@@ -1,0 +1,133 @@
+"""The other end of a Modbus line, by hand: a thread behind a loopback socket or a pty that answers as a test says.
+
+``behave(number, request)`` gets the number of the request (from 0) and its bytes as they stood on the line, and returns
+what is done: bytes are sent, numbers are waited (seconds), RESET and CLOSE end the connection.
+"""
+
+import contextlib
+import os
+import select
+import socket
+import struct
+import threading
+import time
+import tty
+
+RESET, CLOSE = "reset", "close"
+
+
+def crc(data):
+    """CRC-16/MODBUS, bit by bit (Modbus over serial line V1.02, appendix B)."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ (0xA001 if value & 1 else 0)
+    return struct.pack("<H", value)
+
+
+def rtu(unit, pdu):
+    frame = bytes((unit,)) + pdu
+    return frame + crc(frame)
+
+
+def tcp(transaction, unit, pdu):
+    return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
+
+
+class Peer(threading.Thread):
+    """Runs until it is left."""
+
+    def __init__(self, behave):
+        super().__init__(daemon=True)
+        self.behave = behave
+        self.requests = []
+        self.over = threading.Event()
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *error):
+        self.over.set()
+        self.join(5.0)
+        self.end()
+
+    def act(self, request, send):
+        number = len(self.requests)
+        self.requests.append(request)
+        for what in self.behave(number, request):
+            if isinstance(what, bytes):
+                send(what)
+            elif isinstance(what, float):
+                time.sleep(what)
+            else:
+                return what
+        return None
+
+
+class TcpPeer(Peer):
+    """Listens on a free port of the loopback; serves one connection after the other."""
+
+    def __init__(self, behave):
+        super().__init__(behave)
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.settimeout(0.02)
+        self.port = self.listener.getsockname()[1]
+        self.connections = 0
+
+    def run(self):
+        while not self.over.is_set():
+            with contextlib.suppress(TimeoutError), contextlib.suppress(OSError):
+                connection, _ = self.listener.accept()
+                self.connections += 1
+                with connection:
+                    self.serve(connection)
+
+    def serve(self, connection):
+        connection.settimeout(0.02)
+        buffer = b""
+        while not self.over.is_set():
+            try:
+                data = connection.recv(1000)
+            except TimeoutError:
+                continue
+            if not data:
+                return
+            buffer += data
+            while len(buffer) >= 6 and len(buffer) >= (end := 6 + struct.unpack_from(">H", buffer, 4)[0]):
+                request, buffer = buffer[:end], buffer[end:]
+                ending = self.act(request, connection.sendall)
+                if ending == RESET:
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                if ending is not None:
+                    return
+
+    def end(self):
+        self.listener.close()
+
+
+class SerialPeer(Peer):
+    """The master side of a pty; ``device`` is the other one. Requests are told apart by the silence between them."""
+
+    def __init__(self, behave):
+        super().__init__(behave)
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.master)
+        tty.setraw(self.slave)
+        self.device = os.ttyname(self.slave)
+
+    def run(self):
+        while not self.over.is_set():
+            if not select.select([self.master], [], [], 0.02)[0]:
+                continue
+            request = b""
+            while select.select([self.master], [], [], 0.004)[0]:
+                request += os.read(self.master, 1000)
+            if self.act(request, lambda data: os.write(self.master, data)) is not None:
+                return
+
+    def end(self):
+        for end in (self.master, self.slave):
+            with contextlib.suppress(OSError):
+                os.close(end)

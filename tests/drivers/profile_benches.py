@@ -1,0 +1,73 @@
+"""Benches of real drives' CANopen profiles: the simulated drive wears them; frames are taken apart by hand."""
+
+import struct
+
+from drive_benches import RPM, CanopenBench
+
+from drivers.drive import Mode, PowerState, RawFrame
+
+REMOTE = 1 << 30
+"""Set in the identifier of a remote frame, as SocketCAN does; the drive's answer has the same one without it."""
+
+
+class Epos4Bench(CanopenBench):
+    """rpm, thousandths of a rated torque that stands in µN·m, no 6074h, torque limit by current."""
+
+    PROFILE, WORN = "maxon/epos4", True
+    SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
+    speed_lsb, torque_lsb = RPM, 1.0
+    ramp_rad_s2 = 10.0 * RPM       # 1 rad/s² is 9.55 rpm/s, the next one up
+
+    def decode(self, frames):
+        found, mode = [], 0
+        for frame in frames:
+            if not frame.outgoing and frame.identifier == 0x281:
+                (mode,) = struct.unpack("<b", frame.data)
+            elif not frame.outgoing and frame.identifier == 0x181:
+                status, torque, rpm = struct.unpack("<Hhi", frame.data)
+                found.append((status, rpm * RPM, torque * 1.0, None, {9: Mode.SPEED, 10: Mode.TORQUE}.get(mode)))
+        return found
+
+    def setpoints(self, frames):
+        words = [struct.unpack("<Hhi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
+        return [(rpm * RPM, torque * 1.0) for _, torque, rpm in words]
+
+
+class S120Bench(CanopenBench):
+    """Encoder increments a second (2048 pulses x 2^11), torque in 5810h with 4000h = 1000 N·m, node guarding."""
+
+    PROFILE, WORN = "siemens/s120-canopen", True
+    SETTINGS = ((0x100C, 0), (0x100D, 0), (0x1017, 0), (0x6007, 0), (0x6072, 0), (0x25F1, 0), (0x243A, 0), (0x246F, 0))
+    TARGETS = ((0x6060, 0), (0x60FF, 0))
+    WATCHDOG = (0x100C, 0)
+    LEAST_FRAMES = 1600            # at 100 Hz
+    modes = frozenset({Mode.SPEED})
+    ends = PowerState.OFF
+    speed_lsb, torque_lsb = 60.0 * RPM / 4194304, 1000.0 / 16384
+
+    def _tap(self, frame):
+        if frame.outgoing and frame.identifier == 0x701:
+            frame = RawFrame(frame.time_s, True, REMOTE | 0x701, frame.data)
+        self.frames.append(frame)
+
+    def heard(self):
+        frames = []
+        while (message := self._second.recv(0.0)) is not None:
+            identifier = message.arbitration_id | (REMOTE if message.is_remote_frame else 0)
+            frames.append((identifier, bytes(message.data)))
+        return frames
+
+    def decode(self, frames):
+        found, mode = [], 0
+        for frame in frames:
+            if not frame.outgoing and frame.identifier == 0x281:
+                (mode,) = struct.unpack("<b", frame.data)
+            elif not frame.outgoing and frame.identifier == 0x181:
+                status, torque, counts = struct.unpack("<Hhi", frame.data)
+                shown = Mode.SPEED if mode == 3 else None
+                found.append((status, counts * self.speed_lsb, torque * self.torque_lsb, None, shown))
+        return found
+
+    def setpoints(self, frames):
+        words = [struct.unpack("<Hi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
+        return [(counts * self.speed_lsb, None) for _, counts in words]

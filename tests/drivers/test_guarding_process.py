@@ -1,0 +1,69 @@
+"""Node guarding between two processes: the simulated drive behind our own socketcand hub, its host gone of a sudden.
+
+python-can's client sends a remote frame as a length without bytes, which our hub takes for what it is; a foreign
+socketcand server may make a data frame of it, and then preflight refuses (see test_guarding).
+"""
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import pytest
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import SteppedClock
+from drivers.drive import Command, Limits, Mode, PowerState
+from profiles.library import load_canopen_profile
+
+LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+NAME = "siemens/s120-canopen"
+
+
+@pytest.fixture
+def simulated(tmp_path):
+    trace = tmp_path / "trace.csv"
+    arguments = ["canopen", "--hub", "127.0.0.1:0", "--profile", NAME, "--seed", "1", "--trace", str(trace)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sim_bus", *arguments], stdout=subprocess.PIPE, text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    line = process.stdout.readline()
+    assert line.endswith(f"node 1 profile {NAME}\n")
+    yield int(line.split()[2].rpartition(":")[2]), trace, process
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
+    port, trace, process = simulated
+    bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0", tcp_tune=True)
+    drive = Cia402Drive(bus, load_canopen_profile(NAME), SteppedClock(), node=1)
+    drive.connect()
+    found = drive.preflight(LIMITS)
+    assert found.refused == ()
+    assert next(check for check in found.checks if check.name == "watchdog").found == "100 ms x 4, answered"
+    drive.enable(Mode.SPEED)
+    for _ in range(700):
+        sample = drive.exchange(Command(Mode.SPEED, 5.0, 0.0))
+    assert sample.state is PowerState.ENABLED
+    assert sample.speed_rad_s == pytest.approx(5.0, abs=0.3)
+    bus.shutdown()                                           # no quick stop, no disable, no good-bye
+    deadline_s = time.monotonic() + 20.0
+    rows = []
+    while time.monotonic() < deadline_s:
+        time.sleep(0.2)
+        rows = list(csv.reader(trace.read_text(encoding="utf-8").splitlines()))[1:]
+        if any(row[4:] == ["state: switch on disabled"] for row in rows[20:]):
+            break
+    process.terminate()
+    process.wait(10.0)
+    rows = list(csv.reader(trace.read_text(encoding="utf-8").splitlines()))[1:]
+    lost = next(row for row in rows if row[4:] == ["host's node guarding lost"])
+    ended = next(row for row in rows if row[4:] == ["state: switch on disabled"] and float(row[0]) > float(lost[0]))
+    assert float(lost[1]) == pytest.approx(5.0, abs=0.3)
+    assert float(ended[0]) - float(lost[0]) < 5.0 / 2.0 + 1.5      # the ramp that preflight has set
+    assert abs(float(rows[-1][1])) < 0.1

@@ -1,0 +1,368 @@
+"""The cycle on a bank of the tests' own, in stepped time: what goes wrong in mid-run, and when a sample is."""
+
+import itertools
+import json
+
+import pytest
+from modbus_bank import CONTROL, MODE, Bank, high_and_low
+from power_machine import OFF, STOPPING
+
+from drivers.clock import SteppedClock
+from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.errors import CommandRejected, CommunicationLost, DriveFault
+from drivers.modbus.drive import ModbusDrive
+from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.errors import CycleRefused, LinkLost
+from profiles.library import load_modbus_profile
+from profiles.modbus_schema import ModbusProfile
+
+LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+GENERIC = load_modbus_profile("generic/modbus")
+PERIOD_S = 0.01
+
+
+class Run:
+    """A drive on a bank, preflight done."""
+
+    def __init__(self, profile=GENERIC, bank=None, **options):
+        self.bank, self.clock = bank or Bank(**options), SteppedClock()
+        self.link = EmbeddedLink(self.bank.serve, self.clock)
+        self.drive = ModbusDrive(self.link, profile, unit=1)
+        self.drive.connect()
+        assert self.drive.preflight(LIMITS).refused == ()
+        self.bank.writes.clear()
+        self.bank.requests.clear()
+
+    def cycle(self, speed=1.0, torque=0.0, mode=Mode.SPEED):
+        return self.drive.exchange(Command(mode, speed, torque))
+
+    def enabled(self, mode=Mode.SPEED):
+        self.drive.enable(mode)
+        for _ in range(4):
+            sample = self.cycle(mode=mode)
+        assert (sample.state, sample.mode) == (PowerState.ENABLED, mode)
+        return self
+
+    def controlwords(self):
+        return [words[CONTROL - address] for address, words in self.bank.writes if address == CONTROL]
+
+
+def profile_with(**sections):
+    data = GENERIC.model_dump(by_alias=True)
+    for section, change in sections.items():
+        data[section] |= change
+    return ModbusProfile.model_validate_json(json.dumps(data))
+
+
+def errors(run, cycles):
+    """(cycle, error) of every error that comes."""
+    found = []
+    for k in range(cycles):
+        try:
+            run.cycle()
+        except (CommunicationLost, DriveFault) as error:
+            found.append((k, error))
+    return found
+
+
+def test_the_words_on_the_way_to_enabled_and_off():
+    run = Run().enabled()
+    run.drive.quick_stop()
+    run.cycle()
+    run.cycle()
+    assert run.bank.machine.state == STOPPING
+    run.drive.disable()
+    run.cycle(0.0)
+    run.cycle(0.0)
+    assert run.controlwords() == [0x00, 0x06, 0x07, 0x0F, 0x02, 0x02, 0x00, 0x00]
+    assert all(request[0] == 23 for request in run.bank.requests)       # one transaction a cycle
+
+
+def test_time_is_the_middle_of_the_transaction():
+    run = Run(takes_s=0.006)
+    before_s = run.clock.now_s()
+    first, second = run.cycle(), run.cycle()
+    assert run.drive.period_s == PERIOD_S
+    assert (first.half_width_s, first.age_s, first.fresh) == (pytest.approx(0.003), pytest.approx(0.003), True)
+    assert before_s < first.time_s
+    assert second.time_s - first.time_s == pytest.approx(PERIOD_S)
+    assert run.drive.counters.overruns == 0
+
+
+def test_speed_and_torque_of_two_transactions_are_of_both():
+    """Reads of 17+2 and 19 apart from each other: the half-width covers both and the way between."""
+    split = profile_with(cycle={"functions": [3, 6, 16], "largest_read": 3})
+    run = Run(split, takes_s=0.002)
+    sample = run.cycle()
+    assert [request[0] for request in run.bank.requests] == [16, 3, 3]
+    assert sample.half_width_s == pytest.approx(0.002)
+
+
+def test_feedback_in_si():
+    run = Run()
+    run.bank.feedback = lambda: (-70_000, -250)
+    sample = run.cycle()
+    assert sample.speed_rad_s == pytest.approx(-73.3038286)         # 700 rpm
+    assert sample.torque_nm == pytest.approx(-200.0)
+    assert sample.torque_demand_nm is None
+
+
+def test_one_lost_reply_is_one_missed_sample():
+    run = Run().enabled()
+    run.bank.feedback = lambda: (1000, 100)
+    good = run.cycle()
+    run.bank.script = [lambda reply: None]
+    missed = run.cycle()
+    assert not missed.fresh
+    assert missed.speed_rad_s == good.speed_rad_s
+    after = run.cycle()
+    assert after.fresh
+    assert after.state is PowerState.ENABLED
+    assert run.drive.counters.missed == 1
+    assert run.drive.counters.cycles == 7
+
+
+def test_a_reply_that_comes_too_late_is_dropped_and_counted():
+    run = Run().enabled()
+    run.bank.takes_s = 0.2
+    assert not run.cycle().fresh
+    run.bank.takes_s = 0.0
+    assert run.cycle().fresh
+    assert (run.drive.counters.late, run.drive.counters.missed) == (1, 1)
+
+
+@pytest.mark.parametrize("rubbish", [
+    lambda reply: reply[:-1], lambda reply: bytes((3, *reply[1:])), lambda reply: b"", lambda reply: reply + b"\0",
+])
+def test_rubbish_is_a_missed_sample(rubbish):
+    run = Run().enabled()
+    run.bank.script = [rubbish]
+    assert not run.cycle().fresh
+    assert run.cycle().fresh
+
+
+def test_silence_ends_within_half_the_watchdogs_time_and_is_said_once():
+    run = Run().enabled()
+    begun_s = run.clock.now_s()
+    run.bank.silent = True
+    (found,) = errors(run, 40)
+    assert isinstance(found[1], CommunicationLost)
+    assert "no good reply" in found[1].what
+    run.bank.silent, run.bank.requests = False, []
+    run.bank.writes.clear()
+    for _ in range(5):
+        run.cycle()
+    # Back on the line there is no enable and no motion, until somebody asks for it.
+    assert 0x0F not in run.controlwords()
+    assert run.bank.machine.state == STOPPING
+    assert begun_s < run.clock.now_s()
+
+
+def test_the_budget_for_retries():
+    run = Run().enabled()
+    run.bank.silent = True
+    last_good_s = run.clock.now_s()
+    for _ in range(100):
+        try:
+            run.cycle()
+        except CommunicationLost:
+            break
+    # Raised before the drive's own watchdog (0.5 s) would act.
+    assert 0.25 <= run.clock.now_s() - last_good_s <= 0.4
+
+
+@pytest.mark.parametrize("code", [1, 2, 3, 4])
+def test_an_exception_in_the_cycle_is_raised_once(code):
+    run = Run().enabled()
+    run.bank.refuse = {23: code}
+    ((k, error),) = errors(run, 20)
+    assert k == 0
+    assert isinstance(error, CycleRefused)
+    assert error.code == code
+    assert "23 writes 0+5 reads 16+5" in error.where
+
+
+def test_busy_is_asked_again_within_the_cycle():
+    run = Run().enabled()
+    run.bank.script = [lambda reply: bytes((0x97, 6))] * 2
+    assert run.cycle().fresh
+    assert run.drive.counters.missed == 0
+
+
+def test_busy_for_good_counts_as_lost():
+    run = Run().enabled()
+    run.bank.refuse = {23: 6}
+    ((k, error),) = errors(run, 60)
+    assert k > 3
+    assert isinstance(error, CommunicationLost)
+    assert "busy" in error.what
+
+
+def test_a_fault_is_raised_once_and_never_reset():
+    run = Run().enabled()
+    run.bank.machine.fail()
+    ((_, error),) = errors(run, 20)
+    assert isinstance(error, DriveFault)
+    assert "--reset-fault" in error.next_step
+    sample = run.cycle()
+    assert sample.state is PowerState.FAULT
+    assert not any(word & 0x80 for word in run.controlwords())
+
+
+def test_a_drive_that_fell_out_is_not_enabled_again():
+    run = Run().enabled()
+    run.bank.machine.state = OFF
+    for _ in range(10):
+        sample = run.cycle()
+    assert sample.state is PowerState.OFF
+    assert run.controlwords()[-8:] == [0] * 8
+
+
+def test_a_turning_shaft_is_braked_before_it_is_disabled():
+    run = Run().enabled()
+    run.bank.feedback = lambda: (3000, 0)
+    run.cycle()
+    run.drive.disable()
+    for _ in range(5):
+        run.cycle()
+    assert run.bank.machine.state == STOPPING
+    run.bank.feedback = lambda: (0, 0)
+    run.cycle()
+    run.cycle()
+    assert run.bank.machine.state == OFF
+
+
+def test_standstill_from_the_speed_wants_time():
+    run = Run().enabled()
+    run.bank.feedback = lambda: (300, 0)
+    assert not run.cycle().standstill
+    run.bank.feedback = lambda: (0, 0)
+    seen = [run.cycle().standstill for _ in range(30)]
+    assert seen.index(True) == 19       # 20 cycles of 10 ms
+    run.bank.script = [lambda reply: None]
+    assert not run.cycle().standstill
+    assert not run.cycle().standstill
+
+
+def test_creeping_is_no_standstill():
+    run = Run().enabled()
+    run.bank.feedback = lambda: (40, 0)         # 0.042 rad/s, within the noise allowed for one sample
+    assert not any(run.cycle().standstill for _ in range(50))
+
+
+def test_standstill_as_the_drive_says():
+    said = profile_with(control={"standstill": {"mask": 0x1000, "value": 0}})
+    run = Run(said)
+    assert run.cycle().standstill is not bool(run.cycle().status & 0x1000)
+
+
+def test_a_frozen_loop_does_not_send_what_it_had_in_hand():
+    run = Run().enabled()
+    sent = len(run.bank.requests)
+    run.clock.wait_until(run.clock.now_s() + 0.3)
+    with pytest.raises(CommunicationLost, match="stood still"):
+        run.cycle()
+    assert len(run.bank.requests) == sent
+    run.bank.writes.clear()
+    run.cycle()
+    assert run.controlwords() == [0x02]
+
+
+def test_a_short_stall_is_an_overrun_and_no_burst_follows():
+    run = Run().enabled()
+    run.clock.wait_until(run.clock.now_s() + 0.055)
+    times = [run.cycle().time_s for _ in range(4)]
+    assert run.drive.counters.overruns == 1
+    assert min(b - a for a, b in itertools.pairwise(times)) >= 0.5 * PERIOD_S - 1e-9
+
+
+def test_a_lost_line_is_said_every_time_and_closing_does_not_raise():
+    run = Run().enabled()
+
+    def gone(unit, pdu, timeout_s):
+        raise LinkLost("connection reset", where="wire")
+
+    run.link.transact = gone
+    assert len(errors(run, 5)) == 5
+    assert run.drive.close() == ()
+    assert run.bank.words[40] == 500        # the watchdog stays armed
+
+
+def test_what_could_not_be_given_back_is_said():
+    run = Run()
+    run.cycle()
+    run.bank.refuse_at = {38: 4}
+    left = run.drive.close()
+    assert len(left) == 1
+    assert "register 38" in left[0]
+    assert run.bank.words[40] == 0
+
+
+def test_mode_in_a_register_of_its_own_comes_after_the_seed():
+    display = {"register": {"address": 9}, "speed": 0, "torque": 1}
+    apart = profile_with(modes={"register": {"address": 8, "type": "u16"}, "display": display})
+    bank = Bank()
+    bank.on_show = lambda words: words.update({9: words[8]})
+    run = Run(apart, bank).enabled()
+    bank.writes.clear()
+    bank.on_show = lambda words: None           # the display stays where it is
+    for _ in range(30):
+        sample = run.cycle(1.0, 120.0, Mode.TORQUE)
+    assert sample.mode is Mode.SPEED
+    seeds = [k for k, (address, _) in enumerate(bank.writes) if address == 0]
+    switches = [k for k, (address, _) in enumerate(bank.writes) if address == 8]
+    assert bank.writes[seeds[0]][1][3] == 150                   # 120 of 800 N·m
+    assert seeds[0] < switches[0]
+    assert len(switches) == 2                                   # asked for again after 25 cycles
+    bank.words[9] = 1
+    assert run.cycle(1.0, 120.0, Mode.TORQUE).mode is Mode.TORQUE
+    # Confirmed, it is only looked at now and then.
+    bank.requests.clear()
+    for _ in range(40):
+        run.cycle(1.0, 120.0, Mode.TORQUE)
+    assert sum(request[0] == 3 for request in bank.requests) == 2
+
+
+def test_mode_by_bits_of_the_control_word():
+    bits = profile_with(
+        control={"torque_bits": 0x0800},
+        modes={"by": "control_bits", "register": None, "speed_value": None, "torque_value": None, "display": None},
+    )
+    run = Run(bits).enabled()
+    assert run.cycle(1.0, 120.0, Mode.TORQUE).mode is Mode.TORQUE
+    assert run.controlwords()[-2:] == [0x0F, 0x080F]
+    assert all(address <= CONTROL and len(words) == 4 for address, words in run.bank.writes)
+    assert MODE not in [address for address, _ in run.bank.writes]
+
+
+def test_a_direction_bit_for_a_register_without_sign():
+    data = GENERIC.model_dump(by_alias=True)
+    data["control"]["reverse_bits"] = 0x4000
+    data["cycle"]["speed_setpoint"]["register"]["type"] = "u32"
+    profile = ModbusProfile.model_validate_json(json.dumps(data))
+    run = Run(profile).enabled()
+    run.cycle(-2.0)
+    _, words = run.bank.writes[-1]
+    assert words[0] == 0x400F
+    assert words[1:3] == high_and_low(1910)         # 19.1 rpm
+    run.cycle(0.0)
+    assert run.controlwords()[-1] == 0x400F         # braked from where it came
+    run.cycle(2.0)
+    assert run.controlwords()[-1] == 0x000F
+
+
+def test_a_mode_that_was_not_prepared():
+    drive = ModbusDrive(EmbeddedLink(Bank().serve, SteppedClock()), GENERIC, unit=1)
+    with pytest.raises(CommandRejected):
+        drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+
+
+def test_every_pdu_is_tapped():
+    bank, clock, frames = Bank(), SteppedClock(), []
+    drive = ModbusDrive(EmbeddedLink(bank.serve, clock), GENERIC, unit=1, tap=frames.append)
+    drive.connect()
+    drive.preflight(LIMITS)
+    drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    assert [frame.data for frame in frames if frame.outgoing] == bank.requests
+    assert len([frame for frame in frames if not frame.outgoing]) == len(bank.requests)
+    assert {frame.identifier for frame in frames} == {1}

@@ -1,0 +1,372 @@
+"""Both links against peers that misbehave, over the loopback and over a pty: every trouble comes out typed."""
+
+import contextlib
+import socket
+import struct
+import threading
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from modbus_peers import CLOSE, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
+
+from drivers.clock import MonotonicClock
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.errors import BadReply, LinkLost, NoReply
+from drivers.modbus.rtu import RtuLink
+from drivers.modbus.serial_port import permission_command, refusal
+from drivers.modbus.tcp import TcpLink
+
+ASK = bytes.fromhex("03 0010 0002")
+GOOD = bytes.fromhex("03 04 0250 04d2")
+OTHER = bytes.fromhex("03 04 dead beef")
+SHORT_S = 0.1       # for a reply that doesn't come
+LONG_S = 2.0        # for one that does
+
+
+def head(request):
+    return struct.unpack_from(">H", request)[0], request[6]
+
+
+def good(request):
+    """The right reply over TCP."""
+    return tcp(*head(request), GOOD)
+
+
+class Line:
+    """A link and its peer, with the reply's bytes for either kind of line."""
+
+    def __init__(self, kind, behave):
+        self.kind = kind
+        self.peer = (TcpPeer if kind == "tcp" else SerialPeer)(behave)
+
+    def __enter__(self):
+        self.peer.__enter__()
+        clock = MonotonicClock()
+        if self.kind == "tcp":
+            self.link = TcpLink("127.0.0.1", self.peer.port, clock)
+        else:
+            self.link = RtuLink(self.peer.device, clock, baud=115200, parity="N")
+        return self
+
+    def __exit__(self, *error):
+        self.link.close()
+        self.peer.__exit__()
+
+    def ask(self, timeout_s=LONG_S, pdu=ASK):
+        return self.link.transact(1, pdu, timeout_s)
+
+
+KINDS = pytest.mark.parametrize("kind", ["tcp", "rtu"])
+
+
+def reply(kind, request, pdu=GOOD, unit=None):
+    if kind == "rtu":
+        return rtu(request[0] if unit is None else unit, pdu)
+    transaction, sender = head(request)
+    return tcp(transaction, sender if unit is None else unit, pdu)
+
+
+@KINDS
+def test_a_transaction(kind):
+    with Line(kind, lambda number, request: [reply(kind, request)]) as line:
+        before_s = line.link.clock.now_s()
+        found = line.ask()
+        assert found.pdu == GOOD
+        assert before_s <= found.sent_s <= found.received_s <= line.link.clock.now_s()
+        request = line.peer.requests[0]
+        assert request == (tcp(1, 1, ASK) if kind == "tcp" else rtu(1, ASK))
+        assert line.link.description
+
+
+def test_the_crc_of_the_specification():
+    """A frame of the serial-line guide: 02 07 has CRC 41 12."""
+    assert crc(bytes.fromhex("0207")) == bytes.fromhex("4112")
+
+
+@KINDS
+@pytest.mark.parametrize("code", [1, 2, 3, 4, 6])
+def test_exceptions_are_replies(kind, code):
+    with Line(kind, lambda number, request: [reply(kind, request, bytes((0x83, code)))]) as line:
+        assert line.ask().pdu == bytes((0x83, code))
+
+
+@KINDS
+def test_a_reply_in_pieces(kind):
+    def behave(number, request):
+        whole = reply(kind, request)
+        return [part for k in range(len(whole)) for part in (whole[k : k + 1], 0.003)]
+
+    with Line(kind, behave) as line:
+        assert line.ask().pdu == GOOD
+        assert line.ask().pdu == GOOD
+
+
+@KINDS
+def test_silence(kind):
+    with Line(kind, lambda number, request: [] if number == 0 else [reply(kind, request)]) as line:
+        with pytest.raises(NoReply) as caught:
+            line.ask(SHORT_S)
+        assert isinstance(caught.value, CommunicationLost)
+        assert caught.value.where == line.link.description
+        assert caught.value.next_step
+        assert line.ask().pdu == GOOD
+        assert line.link.late == 0
+
+
+@KINDS
+def test_a_late_reply_is_not_taken_for_the_next(kind):
+    """It comes 50 ms after its time was over, and says something else."""
+    def behave(number, request):
+        return [SHORT_S + 0.05, reply(kind, request, OTHER)] if number == 0 else [reply(kind, request)]
+
+    with Line(kind, behave) as line:
+        with pytest.raises(NoReply):
+            line.ask(SHORT_S)
+        assert [line.ask().pdu for _ in range(3)] == [GOOD] * 3
+        assert line.link.late == 1
+
+
+@KINDS
+def test_a_reply_so_late_that_the_next_request_is_out(kind):
+    """The old reply comes right before the new one: same unit, function and length."""
+    kept = []
+
+    def behave(number, request):
+        if number == 0:
+            kept.append(reply(kind, request, OTHER))
+            return []
+        late = [kept.pop(), 0.015] if kept else []
+        return [*late, reply(kind, request)]
+
+    with Line(kind, behave) as line:
+        with pytest.raises(NoReply):
+            line.ask(SHORT_S)
+        assert [line.ask().pdu for _ in range(3)] == [GOOD] * 3
+        assert line.link.late == 1
+
+
+@KINDS
+def test_a_reply_nobody_asked_for_is_thrown_away(kind):
+    def behave(number, request):
+        return [reply(kind, request)] + ([0.01, reply(kind, request, OTHER)] if number == 0 else [])
+
+    with Line(kind, behave) as line:
+        assert line.ask().pdu == GOOD
+        wait = threading.Event()
+        wait.wait(0.06)
+        if kind == "rtu":
+            assert line.ask().pdu == GOOD
+            assert line.link.late == 1
+        else:
+            # An id that is not awaited, nor was given up: foreign. What comes next is on a new connection.
+            with pytest.raises(BadReply, match="transaction id 1, not 2"):
+                line.ask()
+        assert line.ask().pdu == GOOD
+
+
+@KINDS
+@pytest.mark.parametrize("wrong", ["unit", "function"])
+def test_a_reply_of_somebody_else(kind, wrong):
+    def behave(number, request):
+        if number:
+            return [reply(kind, request)]
+        return [reply(kind, request, GOOD if wrong == "unit" else b"\x04" + GOOD[1:], 2 if wrong == "unit" else None)]
+
+    with Line(kind, behave) as line:
+        with pytest.raises(BadReply, match=wrong):
+            line.ask()
+        assert line.ask().pdu == GOOD
+
+
+def test_a_wrong_transaction_id_costs_the_connection():
+    def behave(number, request):
+        transaction, unit = head(request)
+        return [tcp(transaction + 7 if number == 0 else transaction, unit, OTHER if number == 0 else GOOD)]
+
+    with Line("tcp", behave) as line:
+        with pytest.raises(BadReply, match="transaction id 8, not 1"):
+            line.ask()
+        assert line.peer.connections == 1
+        assert line.ask().pdu == GOOD
+    assert line.peer.connections == 2
+
+
+@pytest.mark.parametrize("rubbish", [b"HTTP/1.1 400 Bad Request\r\n", bytes(6) + b"\x01\x03", b"\0\1\0\0\xff\xff\1\3"])
+def test_what_is_no_modbus_frame(rubbish):
+    with Line("tcp", lambda number, request: [rubbish if number == 0 else good(request)]) as line:
+        with pytest.raises(BadReply, match="no Modbus frame"):
+            line.ask()
+        assert line.ask().pdu == GOOD
+
+
+@pytest.mark.parametrize("bit", [0, 9, 20, 35, 50, 71])
+def test_a_crc_error_on_the_line(bit):
+    def behave(number, request):
+        frame = bytearray(rtu(1, GOOD))
+        if number == 0:
+            frame[bit // 8] ^= 1 << bit % 8
+        return [bytes(frame)]
+
+    with Line("rtu", behave) as line:
+        with pytest.raises((BadReply, NoReply)):
+            line.ask(SHORT_S)
+        assert line.ask().pdu == GOOD
+
+
+@pytest.mark.parametrize("length", range(1, 9))
+def test_a_short_reply_on_the_line(length):
+    with Line("rtu", lambda number, request: [rtu(1, GOOD)[: length if number == 0 else None]]) as line:
+        with pytest.raises(BadReply):
+            line.ask(SHORT_S)
+        assert line.ask().pdu == GOOD
+
+
+@pytest.mark.parametrize("ending", [RESET, CLOSE])
+def test_a_connection_that_ends_is_not_opened_again(ending):
+    with Line("tcp", lambda number, request: [ending] if number == 1 else [good(request)]) as line:
+        assert line.ask().pdu == GOOD
+        for _ in range(3):
+            with pytest.raises(LinkLost):
+                line.ask()
+        assert line.peer.connections == 1
+        assert len(line.peer.requests) == 2
+
+
+def test_nothing_queues_up_on_a_connection_that_takes_nothing():
+    """The other end neither reads nor acknowledges: its buffers are full, as behind a cable that is out."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        link = TcpLink("127.0.0.1", listener.getsockname()[1], MonotonicClock())
+        link._socket.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            while True:
+                link._socket.send(bytes(1000))
+        with pytest.raises((NoReply, LinkLost)):
+            link.transact(1, ASK, SHORT_S)
+        with pytest.raises((NoReply, LinkLost)):
+            link.transact(1, ASK, SHORT_S)
+        assert link._transaction == 0       # neither was sent
+        link.close()
+
+
+def test_the_adapter_is_unplugged():
+    with Line("rtu", lambda number, request: [rtu(1, GOOD)] if number == 0 else [CLOSE]) as line:
+        assert line.ask().pdu == GOOD
+        line.peer.over.set()
+        line.peer.join()
+        line.peer.end()
+        for _ in range(2):
+            with pytest.raises(LinkLost):
+                line.ask(SHORT_S)
+
+
+def test_nothing_listens():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(PreflightRefused, match="nothing listens") as caught:
+        TcpLink("127.0.0.1", port, MonotonicClock())
+    assert str(port) in caught.value.where
+    assert caught.value.next_step
+
+
+def test_no_such_device(tmp_path):
+    with pytest.raises(PreflightRefused, match="no such device") as caught:
+        RtuLink(str(tmp_path / "ttyUSB7"), MonotonicClock())
+    assert caught.value.next_step
+
+
+def test_a_file_is_no_line(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("not a device")
+    with pytest.raises(PreflightRefused, match="no serial device"):
+        RtuLink(str(path), MonotonicClock())
+
+
+def test_a_device_in_use():
+    peer = SerialPeer(lambda number, request: [])
+    first = RtuLink(peer.device, MonotonicClock(), parity="N")
+    with pytest.raises(PreflightRefused, match="another program"):
+        RtuLink(peer.device, MonotonicClock(), parity="N")
+    first.close()
+    peer.end()
+
+
+@pytest.mark.parametrize("parity", ["N", "E", "O"])
+@pytest.mark.parametrize("baud", [9600, 19200, 115200])
+def test_settings_of_the_line(parity, baud):
+    """A pty takes them all, though none means anything to it."""
+    with SerialPeer(lambda number, request: [rtu(1, GOOD)]) as peer:
+        link = RtuLink(peer.device, MonotonicClock(), baud=baud, parity=parity, stop_bits=2)
+        assert link.transact(1, ASK, LONG_S).pdu == GOOD
+        assert f"{baud} baud 8{parity}2" in link.description
+        link.close()
+
+
+def test_permission_names_the_command(tmp_path):
+    path = tmp_path / "ttyUSB0"
+    path.touch()
+    error = refusal(str(path), PermissionError(13, "Permission denied"))
+    assert "permission denied" in error.what
+    assert "sudo " in error.next_step
+    assert permission_command("there is none").startswith("sudo usermod -a -G dialout")
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.binary(max_size=12) | st.sampled_from([tcp(1, 1, GOOD), tcp(1, 1, b"\x83\x02"), tcp(1, 2, GOOD)])))
+def test_whatever_comes_over_tcp_is_a_reply_or_a_typed_error(pieces):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        link = TcpLink("127.0.0.1", listener.getsockname()[1], MonotonicClock())
+        other, _ = listener.accept()
+        with other:
+            other.sendall(b"".join(pieces))
+            other.shutdown(socket.SHUT_WR)
+            with contextlib.suppress(BadReply, LinkLost):
+                assert link.transact(1, ASK, LONG_S).pdu[0] & 0x7F == 3
+        link.close()
+
+
+class JunkPort:
+    """Quacks like a serial port: what is to come comes once something was written."""
+
+    def __init__(self, data):
+        self.data, self.coming = data, b""
+
+    @property
+    def in_waiting(self):
+        return len(self.coming)
+
+    def write(self, frame):
+        self.coming, self.data = self.data, b""
+
+    def read(self, size):
+        found, self.coming = self.coming[:size], self.coming[size:]
+        if not found:
+            threading.Event().wait(0.001)
+        return found
+
+    def close(self):
+        pass
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.binary(max_size=12) | st.sampled_from([rtu(1, GOOD), rtu(1, b"\x83\x02"), rtu(2, GOOD)])))
+def test_whatever_comes_over_a_serial_line_is_a_reply_or_a_typed_error(pieces):
+    peer = SerialPeer(lambda number, request: [])
+    link = RtuLink(peer.device, MonotonicClock(), parity="N")
+    link.close()
+    peer.end()
+    link._lost, link._port = "", JunkPort(b"".join(pieces))
+    with contextlib.suppress(BadReply, NoReply):
+        assert link.transact(1, ASK, 0.01).pdu in (GOOD, b"\x83\x02")
+    link._port = JunkPort(rtu(1, GOOD))
+    assert link.transact(1, ASK, LONG_S).pdu == GOOD
+
+
+def test_the_embedded_line_drops_what_comes_too_late():
+    clock = MonotonicClock()
+    link = EmbeddedLink(lambda unit, pdu, now_s: (GOOD, now_s + 1.0), clock)
+    with pytest.raises(NoReply):
+        link.transact(1, ASK, 0.01)
+    assert link.late == 1

@@ -1,0 +1,380 @@
+"""Before motion: the marker, the whole table on a right drive, and every wrong of a register map, on a bank of ours."""
+
+import json
+
+import pytest
+from modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
+
+from drivers.clock import MonotonicClock, SteppedClock
+from drivers.drive import Limits, Mode, Outcome
+from drivers.errors import PreflightRefused
+from drivers.modbus.drive import ModbusDrive
+from drivers.modbus.embedded import EmbeddedLink
+from profiles.library import load_modbus_profile
+from profiles.modbus_schema import ModbusProfile
+
+LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+
+
+@pytest.fixture(scope="module")
+def generic():
+    return load_modbus_profile("generic/modbus")
+
+
+@pytest.fixture
+def bank():
+    return Bank()
+
+
+def of(data):
+    """As the file would be read: strict, and arrays are tuples."""
+    return ModbusProfile.model_validate_json(json.dumps(data))
+
+
+def changed(profile, **parts):
+    """The profile with other parameters, by name; whole sections by theirs."""
+    data = profile.model_dump(by_alias=True)
+    for name, change in parts.items():
+        if name in data and not isinstance(data[name], str):
+            data[name] = change if not isinstance(change, dict) else data[name] | change
+        else:
+            entry = next(one for one in data["parameters"] if one["name"] == name)
+            entry |= change
+    return of(data)
+
+
+def drive_on(bank, profile, clock=None, **options):
+    return ModbusDrive(EmbeddedLink(bank.serve, clock or SteppedClock()), profile, unit=1, **options)
+
+
+def refused(bank, profile, limits=LIMITS, **options):
+    """Preflight's refused rows by name; nothing may have moved."""
+    drive = drive_on(bank, profile, **options)
+    drive.connect()
+    found = drive.preflight(limits)
+    controlwords = [words[0] for address, words in bank.writes if address == CONTROL]
+    assert set(controlwords) <= {0}
+    assert all(check.where and check.next_step for check in found.refused)
+    return {check.name: check for check in found.refused}
+
+
+def test_a_drive_that_is_right(bank, generic):
+    before = dict(bank.words)
+    drive = drive_on(bank, generic)
+    identity = drive.connect()
+    assert identity.simulated
+    assert bank.writes == []
+    found = drive.preflight(LIMITS)
+    assert found.refused == ()
+    assert all(check.where for check in found.checks)
+    assert found.modes == frozenset(Mode)
+    assert (found.rated_torque_nm, found.torque_resolution_nm) == (800.0, 0.8)
+    assert (found.filters.speed_lag_s, found.filters.torque_lag_s) == (0.040, 0.015)
+    # 15 rad/s = 143.24 rpm, rounded up; 300 N·m of 800; 1 rad/s² = 9.55 rpm/s; 0.5 s
+    assert [bank.words[at] for at in (36, 37, 38, 39, 40)] == [1433, 0x10000 - 1433, 375, 96, 500]
+    assert [bank.words[at] for at in range(4)] == [0, 0, 0, 0]
+    assert drive.close() == ()
+    bank.show()
+    # The status word isn't a setting: the drive never left 'switch on disabled'.
+    assert {at: word for at, word in bank.words.items() if at != STATUS} == {
+        at: word for at, word in before.items() if at != STATUS
+    }
+
+
+def test_a_drive_without_marker_is_real_and_never_stepped(generic):
+    bank = Bank(marker=False)
+    with pytest.raises(PreflightRefused, match="marker"):
+        drive_on(bank, generic).connect()
+    assert not drive_on(bank, generic, MonotonicClock()).connect().simulated
+    assert bank.writes == []
+
+
+def test_a_simulated_peer_in_its_own_time_is_not_stepped(bank, generic):
+    bank.words[0xFDE8 + 12] = 0
+    with pytest.raises(PreflightRefused, match="its own time"):
+        drive_on(bank, generic).connect()
+
+
+def test_silence(bank, generic):
+    bank.silent = True
+    with pytest.raises(PreflightRefused, match="no drive answers") as caught:
+        drive_on(bank, generic).connect()
+    assert "--unit" in caught.value.next_step
+
+
+def test_a_drive_that_is_driven_already(bank, generic):
+    bank.machine.state = "operation enabled"
+    with pytest.raises(PreflightRefused, match="another master"):
+        drive_on(bank, generic).connect()
+    assert bank.writes == []
+
+
+def test_a_fault_is_never_reset_silently(bank, generic):
+    bank.machine.state = "fault"
+    rows = refused(bank, generic)
+    assert "--reset-fault" in rows["state"].next_step
+    assert bank.writes == []
+    drive = drive_on(bank, generic)
+    drive.connect()
+    drive.reset_fault()
+    assert [words for _, words in bank.writes] == [[0x0000], [0x0080], [0x0000]]
+    assert drive.preflight(LIMITS).refused == ()
+
+
+def test_a_turning_shaft_and_local_control(bank, generic):
+    bank.feedback = lambda: (2000, 0)
+    bank.remote = False
+    rows = refused(bank, generic)
+    assert set(rows) == {"state", "control over the field bus"}
+    assert "2.09 rad/s" in rows["state"].found
+    assert bank.writes == []
+
+
+# -- wrongs of a whole map: the drive is right, the profile has it wrong throughout, or the other way round ----------
+
+
+def every_register(profile, change):
+    """The profile with ``change(entry)`` made to each register, and to whatever has a scale."""
+    def walk(part):
+        if isinstance(part, dict):
+            change(part)
+            for one in part.values():
+                walk(one)
+        elif isinstance(part, list | tuple):
+            for one in part:
+                walk(one)
+
+    data = profile.model_dump(by_alias=True, mode="json")
+    walk(data)
+    return of(data)
+
+
+def swap_sign(part):
+    if part.get("type", "")[1:] in ("16", "32") and "address" in part:
+        part["type"] = {"i": "u", "u": "i"}[part["type"][0]] + part["type"][1:]
+
+
+def scale(factor):
+    def change(part):
+        if "per_lsb" in part:
+            part["per_lsb"] *= factor
+    return change
+
+
+def shift(by):
+    def change(part):
+        if "address" in part:
+            part["address"] = max(0, part["address"] + by)
+    return change
+
+
+@pytest.mark.parametrize(("title", "wrong"), [
+    ("word order", lambda profile: changed(profile, line={"word_order": "low_first"})),
+    ("ten times", lambda profile: every_register(profile, scale(10.0))),
+    ("a tenth", lambda profile: every_register(profile, scale(0.1))),
+    ("one too high", lambda profile: every_register(profile, shift(1))),
+    ("one too low", lambda profile: every_register(profile, shift(-1))),
+    ("sign", lambda profile: every_register(profile, swap_sign)),
+])
+def test_a_map_that_is_wrong_throughout_is_caught_before_anything_is_written(bank, generic, title, wrong):
+    profile = wrong(generic)
+    rows = refused(bank, profile)
+    assert rows, title
+    assert bank.writes == []
+
+
+@pytest.mark.parametrize("name", ["rated_torque", "rated_power", "rated_speed", "check_pattern", "check_sign"])
+@pytest.mark.parametrize("wrong", [{"per_lsb": 10.0}, {"address": 1}, {"address": -1}])
+def test_one_known_register_that_is_wrong(bank, generic, name, wrong):
+    entry = generic.parameter(name)
+    address = entry.register_.address + wrong.get("address", 0)
+    change = {"register": {**entry.register_.model_dump(), "address": address},
+              "per_lsb": entry.per_lsb * wrong.get("per_lsb", 1.0)}
+    assert refused(bank, changed(generic, **{name: change}))
+    assert bank.writes == []
+
+
+@pytest.mark.parametrize("setpoint", ["speed_setpoint", "torque_setpoint"])
+@pytest.mark.parametrize("wrong", ["times 10", "one off", "16 bit"])
+def test_one_setpoint_that_is_wrong(bank, generic, setpoint, wrong):
+    """The known registers are all right: only the drive's own echo can tell."""
+    data = generic.model_dump(by_alias=True)
+    entry = data["cycle"][setpoint]
+    if wrong == "times 10":
+        entry["per_lsb"] *= 10.0
+    elif wrong == "one off":
+        # The registers 5 to 9 take anything and do nothing.
+        entry["register"]["address"] = 6
+    elif setpoint == "torque_setpoint":
+        entry["register"]["address"] = 2
+    else:
+        entry["register"]["type"] = "i16"
+    name = setpoint.split("_")[0]
+    assert f"{name} setpoint as the drive understood it" in refused(bank, of(data))
+
+
+def test_setpoint_with_its_halves_swapped(bank, generic):
+    """The drive takes 32-bit setpoints the other way round than everything else."""
+    def swap(address, words):
+        if address == SPEED_SETPOINT:
+            bank.words[1], bank.words[2] = words[1], words[0]
+
+    bank.on_write = swap
+    assert "speed setpoint as the drive understood it" in refused(bank, generic)
+
+
+@pytest.mark.parametrize("address", [1, 3, 4, 36, 37, 38, 39, 40])
+def test_a_write_that_is_taken_but_not_applied(bank, generic, address):
+    """With function 16 a setpoint's two registers are written together: deaf to both halves."""
+    bank.deaf_to = {address, 2} if address == 1 else {address}
+    rows = refused(bank, generic)
+    assert rows
+    assert any(str(address) in check.where for check in rows.values())
+
+
+@pytest.mark.parametrize("address", [0, 1, 36, 40, 41, 45])
+@pytest.mark.parametrize("code", [1, 2, 3, 4])
+def test_a_register_that_the_drive_refuses(bank, generic, address, code):
+    bank.refuse_at = {address: code}
+    rows = refused(bank, generic)
+    if address == 45:
+        assert rows == {}           # a filter that isn't told is a note
+    else:
+        assert any(f"exception {code}" in check.found for check in rows.values())
+
+
+def test_a_busy_drive_is_asked_again_but_not_for_ever(bank, generic):
+    bank.script = [lambda reply: bytes((reply[0] | 0x80, 6))] * 3
+    drive = drive_on(bank, generic)
+    drive.connect()
+    assert drive.preflight(LIMITS).refused == ()
+    bank.refuse = {3: 6}
+    before = len(bank.requests)
+    with pytest.raises(PreflightRefused, match="busy"):
+        drive_on(bank, generic).connect()
+    assert len(bank.requests) - before == 5
+
+
+def test_the_checklist(bank, generic):
+    """What must be set by hand: each wrong one with its title, register and advice, all at once."""
+    bank.words[41] = 1
+    bank.words[44] = 7
+    profile = changed(generic, time_out_reaction={"advice": "Set 41 to 3 at the drive"})
+    rows = refused(bank, profile)
+    assert set(rows) == {"reaction to the time-out, 3 = quick stop", "register that reads -12345"}
+    assert rows["reaction to the time-out, 3 = quick stop"].next_step == "Set 41 to 3 at the drive"
+    assert bank.writes == []
+    bank.words |= {41: 3, 44: 0x10000 - 12345}
+    assert refused(bank, profile) == {}
+
+
+def test_what_the_drive_can_not_tell_must_be_given(bank, generic):
+    profile = changed(generic, rated_speed={"register": None}, rated_torque={"register": None})
+    rows = refused(bank, profile)
+    assert {"rated torque", "rated speed"} <= set(rows)
+    assert "drive_data.parameters.rated_speed" in rows["rated speed"].next_step
+    assert refused(bank, profile, given={"rated_speed": 200.0, "rated_torque": 800.0}) == {}
+    assert "name plate: torque × speed" in refused(bank, profile, given={"rated_speed": 2000.0, "rated_torque": 800.0})
+
+
+def test_rig_and_drive_must_agree_on_the_rated_torque(bank, generic):
+    assert set(refused(bank, generic, rated_torque_nm=900.0)) == {"rated torque"}
+    assert refused(bank, generic, rated_torque_nm=800.0) == {}
+
+
+def test_scales_that_hang_on_parameters(generic):
+    """Raw x per_lsb x value of another parameter: 16384 counts are the reference speed."""
+    data = generic.model_dump(by_alias=True)
+    data["cycle"]["speed_setpoint"] |= {"per_lsb": 0.01 / 200.0, "times": "rated_speed"}
+    data["cycle"]["speed"] |= {"per_lsb": 0.01 / 200.0, "times": "rated_speed"}
+    profile = of(data)
+    bank = Bank()
+    assert refused(bank, profile) == {}
+    # With another reference at the drive the echo no longer fits (nor does the name plate).
+    bank.words[35] = 2100
+    assert refused(bank, changed(profile, name_plate=None))
+
+
+@pytest.mark.parametrize(("watchdog", "words", "wrong"), [
+    ({"kind": "none", "parameter": None, "reaction": "none", "reaction_parameter": None}, {}, "watchdog"),
+    ({"parameter": None}, {}, "watchdog"),
+])
+def test_a_watchdog_that_is_not_there(bank, generic, watchdog, words, wrong):
+    bank.words |= words
+    assert set(refused(bank, changed(generic, watchdog=watchdog))) == {wrong}
+
+
+@pytest.mark.parametrize(("counts", "good"), [(0, False), (40, False), (300, True), (500, True), (501, False)])
+def test_a_watchdog_that_is_set_by_hand(bank, generic, counts, good):
+    """Not longer than rig.yaml wants it, and at least five cycles of 10 ms."""
+    bank.words[TIME_OUT] = counts
+    profile = changed(generic, time_out={"set_to": None})
+    assert set(refused(bank, profile)) == (set() if good else {"watchdog"})
+
+
+def test_a_coasting_reaction_is_said(bank, generic):
+    drive = drive_on(bank, changed(generic, watchdog={"reaction": "coast"}))
+    drive.connect()
+    found = drive.preflight(LIMITS)
+    assert found.safe_action == "coast"
+    assert any(check.name == "watchdog reaction" and check.found == "coast" for check in found.checks)
+
+
+def test_the_rate_is_what_the_line_carries(generic):
+    for takes_s, period_s in ((0.001, 0.010), (0.0098, 0.010), (0.0099, 0.01089), (0.020, 0.022)):
+        drive = drive_on(Bank(takes_s=takes_s), generic)
+        drive.connect()
+        found = drive.preflight(LIMITS)
+        assert drive.period_s == pytest.approx(period_s, abs=1e-5)
+        row = next(check for check in found.checks if check.name == "cycle rate")
+        assert row.outcome is (Outcome.NOTE if period_s > 0.010 else Outcome.OK)
+        assert f"{1.0 / drive.period_s:.4g} Hz" in row.found
+
+
+def test_a_line_too_slow_for_the_watchdog(generic):
+    rows = refused(Bank(takes_s=0.1), generic)
+    assert set(rows) == {"watchdog time"}
+    assert "0.55 s" in rows["watchdog time"].next_step
+
+
+def test_quick_stop_as_a_time(bank, generic):
+    """1 rad/s² from 3000 rpm (314.16 rad/s) down is 314.1 s, in counts of 0.1 s and not longer."""
+    profile = changed(generic, quick_stop_deceleration={"set_to": "quick_stop_time", "unit": "s", "times": "top"},
+                      rated_speed={"name": "top"}, name_plate=None)
+    bank.words[35] = 30000
+    assert refused(bank, profile) == {}
+    assert bank.words[39] == 3141
+
+
+@pytest.mark.parametrize("cut", ["hz", "fixed"])
+def test_filters(bank, generic, cut):
+    data = generic.model_dump(by_alias=True)
+    whence = {"source": "made up for a test", "confidence": "verified"}
+    if cut == "hz":
+        next(one for one in data["parameters"] if one["name"] == "speed_filter").update(unit="hz", per_lsb=0.1)
+        wanted = 0.0397887      # 1 / (2π 4 Hz)
+    else:
+        data["filters"] = [{"signal": "speed", "documented_s": 0.1, "advice": "take 63", **whence}]
+        wanted = 0.1
+    drive = drive_on(bank, of(data))
+    drive.connect()
+    found = drive.preflight(LIMITS)
+    assert found.filters.speed_lag_s == pytest.approx(wanted, rel=1e-5)
+    assert found.filters.source
+    assert any(check.name == "speed filter" for check in found.checks)
+
+
+def test_a_speed_only_drive(bank, generic):
+    data = generic.model_dump(by_alias=True)
+    data["cycle"]["torque_setpoint"] = None
+    data["echoes"] = [one for one in data["echoes"] if one["setpoint"] == "speed"]
+    data["modes"] |= {"torque": False, "by": "none", "register": None, "speed_value": None, "torque_value": None,
+                      "display": None}
+    drive = drive_on(bank, of(data))
+    drive.connect()
+    found = drive.preflight(LIMITS)
+    assert found.refused == ()
+    assert found.modes == {Mode.SPEED}
+    assert all(address + len(words) <= 3 or address > 4 for address, words in bank.writes)
+    with pytest.raises(PreflightRefused, match="torque"):
+        drive.enable(Mode.TORQUE)

@@ -1,0 +1,168 @@
+"""Preflight against drives that wear real profiles: what is set wrong by hand is refused, with the place to mend it."""
+
+import pytest
+from drive_benches import CanopenBench, Run
+from profile_benches import Epos4Bench, S120Bench
+
+from drivers.cia402.parameters import fulfils, wanted_text
+from drivers.drive import Mode, Outcome
+from profiles.requirement import Require
+from profiles.schema import CanopenProfile
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def make(kind):
+        made.append(kind())
+        return made[-1]
+
+    yield make
+    for bench in made:
+        bench.close()
+
+
+def found_with(bench, index=0, sub=0, value=None):
+    if value is not None:
+        store = bench.simulated.simulator.node.store
+        store.live.pop(index << 8 | sub, None)
+        store.values[index << 8 | sub] = value
+    bench.drive.connect()
+    return bench.drive.preflight(bench.limits)
+
+
+def refused(found):
+    return {check.name: check for check in found.refused}
+
+
+@pytest.mark.parametrize("kind", [Epos4Bench, S120Bench])
+def test_as_delivered_it_is_accepted_and_every_limit_stands_in_the_drive(make, kind):
+    found = found_with(make(kind))
+    assert found.refused == ()
+    titles = [check.name for check in found.checks if check.outcome is Outcome.OK]
+    assert {"torque limit", "speed limit", "quick-stop ramp", "unit of speed", "watchdog"} <= set(titles)
+
+
+@pytest.mark.parametrize("unit", [0xFFB44700, 0xFDB44700, 0x00000000])
+def test_another_unit_of_speed_is_refused(make, unit):
+    check = refused(found_with(make(Epos4Bench), 0x60A9, 0, unit))["unit of speed"]
+    assert (check.wanted, check.found, check.where) == ("00B44700h", f"{unit:08X}h", "60A9h")
+    assert "60A9h" in check.next_step
+
+
+def test_no_torque_constant_no_torque_limit(make):
+    found = refused(found_with(make(Epos4Bench), 0x3001, 5, 0))
+    assert set(found) == {"3001h:05 Torque constant", "torque limit"}
+    assert "at least 1" in found["3001h:05 Torque constant"].wanted
+    assert "reads 0" in found["torque limit"].found
+
+
+def test_rated_torque_is_in_micro_newton_metres(make):
+    bench = make(Epos4Bench)
+    found = found_with(bench)
+    assert bench.read(0x6076) == 1_000_000_000
+    assert found.rated_torque_nm == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize(("index", "sub", "value", "title", "words"), [
+    (0x4228, 0, 1, "p8744 CAN PDO mapping configuration", "p8744 = 2"),
+    (0x2803, 1, 0, "p2051[1] the second send word, r0080", "r0080[0]"),
+    (0x2803, 1, 31 << 16, "p2051[1] the second send word, r0080", "r0080[0]"),       # the smoothed one
+    (0x2198, 0, 0, "unit of speed", "p8630[0]"),
+    (0x21A2, 0, 200, "unit of speed", "scaled"),
+])
+def test_what_must_be_set_by_hand_on_an_s120(make, index, sub, value, title, words):
+    check = refused(found_with(make(S120Bench), index, sub, value))[title]
+    assert words in check.next_step
+    assert f"{index:04X}h" in check.where
+
+
+def test_an_s120_with_another_encoder_is_scaled_by_it(make):
+    """1024 pulses and 2^9: 524288 counts a turn."""
+    bench = make(S120Bench)
+    store = bench.simulated.simulator.node.store
+    store.values[0x21A200] = 9
+    assert found_with(bench, 0x2198, 0, 1024).speed_resolution_rad_s == pytest.approx(6.283185307 / 524288)
+
+
+def test_the_limits_of_an_s120_read_back_as_they_were_meant(make):
+    bench = make(S120Bench)
+    found_with(bench)
+    # IEEE 754: 300, -300 N·m; 143.2394 rpm is 15 rad/s; 15 s down from there at 1 rad/s²
+    assert bench.read(0x6072) == 0x43960000
+    assert bench.read(0x25F1) == 0xC3960000
+    assert bench.read(0x243A) == 0x430F3D4D
+    assert abs(bench.read(0x246F) - 0x41700000) <= 1       # worked out from a speed that is one of these itself
+
+
+def test_a_drive_whose_object_is_missing_says_so(make):
+    bench = make(S120Bench)
+    bench.simulated.simulator.node.store.remove(0x5810)
+    check = refused(found_with(bench))["PDO mapping"]
+    assert check.where == "1A00h:2"
+
+
+class UnlimitedBench(CanopenBench):
+    WORN = True
+
+    def __init__(self):
+        super().__init__()
+        sections = self.drive._profile
+        torque = sections.torque.model_copy(update={"max_torque_rated_per_lsb": None})
+        self.drive._profile = sections.model_copy(update={"torque": torque})
+
+
+def test_where_only_the_host_limits_torque_the_table_says_so(make):
+    found = found_with(make(UnlimitedBench))
+    note = next(check for check in found.checks if check.name == "torque limit")
+    assert note.outcome is Outcome.NOTE
+    assert "host alone limits it" in note.found
+
+
+# -- torque of 32 bits: it shares TPDO1 with the speed, and the statusword comes in TPDO2 ------------------------------
+
+
+def wide_profile(kind):
+    from profiles.library import load_canopen_profile
+
+    data = load_canopen_profile("siemens/s120-canopen").model_dump()
+    data["torque"]["actual"] = {"index": 0x5830, "sub": 0, "type": kind, "per_lsb": 0.5, "unit": "nm"}
+    return CanopenProfile.model_validate(data)
+
+
+@pytest.mark.parametrize("kind", ["i32", "f32"])
+def test_torque_of_32_bits(make, monkeypatch, kind):
+    import drive_benches
+
+    monkeypatch.setattr(drive_benches, "load_canopen_profile", lambda name: wide_profile(kind))
+    run = Run(make(S120Bench))
+    found = run.ready()
+    mapping = next(check for check in found.checks if check.name == "PDO mapping")
+    assert mapping.wanted == "6040+60FF, 5830+606C, 6041+6061"
+    run.enable()
+    last = run.go(12.0, speed=5.0)
+    assert last.torque_nm == pytest.approx(100.0, abs=1.0)
+    assert last.speed_rad_s == pytest.approx(5.0, abs=0.01)
+    missed = run.drive.counters.missed                     # none, unless the machine stood still for half a second
+    assert missed <= 2
+    # Half of a cycle's feedback is none: no torque of one instant beside a state of another.
+    run.bench.bus.change = lambda message: [] if message.arbitration_id == 0x281 else [message]
+    assert not run.cycle(speed=5.0).fresh
+    run.bench.bus.change = lambda message: [] if message.arbitration_id == 0x181 else [message]
+    assert not run.cycle(speed=5.0).fresh
+    run.bench.bus.change = lambda message: [message]
+    assert run.cycle(speed=5.0).fresh
+    assert run.drive.counters.missed == missed + 2
+    assert run.samples[-1].mode is Mode.SPEED
+
+
+@pytest.mark.parametrize(("require", "value", "good"), [
+    (Require(equals=2), 2.0, True), (Require(equals=2), 2.1, False), (Require(one_of=(1, 3)), 3.0, True),
+    (Require(one_of=(1, 3)), 2.0, False), (Require(at_least=1), 0.0, False),
+    (Require(at_least=1, at_most=2), 3.0, False), (Require(at_least=1, at_most=2), 1.5, True),
+    (Require(equals=0.1), 0.10000000149011612, True),
+])
+def test_requirements(require, value, good):
+    assert fulfils(require, value) is good
+    assert wanted_text(require, " s").endswith(" s")
