@@ -1,10 +1,10 @@
-"""``python -m sim_bus canopen …``: a simulated drive in a process of its own."""
+"""``python -m sim_bus canopen …``, ``python -m sim_bus modbus …``: a simulated drive in a process of its own."""
 
 import sys
 
-from sim_bus.command import add_arguments, main, run
+from sim_bus.command import main
 
-__all__ = ["add_arguments", "main", "run"]
+__all__ = ["main"]
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,4 +1,4 @@
-"""Which CiA 402 object is what in the drive, and in which unit.
+"""Which CiA 402 object is what in the drive, and in which unit: of our own EDS unless a profile says otherwise.
 
 ==========  =======================================================  ======================
 606B 606C 60FF 606D 606F   velocities and their windows                0.1 rpm (60A9h)
@@ -12,16 +12,13 @@
 """
 
 from collections.abc import Callable
-from math import pi
 
 from canopen.sdo import SdoAbortedError
 
 from sim_bus.cia402_application import Application, Settings
 from sim_bus.object_store import ABORT_VALUE, ObjectStore, key_of
+from sim_bus.object_units import ObjectUnits, standard_units
 from sim_bus.reporting import RPM
-
-VELOCITY_UNIT = 2.0 * pi / 600.0
-"""0.1 rpm in rad/s."""
 
 
 def clamped(value: float, bits: int) -> int:
@@ -33,9 +30,10 @@ def clamped(value: float, bits: int) -> int:
 class ApplicationObjects:
     """Binds an application's quantities to a store; ``setters`` are the fast ways in for RPDOs."""
 
-    def __init__(self, store: ObjectStore, application: Application) -> None:
+    def __init__(self, store: ObjectStore, application: Application, units: ObjectUnits | None = None) -> None:
         self._application = application
-        self._torque_unit = application.inverter.params.drive.rated_torque_nm / 1000.0
+        self._units = units or standard_units(application.inverter.params.drive)
+        self._usual = standard_units(application.inverter.params.drive)
         self._store = store
         self.setters: dict[int, Callable[[int], None]] = {
             key_of(0x6040): application.write_controlword,
@@ -50,52 +48,54 @@ class ApplicationObjects:
 
     def _ratings(self) -> None:
         """The defaults that depend on the rig; the drive's own limits are also the highest that may be written."""
-        drive, store = self._application.inverter.params.drive, self._store
-        per_mille = min(65535, round(1000.0 * drive.torque_limit_nm / drive.rated_torque_nm))
-        rpm = max(1, round(drive.speed_limit_rpm))
+        drive, store, units = self._application.inverter.params.drive, self._store, self._units
+        torque = min(65535, round(drive.torque_limit_nm / units.max_torque))
+        speed = max(1, round(drive.speed_limit_rpm * RPM / units.motor_speed))
         store.set_default(0x6075, 0, round(1000.0 * drive.rated_current_a))
-        store.set_default(0x6076, 0, round(1000.0 * drive.rated_torque_nm))
-        store.set_default(0x6072, 0, per_mille)
-        store.set_default(0x6080, 0, rpm)
-        store.variable(0x6072, 0).max = per_mille
-        store.variable(0x6080, 0).max = rpm
+        store.set_default(0x6076, 0, round(drive.rated_torque_nm / units.rated_torque))
+        store.set_default(0x6072, 0, torque)
+        store.set_default(0x6080, 0, speed)
+        store.variable(0x6072, 0).max = torque
+        store.variable(0x6080, 0).max = speed
 
     def _bind_process_data(self) -> None:
         application, live, hooks = self._application, self._store.live, self._store.hooks
         control, reporting = application.inverter.control, application.inverter.reporting
-        torque_unit = self._torque_unit
+        units = self._units
+        velocity, target, actual = units.velocity, units.target_torque, units.actual_torque
         live[key_of(0x6040)] = lambda: application.controlword
         live[key_of(0x6041)] = application.statusword
         live[key_of(0x6060)] = live[key_of(0x6061)] = lambda: application.mode.value
         live[key_of(0x606B)] = self._velocity_demand
-        live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / VELOCITY_UNIT, 32)
-        live[key_of(0x6074)] = lambda: clamped(control.demand_nm / torque_unit, 16)
-        live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / torque_unit, 16)
-        live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / torque_unit, 16)
-        live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / VELOCITY_UNIT, 32)
+        live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / velocity, 32)
+        live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
+        live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
+        live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)
+        live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / velocity, 32)
         hooks.update(self.setters)
         hooks[key_of(0x6060)] = self._mode_by_sdo
 
     def _bind_settings(self) -> None:
-        torque_unit = self._torque_unit
+        units, usual = self._units, self._usual
         self._setting(0x6007, "connection_option", {0, 1, 2, 3})
         self._setting(0x605A, "quick_stop_option", {0, 1, 2, 3, 5, 6, 7})
         self._setting(0x605B, "shutdown_option", {0, 1})
         self._setting(0x605C, "disable_option", {0, 1})
         self._setting(0x605D, "halt_option", {1, 2, 3})
         self._setting(0x605E, "fault_option", {0, 1, 2, 3})
-        self._scaled(0x606D, "window_rad_s", VELOCITY_UNIT)
-        self._scaled(0x606E, "window_s", 0.001)
-        self._scaled(0x606F, "standstill_rad_s", VELOCITY_UNIT)
-        self._scaled(0x6070, "standstill_s", 0.001)
-        self._scaled(0x6083, "accel_rad_s2", VELOCITY_UNIT)
-        self._scaled(0x6084, "decel_rad_s2", VELOCITY_UNIT)
-        self._scaled(0x6085, "quick_stop_rad_s2", VELOCITY_UNIT)
-        self._scaled(0x6087, "torque_slope_nm_s", torque_unit)
+        self._scaled(0x606D, "window_rad_s", units.velocity, usual.velocity)
+        self._scaled(0x606E, "window_s", 0.001, 0.001)
+        self._scaled(0x606F, "standstill_rad_s", units.velocity, usual.velocity)
+        self._scaled(0x6070, "standstill_s", 0.001, 0.001)
+        self._scaled(0x6083, "accel_rad_s2", units.acceleration, usual.acceleration)
+        self._scaled(0x6084, "decel_rad_s2", units.deceleration, usual.deceleration)
+        self._scaled(0x6085, "quick_stop_rad_s2", units.quick_stop, usual.quick_stop)
+        self._scaled(0x6087, "torque_slope_nm_s", units.torque_slope, usual.torque_slope)
 
     def _bind_limits(self) -> None:
         """6072h bounds both directions, 60E0h and 60E1h one each; 6080h is the speed."""
-        store, limits, unit = self._store, self._application.inverter.control.limits, self._torque_unit
+        store, limits, unit = self._store, self._application.inverter.control.limits, self._units.max_torque
+        speed_unit = self._units.motor_speed
         present = {0x6072: 65535, 0x60E0: 65535, 0x60E1: 65535}
 
         def torque(index: int) -> Callable[[int], None]:
@@ -107,7 +107,7 @@ class ApplicationObjects:
             return write
 
         def speed(value: int) -> None:
-            limits.speed_rad_s = value * RPM
+            limits.speed_rad_s = value * speed_unit
 
         for index in present:
             store.hooks[key_of(index)] = torque(index)
@@ -123,13 +123,17 @@ class ApplicationObjects:
 
         self._store.hooks[key_of(index)] = write
 
-    def _scaled(self, index: int, name: str, unit: float) -> None:
+    def _scaled(self, index: int, name: str, unit: float, usual: float) -> None:
+        """One rate or window; its default is that of our own EDS, in another unit another number, at least 1."""
         settings: Settings = self._application.settings
+        if unit != usual:
+            counts = self._store.default(key_of(index)) * usual / unit
+            self._store.set_default(index, 0, max(1, min(0xFFFF, round(counts))))
         self._store.hooks[key_of(index)] = lambda value: setattr(settings, name, value * unit)
 
     def _velocity_demand(self) -> int:
         control = self._application.inverter.control
-        return clamped(control.speed_reference_rad_s / VELOCITY_UNIT, 32)
+        return clamped(control.speed_reference_rad_s / self._units.velocity, 32)
 
     def _mode_by_sdo(self, code: int) -> None:
         if not self._application.set_mode(code):
@@ -138,8 +142,8 @@ class ApplicationObjects:
     def _mode_by_pdo(self, code: int) -> None:
         self._application.set_mode(code)      # an unsupported one is ignored: 6061h keeps showing the old one
 
-    def _set_target_torque(self, per_mille: int) -> None:
-        self._application.target_torque_nm = per_mille * self._torque_unit
+    def _set_target_torque(self, counts: int) -> None:
+        self._application.target_torque_nm = counts * self._units.target_torque
 
     def _set_target_velocity(self, counts: int) -> None:
-        self._application.target_speed_rad_s = counts * VELOCITY_UNIT
+        self._application.target_speed_rad_s = counts * self._units.velocity

@@ -62,6 +62,7 @@ class Application:
         self.controlword = 0
         self.target_speed_rad_s = 0.0
         self.target_torque_nm = 0.0
+        self.modes = frozenset(Mode)
         self.warning = False
         self.on_event: Callable[[str], None] = _ignore
         self.on_fault_reset: Callable[[], None] = lambda: None
@@ -93,10 +94,9 @@ class Application:
         """6060h; False where the mode is not supported. 0 means no change (CiA 402-2)."""
         if code in {0, self.mode}:
             return True
-        try:
-            self.mode = Mode(code)
-        except ValueError:
+        if code not in self.modes:
             return False
+        self.mode = Mode(code)
         self.on_event(f"mode {self.mode.value}")
         self._in_window_s = 0.0
         return True
@@ -150,6 +150,11 @@ class Application:
         """Halt is asked for in operation enabled."""
         return self.state is State.ENABLED and bool(self.controlword & sm.HALT)
 
+    @property
+    def stopping(self) -> bool:
+        """On the way to rest, or held there, by command: quick stop, halt, or a ramp before switching off."""
+        return self.state is State.QUICK_STOP or self.halted or self._after_stop is not None
+
     def statusword(self) -> int:
         """6041h."""
         word = sm.STATUS[self.state] | sm.VOLTAGE_ENABLED | sm.REMOTE
@@ -158,7 +163,7 @@ class Application:
         control = self.inverter.control
         if control.limited:
             word |= sm.INTERNAL_LIMIT
-        stopping = self.state is State.QUICK_STOP or self.halted or self._after_stop is not None
+        stopping = self.stopping
         if stopping:
             reached = self.standstill
         elif self.state is not State.ENABLED:

@@ -13,6 +13,7 @@ from struct import error as StructError
 import numpy as np
 
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.schema import CanopenProfile
 from sim_bus import emergency as emcy
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.cia402_application import Application
@@ -21,14 +22,17 @@ from sim_bus.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from sim_bus.inverter import Inverter
 from sim_bus.link import PassiveNetwork, Sender
 from sim_bus.nmt import Nmt, NmtCommand, NmtState
+from sim_bus.node_guarding import LifeGuard
 from sim_bus.object_store import ObjectStore, key_of
 from sim_bus.params import RigParams
 from sim_bus.pdo import ReceivePdo, TransmitPdo
 from sim_bus.trace import ROW_PERIOD_US, Trace
+from sim_bus.worn_profile import WornProfile
 
 SYNC = 0x080
 COMMUNICATION_AREA = (0x1000, 0x1FFF)
 PROFILE_AREA = (0x6000, 0x9FFF)
+MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker stays as it is
 Route = Callable[[bytes | bytearray], None]
 
 
@@ -38,10 +42,10 @@ def generic_eds() -> str:
 
 
 class Cia402Node:
-    """A CiA 402 slave over a simulated inverter."""
+    """A CiA 402 slave over a simulated inverter; of our own EDS, or wearing a ``profile``."""
 
     def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: Trace,
-                 stepped: bool) -> None:
+                 stepped: bool, profile: CanopenProfile | None = None) -> None:
         self.id = node_id
         self.time_us = 0
         self.stepped = stepped
@@ -55,7 +59,11 @@ class Cia402Node:
         self.network = PassiveNetwork(sender)
         self.network.add_node(self.store)
         self.emergency = Emergency(self.store, lambda data: sender.send(0x080 + node_id, data))
-        self._objects = ApplicationObjects(self.store, self.application)
+        self.worn = WornProfile(profile, self.application) if profile is not None else None
+        self._guard = LifeGuard()
+        self._objects = ApplicationObjects(self.store, self.application, self.worn.units if self.worn else None)
+        if self.worn is not None:
+            self.worn.dress(self.store, self._guard, self._set_period)
         self._receive = [
             ReceivePdo(self.store, n, self._objects.setters, self._route, self._short_pdo) for n in range(4)
         ]
@@ -84,9 +92,18 @@ class Cia402Node:
         if route is not None:
             route(data)
 
+    def on_remote(self, can_id: int) -> None:
+        """One remote frame: node guarding is answered by a drive that has it and produces no heartbeat of its own."""
+        guarded = self.worn is not None and self.worn.profile.watchdog.kind == "node_guarding"
+        if can_id != 0x700 + self.id or not guarded or self._producer.active:
+            return
+        self._send(can_id, self._guard.answer(self.nmt.state.value))
+        if self._guard.asked(self.time_us):
+            self._supervised("node guarding began")
+
     def boot(self) -> None:
         """Power-on: everything at its defaults, boot-up message, pre-operational."""
-        self._restore(COMMUNICATION_AREA, PROFILE_AREA)
+        self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
         self.note("power on")
         self._send(0x700 + self.id, b"\0")
         self.nmt.state = NmtState.PRE_OPERATIONAL
@@ -114,10 +131,11 @@ class Cia402Node:
         if command in {NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION}:
             if command is NmtCommand.RESET_NODE:
                 self.application.power_off()
-                self._restore(COMMUNICATION_AREA, PROFILE_AREA)
+                self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
             else:
                 self._connection_lost()
                 self._restore(COMMUNICATION_AREA)
+            self._guard.reset()
             self.note(f"NMT {command.name.lower().replace('_', ' ')}")
             self._send(0x700 + self.id, b"\0")
             self.nmt.state = NmtState.PRE_OPERATIONAL
@@ -138,11 +156,15 @@ class Cia402Node:
 
     def _on_heartbeat(self, _data: bytes | bytearray) -> None:
         if self._consumer.beat(self.time_us):
-            self.note("heartbeat supervision began")
-            if self.application.warning:
-                self.application.warning = False
-                if not self._faulted():
-                    self.emergency.reset()
+            self._supervised("heartbeat supervision began")
+
+    def _supervised(self, event: str) -> None:
+        """The host is there, for the first time or again."""
+        self.note(event)
+        if self.application.warning:
+            self.application.warning = False
+            if not self._faulted():
+                self.emergency.reset()
 
     # -- time --------------------------------------------------------------------------------------------
 
@@ -161,7 +183,9 @@ class Cia402Node:
                     self.time_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
                 )
         if self._consumer.expired(self.time_us):
-            self._heartbeat_lost()
+            self._host_lost("host heartbeat lost")
+        if self._guard.expired(self.time_us):
+            self._host_lost("host's node guarding lost")
         if self._producer.due(self.time_us) and self.nmt.state is not NmtState.INITIALISING:
             self._send(0x700 + self.id, bytes([self.nmt.state.value]))
         self._send_events()
@@ -182,9 +206,9 @@ class Cia402Node:
 
     # -- the connection ----------------------------------------------------------------------------------
 
-    def _heartbeat_lost(self) -> None:
+    def _host_lost(self, event: str) -> None:
         """The host fell silent: EMCY 8130h, the reaction of 6007h, and 1029h:1 for the NMT state."""
-        self.note("host heartbeat lost")
+        self.note(event)
         self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
         self.application.warning = True
         self.application.abort_connection()
@@ -216,7 +240,7 @@ class Cia402Node:
         hooks[key_of(0x1017)] = self._producer.configure
         hooks[key_of(MARKER_INDEX, 2)] = self._set_stepped
         live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
-        self.store.values[key_of(MARKER_INDEX, 0)] = 2
+        self.store.values[key_of(MARKER_INDEX, 0)] = max(self.store.object_dictionary[MARKER_INDEX].subindices)
         self.store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
 
     def _set_period(self, period_us: int) -> None:

@@ -42,6 +42,11 @@ class HeartbeatProducer:
         self._next_us = 0
         self._now_us = 0
 
+    @property
+    def active(self) -> bool:
+        """It is switched on."""
+        return self._period_us > 0
+
     def configure(self, milliseconds: int) -> None:
         """1017h; 0 switches off, otherwise the first one is due at once."""
         self._period_us = 1000 * milliseconds

@@ -6,10 +6,11 @@ of canopen's LocalNode, of which the SDO server is kept: its callbacks start a h
 """
 
 from collections.abc import Callable
+from math import isfinite
 
 import canopen
 from canopen import objectdictionary
-from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.sdo import SdoAbortedError
 
 ABORT_READ_WRITE_ONLY = 0x06010001
@@ -25,7 +26,7 @@ ABORT_TOO_LOW = 0x06090032
 ABORT_STATE = 0x08000022
 ABORT_NO_DATA = 0x08000024
 
-Value = int | str
+Value = int | float | str
 
 
 def key_of(index: int, subindex: int = 0) -> int:
@@ -38,8 +39,9 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
 
     def __init__(self, node_id: int, eds: str) -> None:
         super().__init__(node_id, eds)
-        self.live: dict[int, Callable[[], int]] = {}
+        self.live: dict[int, Callable[[], float]] = {}
         self.hooks: dict[int, Callable[[int], None]] = {}
+        self.float_hooks: dict[int, Callable[[float], None]] = {}
         self.values: dict[int, Value] = {}
         self._factory: dict[int, Value] = {}
         for entry in self.object_dictionary.values():
@@ -70,15 +72,18 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
                 hook = self.hooks.get(key)
                 if hook is not None and isinstance(value, int):
                     hook(value)
+                float_hook = self.float_hooks.get(key)
+                if float_hook is not None and not isinstance(value, str):
+                    float_hook(value)
                 self.values[key] = value
 
-    def number(self, key: int) -> int:
+    def number(self, key: int) -> float:
         """The present value of a numeric object."""
         live = self.live.get(key)
         if live is not None:
             return live()
         value = self.values[key]
-        if not isinstance(value, int):
+        if isinstance(value, str):
             raise TypeError(f"object {key >> 8:04X}h:{key & 0xFF} is no number")
         return value
 
@@ -123,9 +128,51 @@ class ObjectStore(canopen.LocalNode):  # type: ignore[misc, unused-ignore]
         variable = self.variable(index, subindex)
         if check_writable and not variable.writable:
             raise SdoAbortedError(ABORT_WRITE_READ_ONLY)
-        if variable.data_type not in objectdictionary.INTEGER_TYPES or 8 * len(data) != len(variable):
+        if 8 * len(data) != len(variable):
+            raise SdoAbortedError(ABORT_LENGTH)
+        if variable.data_type in objectdictionary.FLOAT_TYPES:
+            self._write_float(key_of(index, subindex), float(variable.decode_raw(bytes(data))))
+            return
+        if variable.data_type not in objectdictionary.INTEGER_TYPES:
             raise SdoAbortedError(ABORT_LENGTH)
         value = variable.decode_raw(bytes(data))
         if not isinstance(value, int):
             raise SdoAbortedError(ABORT_LENGTH)
         self.write(key_of(index, subindex), value)
+
+    def _write_float(self, key: int, value: float) -> None:
+        """A REAL32; NaN and the infinities are out of every range."""
+        if not isfinite(value):
+            raise SdoAbortedError(ABORT_VALUE)
+        hook = self.float_hooks.get(key)
+        if hook is not None:
+            hook(value)
+        self.values[key] = value
+
+    def add(self, index: int, subindex: int, data_type: int, *, writable: bool, mappable: bool, name: str) -> None:
+        """Puts an object in, in place of one that stands there; without a default it is read by its live getter."""
+        variable = ODVariable(name, index, subindex)
+        variable.data_type = data_type
+        variable.access_type = "rw" if writable else "ro"
+        variable.pdo_mappable = mappable
+        known = self.object_dictionary.get(index)
+        if subindex == 0 and not isinstance(known, ODRecord | ODArray):
+            if known is not None:
+                del self.object_dictionary[index]
+            self.object_dictionary.add_object(variable)
+        else:
+            if not isinstance(known, ODRecord | ODArray):
+                known = ODRecord(name, index)
+                self.object_dictionary.add_object(known)
+            known.add_member(variable)
+        for table in (self.live, self.hooks, self.float_hooks, self.values, self._factory):
+            table.pop(key_of(index, subindex), None)
+
+    def remove(self, index: int) -> None:
+        """Takes an object out, all of its subindices: SDO then says 06020000h."""
+        if index not in self.object_dictionary:
+            return
+        del self.object_dictionary[index]
+        for table in (self.live, self.hooks, self.float_hooks, self.values, self._factory):
+            for key in [key for key in table if key >> 8 == index]:
+                del table[key]

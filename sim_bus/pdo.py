@@ -22,11 +22,11 @@ INVALID = 1 << 31
 EXTENDED = 1 << 29
 _FORMATS = {
     datatypes.INTEGER8: "b", datatypes.UNSIGNED8: "B", datatypes.INTEGER16: "h", datatypes.UNSIGNED16: "H",
-    datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I",
+    datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I", datatypes.REAL32: "f",
 }
 _LAST_DUMMY = 0x0007
 Setter = Callable[[int], None]
-Getter = Callable[[], int]
+Getter = Callable[[], float]
 
 
 class Pdo:

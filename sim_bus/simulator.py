@@ -16,6 +16,7 @@ from typing import Self
 
 import can
 
+from profiles.schema import CanopenProfile
 from sim_bus.cia402_node import Cia402Node
 from sim_bus.link import BUS_ERRORS, Sender
 from sim_bus.params import RigParams
@@ -31,12 +32,15 @@ class Simulator:
     """A simulated drive on a bus that somebody else opens and shuts down."""
 
     def __init__(self, bus: can.BusABC, params: RigParams, *, node_id: int = 1, seed: int = 0,
-                 trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0) -> None:
+                 trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0,
+                 profile: CanopenProfile | None = None) -> None:
         self._bus = bus
         self._silence_s = silence_s
         self._sender = Sender(bus, self._on_send_failed)
         self._trace = Trace(trace)
-        self.node = Cia402Node(self._sender, params, node_id=node_id, seed=seed, trace=self._trace, stepped=stepped)
+        self.node = Cia402Node(
+            self._sender, params, node_id=node_id, seed=seed, trace=self._trace, stepped=stepped, profile=profile,
+        )
         self._wall_s = 0.0                 # wall time up to which the plant has run, in its own time
         self._running_on = False           # stepped, but the host is silent
         self._silent_s = 0.0
@@ -67,7 +71,7 @@ class Simulator:
                     continue
                 if message is None:
                     self._nothing_came(timeout_s, before_s, stop)
-                elif not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+                elif not (message.is_extended_id or message.is_error_frame):
                     self._frame_came(message)
 
     def _frame_came(self, message: can.Message) -> None:
@@ -82,7 +86,10 @@ class Simulator:
         elif not node.stepped:
             self._follow_wall_clock()
         was_stepped = node.stepped
-        node.on_frame(message.arbitration_id, message.data)
+        if message.is_remote_frame:
+            node.on_remote(message.arbitration_id)
+        else:
+            node.on_frame(message.arbitration_id, message.data)
         if was_stepped and not node.stepped:
             self._wall_s = time.monotonic()
 
@@ -130,17 +137,18 @@ class EmbeddedSimulator:
     """A simulator in a daemon thread of this process, on a python-can ``virtual`` channel of its own.
 
     ``with EmbeddedSimulator(params) as simulated: bus = can.Bus(interface="virtual", channel=simulated.channel)``.
-    By default stepped, and a pause of the host, however long, changes nothing: host and simulator share a fate, and a
-    run must repeat on a slow machine. What fails in the thread is raised by `check` and by `close`.
+    ``profile`` is what the simulated drive wears. By default stepped, and a pause of the host, however long, changes
+    nothing: host and simulator share a fate, and a run must repeat on a slow machine. What fails in the thread is
+    raised by `check` and by `close`.
     """
 
     def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
-                 stepped: bool = True, silence_s: float = math.inf) -> None:
+                 stepped: bool = True, silence_s: float = math.inf, profile: CanopenProfile | None = None) -> None:
         self.channel = f"tdhil-{uuid.uuid4().hex}"
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self.simulator = Simulator(
             self._bus, params or RigParams(),
-            node_id=node_id, seed=seed, trace=trace, stepped=stepped, silence_s=silence_s,
+            node_id=node_id, seed=seed, trace=trace, stepped=stepped, silence_s=silence_s, profile=profile,
         )
         self._stop = threading.Event()
         self._failure: BaseException | None = None

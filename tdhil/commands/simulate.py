@@ -1,4 +1,4 @@
-"""`tdhil simulate canopen …`: the simulated rig as a process of its own; the same as `python -m sim_bus`."""
+"""`tdhil simulate canopen …`, `tdhil simulate modbus …`: a simulated rig as a process of its own."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import argparse
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """What to pretend to be, and the simulator's own options."""
-    from sim_bus.__main__ import add_arguments as add_simulator_arguments
-    from sim_bus.__main__ import run
+    """What to pretend to be, each kind with the simulator's own options."""
+    from sim_bus.command import add_kinds
 
-    parser.add_argument("kind", choices=("canopen",), help="the bus on which the drive is simulated")
-    add_simulator_arguments(parser)
-    parser.set_defaults(run=run)
+    add_kinds(parser)

@@ -1,0 +1,87 @@
+"""What the commands of all simulated drives share: options, signals, and the one line that a user's mistake costs."""
+
+import argparse
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+
+from profiles.errors import TdhilError
+
+EXIT_OK = 0
+EXIT_USAGE = 2
+
+
+class Unusable(Exception):
+    """Something the user gave can't be used; the text is the line to print."""
+
+
+def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
+    """The shaft and what is written of it."""
+    group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
+    group.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of all noise (default 0)")
+    group.add_argument("--trace", metavar="FILE", type=Path, help="write what the true shaft does to this CSV file")
+
+
+def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
+    """Runs ``simulate`` until SIGINT or SIGTERM; the exit code. What the user can cause ends with one line."""
+    stop = threading.Event()
+    try:
+        with _signals(stop):
+            simulate(stop)
+    except (Unusable, TdhilError, OSError) as error:
+        print(f"simulate: {error}", file=sys.stderr)  # noqa: T201
+        return EXIT_USAGE
+    return EXIT_OK
+
+
+def ready(text: str) -> None:
+    """Tells whoever started the simulator how to reach it."""
+    print(f"ready: {text}", flush=True)  # noqa: T201
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """HOST:PORT; the host of this machine where it is left out."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or int(port) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT")
+    return host.strip("[]") or "127.0.0.1", int(port)
+
+
+def number_from(lowest: int, highest: int, what: str) -> Callable[[str], int]:
+    """An argument type: a whole number in that range."""
+    def parse(text: str) -> int:
+        if not text.isdigit() or not lowest <= int(text) <= highest:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {lowest} to {highest}")
+        return int(text)
+
+    return parse
+
+
+def _seed(text: str) -> int:
+    if not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a seed: a whole number from 0")
+    return int(text)
+
+
+@contextlib.contextmanager
+def _signals(stop: threading.Event) -> Iterator[None]:
+    """SIGINT and SIGTERM end the simulation; in another thread than the main one they can't be caught."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for known, handler in before.items():
+            signal.signal(known, handler)

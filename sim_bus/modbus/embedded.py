@@ -1,0 +1,89 @@
+"""The simulated Modbus drive in the host's own process and time: no socket, no thread, no wall clock.
+
+A request takes its time on the line, the drive acts on it, and the reply takes its time back; whoever sent it waits, in
+control time, until the reply is complete, and that wait is what moves the plant.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from profiles.modbus_schema import ModbusProfile
+from sim_bus.modbus.machine import Machine
+from sim_bus.modbus.timing import LineTiming
+from sim_bus.modbus.wrongs import Wrong
+from sim_bus.params import RigParams
+
+_BROADCAST = 0
+
+
+class EmbeddedModbusDrive:
+    """A drive that wears ``profile``, at the end of a line of ``timing`` (the profile's own unless given)."""
+
+    def __init__(self, params: RigParams, profile: ModbusProfile, *, unit: int = 1, seed: int = 0,
+                 trace: Path | None = None, timing: LineTiming | None = None, wrongs: tuple[Wrong, ...] = ()) -> None:
+        self.unit = unit
+        self.timing = timing if timing is not None else LineTiming.of(profile.line)
+        self.machine = Machine(params, profile, seed=seed, trace=trace, wrongs=wrongs, stepped=True)
+        self._chances = np.random.default_rng((seed, 1))
+        self._free_s = 0.0              # the line has been silent long enough from here on
+        self._time_s = 0.0
+
+    @property
+    def time_s(self) -> float:
+        """Control time up to which the drive has run."""
+        return self._time_s
+
+    @property
+    def speed_rad_s(self) -> float:
+        """The true shaft's speed."""
+        return self.machine.inverter.speed_rad_s
+
+    @property
+    def rated_torque_nm(self) -> float:
+        """100 % torque."""
+        return self.machine.parameters.rated_torque_nm
+
+    @property
+    def untold(self) -> Mapping[str, float]:
+        """Values of the parameters that have no register: what rig.yaml would have to state."""
+        return self.machine.parameters.untold
+
+    def serve(self, unit: int, pdu: bytes, now_s: float) -> tuple[bytes | None, float]:
+        """A request sent at ``now_s``: its reply, and when that is complete; None where nobody answers.
+
+        The plant has then run up to the moment at which the drive acted. A line that isn't free yet delays the request.
+        """
+        timing = self.timing
+        acts_s = max(now_s, self._free_s) + timing.acts_after_s(len(pdu), self._chances.random())
+        self.run_until(acts_s)
+        if unit not in {self.unit, _BROADCAST}:
+            self._free_s = acts_s
+            return None, acts_s
+        reply = self.machine.request(pdu)
+        if unit == _BROADCAST:
+            self._free_s = acts_s
+            return None, acts_s
+        complete_s = acts_s + timing.way_s(len(reply), self._chances.random())
+        self._free_s = complete_s + timing.silence_s
+        return reply, complete_s
+
+    def run_until(self, time_s: float) -> None:
+        """The plant runs on; a watchdog that is due acts on the way."""
+        if time_s > self._time_s:
+            self._time_s = time_s
+            self.machine.run_until(time_s)
+
+    def close(self) -> None:
+        """The trace is written; safe to repeat."""
+        self.machine.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 where: TracebackType | None) -> None:
+        self.close()

@@ -1,0 +1,169 @@
+"""The simulated drive that wears a profile: registers, words, watchdog, loops and shaft, without its bus.
+
+Plant and control move on the drive's own grid, the control period of plant.yaml; a request acts between two steps.
+Owns no clock: whoever calls `run_until` says how late it is.
+"""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from profiles.modbus_schema import ModbusProfile
+from sim_bus.cia402_application import Application, Mode
+from sim_bus.inverter import Inverter
+from sim_bus.modbus.bank import Answer, Bank
+from sim_bus.modbus.families import FAMILIES, Wiring
+from sim_bus.modbus.parameters import Parameters, reporting_lag_s
+from sim_bus.modbus.slots import Map
+from sim_bus.modbus.watchdog import Watchdog
+from sim_bus.modbus.wrongs import Wrong
+from sim_bus.params import RigParams
+from sim_bus.trace import ROW_PERIOD_US, Trace
+
+_REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3, "ramp_stop": 3}
+"""As 6007h codes them."""
+_SLOW_DOWN_RAMP = 1
+
+
+class Machine:
+    """A drive on Modbus, and the shaft on it."""
+
+    def __init__(self, params: RigParams, profile: ModbusProfile, *, seed: int = 0, trace: Path | None = None,
+                 wrongs: tuple[Wrong, ...] = (), stepped: bool = True) -> None:
+        self._profile = profile
+        self.parameters = Parameters(profile, params, wrongs)
+        self.inverter = Inverter(self._worn(params), np.random.default_rng(seed))
+        self.application = application = Application(self.inverter)
+        application.set_mode(Mode.CYCLIC_VELOCITY.value)
+        self.words = FAMILIES[profile.control.family](application, _wiring(profile))
+        self._map = Map(profile, self.parameters, self.words, wrongs, stepped=stepped)
+        cycle = profile.cycle
+        self._bank = Bank(self._map.slots, cycle.functions, self._written, largest_read=cycle.largest_read,
+                          largest_write=cycle.largest_write)
+        self.watchdog = Watchdog(profile.watchdog)
+        self._trace = Trace(trace)
+        self._period_s = params.drive.control_period_s
+        self._steps = 0
+        self._next_row_us = 0
+        application.on_event = self._note
+        self._obey_parameters()
+        self._note("power on")
+
+    @property
+    def time_s(self) -> float:
+        """Plant time."""
+        return self._steps * self._period_s
+
+    def request(self, pdu: bytes) -> bytes:
+        """A request for this drive, at the time that it is."""
+        answer = self._bank.answer(pdu)
+        self._fed(answer)
+        return answer.pdu
+
+    def run_until(self, time_s: float) -> None:
+        """Everything moves on, up to the last step of the grid that is not later."""
+        last = int(time_s / self._period_s * (1.0 + 1e-12) + 1e-6)
+        if last > self._steps:
+            self.application.regulate()
+        while self._steps < last:
+            self._steps += 1
+            self.application.step(self._period_s)
+            self._row()
+            self._watch()
+
+    def trip(self) -> None:
+        """The drive finds a fault of its own."""
+        self.application.fault()
+        self._note("fault")
+
+    def close(self) -> None:
+        """The trace is written; safe to repeat."""
+        self._trace.close()
+
+    def flush(self) -> None:
+        """Lets readers of the trace see what is there."""
+        self._trace.flush()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 where: TracebackType | None) -> None:
+        self.close()
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _worn(self, params: RigParams) -> RigParams:
+        """The rig, reporting as the profile's drive does: its own lags; the quanta are those of the registers."""
+        reporting: dict[str, float] = {"speed_quantum_rpm": 0.0, "torque_quantum_permille": 0.0}
+        for signal in ("speed", "torque"):
+            lag_s = reporting_lag_s(self._profile, self.parameters, signal)
+            if lag_s is not None:
+                reporting[f"{signal}_lag_s"] = lag_s
+        return params.model_copy(update={"reporting": params.reporting.model_copy(update=reporting)})
+
+    def _written(self) -> None:
+        self._obey_parameters()
+        self._map.act()
+
+    def _obey_parameters(self) -> None:
+        limits, parameters = self.inverter.control.limits, self.parameters
+        limits.torque_forward_nm = parameters.limit_nm("torque_limit")
+        limits.torque_reverse_nm = parameters.limit_nm("torque_limit_reverse")
+        limits.speed_rad_s = parameters.speed_limit_rad_s()
+        self.application.settings.quick_stop_rad_s2 = parameters.quick_stop_rad_s2()
+
+    def _fed(self, answer: Answer) -> None:
+        lost = self.watchdog.lost
+        self.watchdog.heard(self.time_s, wrote=answer.wrote, commanded=answer.commanded)
+        if lost and not self.watchdog.lost:
+            self.application.warning = False
+            self._note("host is back")
+
+    def _watch(self) -> None:
+        watchdog = self._profile.watchdog
+        if watchdog.kind == "none" or watchdog.parameter is None:
+            return
+        if self.watchdog.expired(self.time_s, self.parameters.value(watchdog.parameter)):
+            self._host_lost()
+
+    def _host_lost(self) -> None:
+        """The profile's reaction; none where the parameter that chooses it reads something else than it should."""
+        self._note("host silent")
+        watchdog, settings = self._profile.watchdog, self.application.settings
+        self.application.warning = True
+        self.words.set_quick_stop()
+        if watchdog.reaction == "ramp_stop":
+            settings.quick_stop_option = _SLOW_DOWN_RAMP
+        chosen = self.parameters.met(watchdog.reaction_parameter)
+        settings.connection_option = _REACTIONS[watchdog.reaction] if chosen else 0
+        self.application.abort_connection()
+        if settings.connection_option:
+            self.words.host_lost()
+        self.application.regulate()
+
+    def _row(self) -> None:
+        time_us = round(self.time_s * 1e6)
+        if time_us >= self._next_row_us:
+            self._next_row_us = (time_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
+            self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm,
+                            self.application.state.value)
+
+    def _note(self, event: str) -> None:
+        state = self.application.state.value
+        self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm, state,
+                        event or f"state: {state}")
+
+
+def _wiring(profile: ModbusProfile) -> Wiring:
+    return Wiring(
+        torque_bits=profile.control.torque_bits if profile.modes.torque else 0,
+        mode_register=profile.modes.by == "register",
+        reverse_bits=profile.control.reverse_bits or 0,
+        switch_while_enabled=profile.modes.switch_while_enabled,
+        brakes_in_torque=profile.quick_stop.decelerates_in_torque_mode,
+        holds_after_quick_stop=profile.quick_stop.ends == "quick_stop",
+        status_address=profile.cycle.status.register_.address,
+    )

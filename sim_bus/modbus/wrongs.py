@@ -1,0 +1,51 @@
+"""Scripted register-level wrongs: the drive's map isn't what its profile says. Pure.
+
+========================  ==========================================================================================
+word_order                32-bit numbers stand with their halves exchanged
+scale_10                  every scaled register counts in tenths: its number is ten times as large
+address_off_by_one        every register stands one address higher
+sign                      what the drive reports of signed registers has the opposite sign
+unsigned                  signed registers have no sign: set below zero they read as large, reported is the magnitude
+write_not_applied         parameters are written without an error, and keep what they had
+reads_back_something_else `:NAME` the parameter NAME reads half as large again, and one more
+========================  ==========================================================================================
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from profiles.errors import TdhilError
+
+Kind = Literal["word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied",
+               "reads_back_something_else"]
+KINDS: tuple[str, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True, slots=True)
+class Wrong:
+    """One wrong; ``of`` names the parameter that reads back something else."""
+
+    kind: Kind
+    of: str | None = None
+
+
+def parse(text: str, parameters: Iterable[str] = ()) -> Wrong:
+    """``scale_10``, or ``reads_back_something_else:time_out``; TdhilError names what there is."""
+    kind, _, of = text.partition(":")
+    known = tuple(parameters)
+    if kind not in KINDS:
+        raise TdhilError(f"no wrong is named '{kind[:40]}'", where="--wrong",
+                         next_step=f"There are: {', '.join(KINDS)}")
+    if (kind == "reads_back_something_else") != bool(of):
+        raise TdhilError(f"'{text[:60]}' is not complete or says too much", where="--wrong",
+                         next_step="Only reads_back_something_else takes a parameter: reads_back_something_else:NAME")
+    if of and known and of not in known:
+        raise TdhilError(f"the profile has no parameter '{of[:40]}'", where="--wrong",
+                         next_step=f"It has: {', '.join(known)}")
+    return Wrong(kind, of or None)  # type: ignore[arg-type]
+
+
+def something_else(raw: int) -> int:
+    """What is read instead of ``raw``."""
+    return raw + abs(raw) // 2 + 1
