@@ -12,10 +12,15 @@
     ├── LimitHit                    speed left its window; torque or time limit reached          7
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
     ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
-    ├── LogError                    in `tdhil.record`: brings its own `exit_code`
+    ├── LogError                    in `tdhil.record.errors`: each brings its own `exit_code`
+    │   ├── LogUnopened             no such folder                                               2
+    │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
+    │   ├── LogRefused              too little space to begin with; nothing moved                4
+    │   └── NothingRecoverable      not one message of the file can be read                     10
     └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP (143)
 
-Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors.
+Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
+broke off ends with 3 as well, since what it holds can be replayed.
 A class or an instance may carry an attribute ``exit_code``, which goes before this table.
 """
 

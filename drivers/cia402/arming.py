@@ -8,8 +8,8 @@ from drivers.cia402.mapping import layout, write_pdo, written
 from drivers.cia402.objects import consumer_heartbeat
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.shape import Shape
-from drivers.cia402.table import Table
 from drivers.errors import ObjectRefused, PreflightRefused
+from drivers.table import Table
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile, Watchdog
 

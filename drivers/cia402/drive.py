@@ -36,7 +36,6 @@ from drivers.cia402.state import (
     decode,
     power_state,
 )
-from drivers.cia402.table import Table
 from drivers.cia402.units import find_units
 from drivers.cia402.watch import OPERATIONAL, Watch
 from drivers.clock import Clock
@@ -52,6 +51,7 @@ from drivers.drive import (
     Sample,
 )
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.table import Table
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
 from profiles.schema import CanopenProfile
 

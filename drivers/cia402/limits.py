@@ -8,10 +8,10 @@ from collections.abc import Callable
 from drivers.cia402.objects import RPM
 from drivers.cia402.parameters import Settings
 from drivers.cia402.sdo import Objects, name
-from drivers.cia402.table import Table
 from drivers.cia402.values import decode_value, encode_value
 from drivers.drive import Limits
 from drivers.errors import ObjectRefused
+from drivers.table import Table
 from profiles.canopen_parameter import Parameter
 from profiles.schema import CanopenProfile
 

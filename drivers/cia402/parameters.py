@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from drivers.cia402.sdo import Objects, name
-from drivers.cia402.table import Table
 from drivers.cia402.values import decode_value
 from drivers.errors import ObjectRefused
+from drivers.table import Table
 from profiles.canopen_parameter import Parameter
 from profiles.requirement import Require
 from profiles.schema import CanopenProfile

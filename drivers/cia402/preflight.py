@@ -11,9 +11,9 @@ from drivers.cia402.filters import read_filters
 from drivers.cia402.objects import MODE_NAMES, Units
 from drivers.cia402.sdo import Objects
 from drivers.cia402.state import State, decode
-from drivers.cia402.table import Table
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
+from drivers.table import Table
 from profiles.schema import CanopenProfile
 
 STILL_LSB, STILL_RAD_S = 5, 0.05

@@ -5,9 +5,9 @@ from __future__ import annotations
 from drivers.cia402.objects import RPM, Units
 from drivers.cia402.parameters import Settings
 from drivers.cia402.sdo import Objects, name
-from drivers.cia402.table import Table
 from drivers.cia402.values import decode_value
 from drivers.errors import ObjectRefused
+from drivers.table import Table
 from profiles.schema import CanopenProfile
 
 SI_UNIT_VELOCITY = 0x60A9

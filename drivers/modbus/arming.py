@@ -12,7 +12,7 @@ from drivers.modbus.access import Access
 from drivers.modbus.limits import write_setting
 from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.rounds import Round
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile
 
 LEAST_CYCLES = 5

@@ -31,8 +31,8 @@ from drivers.modbus.rounds import Round, go_round
 from drivers.modbus.scales import Scales
 from drivers.modbus.standstill import Standstill
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
-from drivers.modbus.table import Table
 from drivers.modbus.ticks import Ticks
+from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, StatusState
 
 REPEAT_MODE_CYCLES = 25

@@ -13,7 +13,7 @@ from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.registers import RANGES, register_name, to_counts
 from drivers.modbus.scales import Scales, si_per_count
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.modbus_schema import Echo, ModbusProfile, Signal
 
 SHARES = (0.25, -0.5, 0.75, -1.0 / 3.0)

@@ -15,7 +15,7 @@ from drivers.modbus.access import Access
 from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.registers import to_counts
 from drivers.modbus.scales import RPM, per_count
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
 
 _SLACK = 1e-9

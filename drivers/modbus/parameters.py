@@ -14,7 +14,7 @@ from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.registers import RANGES, register_name
 from drivers.modbus.scales import RPM, per_count, settle
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
 from profiles.requirement import Require
 

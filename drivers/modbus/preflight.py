@@ -21,7 +21,7 @@ from drivers.modbus.parameters import (
 from drivers.modbus.registers import from_words, register_name
 from drivers.modbus.scales import Scales, find_scales
 from drivers.modbus.states import decode, power_state, seen
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile
 
 STILL_COUNTS, STILL_SHARE = 5, 0.005

@@ -5,6 +5,8 @@ from threading import Event as Flag
 from typing import Any, Final
 
 NUDGE: Final = 256
+WAKE_S: Final = 0.2
+LAG_S: Final = 0.4                     # of control time: what a kill may cost in stepped time, plus a cycle
 SPARE: Final = 1024
 
 
@@ -22,6 +24,9 @@ class Backlog:
         self.room = Flag()                 # something was taken out
         self.dropped = 0
         self.ended = False
+        self.hurry = False                 # somebody waits until all that is here is in the file
+        self.written = Flag()              # that is done
+        self.saved_s = 0.0                 # control time up to which the file holds everything
         self._limit = limit
         self._block = block
         self._alert = min(NUDGE, limit)
@@ -40,11 +45,27 @@ class Backlog:
         self.items.append(item)
         return True
 
+    def keep_up(self, time_s: float) -> None:
+        """Stepped time, after the cycle of control time ``time_s``: waits while the file is `LAG_S` behind it."""
+        behind_s = time_s - self.saved_s
+        if behind_s < WAKE_S:
+            return
+        if behind_s < LAG_S:
+            if not self.wake.is_set():
+                self.wake.set()
+            return
+        self.written.clear()
+        self.hurry = True
+        self.wake.set()
+        while not self.ended and not self.written.wait(0.05):
+            pass                           # the time-out covers an end that came in between
+
     def end(self) -> None:
         """Nothing is taken any more; whoever waits for room goes on."""
         self.ended = True
         self._alert = 0
         self.room.set()
+        self.written.set()
 
     def _crowded(self, limit: int) -> bool:
         if not self.wake.is_set():

@@ -1,6 +1,10 @@
 """Something that happened in a run and is worth a line: an error, a warning, a drop, a key press."""
 
 from dataclasses import dataclass
+from typing import Final
+
+RECOVERED: Final = "recovered"
+"""Kind of the event in a salvaged copy: the copy is whole, the run that it shows is not."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from tdhil.record import chunk
 from tdhil.record.channels import CHANNELS, PACKAGE
@@ -15,10 +15,19 @@ _NUMBER: Final = {(topic, f"{PACKAGE}.{message}"): number for number, (topic, me
 _OTHER: Final = "Give a run.mcap of this tool"
 
 
-def messages(path: Path) -> Iterator[tuple[int, bytes] | Damage | Whole]:
-    """Channel numbers of ours with payloads, what was stepped over, and at the end `Whole` if the file was closed.
+class Ours(NamedTuple):
+    """One message on one of our channels, not decoded yet; ``number`` is the channel's in `channels`."""
+
+    number: int
+    payload: bytes
+    log_time_ns: int
+
+
+def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | Whole]:
+    """Messages of ours, what was stepped over, and at the end `Whole` if the file was closed.
 
     Raises `LogError` where the file can't be opened, is empty, is not MCAP, or (at the end) holds nothing of ours.
+    ``salvage``: a file that doesn't begin like MCAP is searched all the same, since its head may be what was hit.
     """
     declared = _Declared()
     try:
@@ -28,7 +37,10 @@ def messages(path: Path) -> Iterator[tuple[int, bytes] | Damage | Whole]:
             if size == 0:
                 raise LogError("the file is empty", where=str(path), next_step="The run has to be done again")
             if file.read(len(MAGIC)) != MAGIC[:size]:
-                raise LogError("this is not an MCAP file", where=str(path), next_step=_OTHER)
+                if not salvage:
+                    raise LogError("this is not an MCAP file", where=str(path), next_step=_OTHER)
+                yield Damage(0, "the file does not begin like MCAP")
+                declared.assume()
             for found in walk(file, size):
                 if isinstance(found, Contents):
                     yield from declared.messages(found)
@@ -40,7 +52,8 @@ def messages(path: Path) -> Iterator[tuple[int, bytes] | Damage | Whole]:
         raise LogError(f"the log can't be read: {error.strerror or error}", where=str(path),
                        next_step="Check the path") from error
     if not declared.ours:
-        raise LogError("an MCAP file, but not a run of this tool", where=str(path), next_step=_OTHER)
+        what = "nothing of a run of this tool is in it" if salvage else "an MCAP file, but not a run of this tool"
+        raise LogError(what, where=str(path), next_step=_OTHER)
 
 
 class _Declared:
@@ -57,13 +70,18 @@ class _Declared:
             self.ours = True
             self._numbers = {number: number for number in CHANNELS} | self._numbers
 
-    def messages(self, contents: Contents) -> Iterator[tuple[int, bytes] | Damage]:
+    def assume(self) -> None:
+        """Nothing is known of who wrote it: what can't be one of our files' chunks must show by itself."""
+        self._numbers = {number: number for number in CHANNELS}
+
+    def messages(self, contents: Contents) -> Iterator[Ours | Damage]:
         numbers = self._numbers
         try:
             for record in chunk.records(contents.data):
                 if isinstance(record, chunk.Message):
                     if record.channel in numbers:
-                        yield numbers[record.channel], record.payload
+                        self.ours = True
+                        yield Ours(numbers[record.channel], record.payload, record.log_time_ns)
                 elif isinstance(record, chunk.Schema):
                     self._schemas[record.identifier] = record.name
                 else:

@@ -10,11 +10,12 @@ from tdhil.record.channels import CAN, COMMAND, SAMPLE
 from tdhil.record.cold import Cold, event_message
 from tdhil.record.container import Container
 from tdhil.record.event import Event
+from tdhil.record.sync import Syncer
 from tdhil.record.wire import pack_command, pack_frames, pack_sample
 
 POLL_S: Final = 0.05
 CHUNK_WALL_S: Final = 0.25
-CHUNK_LOG_NS: Final = 400_000_000
+CHUNK_LOG_NS: Final = 200_000_000
 CHUNK_BYTES: Final = 2**20
 FRAMES: Final = 64
 
@@ -25,10 +26,11 @@ class Pump:
     ``failure`` is the first exception, whatever came after it.
     """
 
-    def __init__(self, backlog: Backlog, container: Container, epoch_ns: int) -> None:
+    def __init__(self, backlog: Backlog, container: Container, syncer: Syncer, epoch_ns: int) -> None:
         self.failure: Exception | None = None
         self._backlog = backlog
         self._container = container
+        self._syncer = syncer
         self._epoch_ns = epoch_ns
         self._time_s = 0.0                     # of the latest record, control time
         self._frames: list[RawFrame] = []      # of the cycle that is under way
@@ -43,6 +45,7 @@ class Pump:
         self._backlog.items.clear()
         self._guarded(self._close_chunk)
         self._guarded(self._container.finish)
+        self._guarded(self._syncer.finish)
         self._guarded(self._container.close)
 
     def _guarded(self, step: Callable[[], None]) -> None:
@@ -58,7 +61,12 @@ class Pump:
             backlog.wake.wait(POLL_S)
             backlog.wake.clear()
             last = backlog.ended
+            hurry = backlog.hurry
             self._drain()
+            if hurry:
+                backlog.hurry = False
+                self._close_chunk()
+                backlog.written.set()
             now_s = time.monotonic()
             if self._opened_s is None:
                 self._opened_s = now_s if self._container.size or self._frames else None
@@ -118,6 +126,8 @@ class Pump:
             self._container.add(event.channel, self._log_ns(self._time_s), event.payload)
         self._chunk_ns = self._opened_s = None
         self._container.close_chunk()
+        self._backlog.saved_s = self._time_s
+        self._syncer.poke()
 
     def _log_ns(self, time_s: float) -> int:
         """Log time of a control time; NaN counts as the time of the record before, an impossible one as the epoch."""

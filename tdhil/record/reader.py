@@ -14,9 +14,9 @@ from tdhil.record import channels
 from tdhil.record.builder import FACTS, RecordingBuilder
 from tdhil.record.channels import CHANNELS, CLASSES, MODE_OF, STATE_OF
 from tdhil.record.cold import TEXT_LIMIT
-from tdhil.record.event import Event
+from tdhil.record.event import RECOVERED, Event
 from tdhil.record.inflate import Damage
-from tdhil.record.messages import messages
+from tdhil.record.messages import Ours, messages
 from tdhil.record.plain import structure
 from tdhil.record.recording import Excitation, Level, Ramp, Recording, Stage
 
@@ -41,9 +41,12 @@ class Run:
     problems: tuple[str, ...]
 
 
-def read_run(path: Path) -> Run:
-    """Everything but the raw frames and the commands. Raises `LogError` if there is nothing of ours in the file."""
-    return _Reading().run(path)
+def read_run(path: Path, *, salvage: bool = False) -> Run:
+    """Everything but the raw frames and the commands. Raises `LogError` if there is nothing of ours in the file.
+
+    ``salvage``: also where the file's head is damaged.
+    """
+    return _Reading().run(path, salvage)
 
 
 def read_samples(path: Path) -> Iterator[Sample]:
@@ -66,9 +69,9 @@ def read_frames(path: Path) -> Iterator[RawFrame]:
 def _messages(path: Path, wanted: int) -> Iterator[Any]:
     parse = CLASSES[CHANNELS[wanted][1]].FromString
     for found in messages(path):
-        if isinstance(found, tuple) and found[0] == wanted:
+        if isinstance(found, Ours) and found.number == wanted:
             with suppress(DecodeError):
-                yield parse(found[1])
+                yield parse(found.payload)
 
 
 class _Reading:
@@ -90,10 +93,10 @@ class _Reading:
             channels.EVENT: self._event,
         }
 
-    def run(self, path: Path) -> Run:
-        for found in messages(path):
-            if isinstance(found, tuple):
-                self._message(*found)
+    def run(self, path: Path, salvage: bool) -> Run:
+        for found in messages(path, salvage=salvage):
+            if isinstance(found, Ours):
+                self._message(found.number, found.payload)
             elif isinstance(found, Damage):
                 self._problem(str(found))
             else:
@@ -138,8 +141,11 @@ class _Reading:
             self._builder.stage(stage)
 
     def _event(self, message: Any) -> None:
+        event = structure(Event, message)
+        if event.kind == RECOVERED:
+            self._problem(event.text)
         if len(self._events) < RARE:
-            self._events.append(structure(Event, message))
+            self._events.append(event)
 
     def _excitation(self, message: Any) -> None:
         self._builder.excitation(

@@ -70,6 +70,19 @@ class LagPrior:
 
 
 @dataclass(frozen=True)
+class SteppedSetpoint:
+    """A speed setpoint that was stepped once in ``period_s``, and how the drive made the shaft follow it:
+
+    H(s) = (1 + zero·s)/(1 + first·s + second·s²) from setpoint to the shaft's speed.
+    """
+
+    period_s: float
+    zero_s: float
+    first_s: float
+    second_s2: float
+
+
+@dataclass(frozen=True)
 class Stage:
     """A stage of the protocol as it went. ``outcome``: ok, degraded, aborted."""
 
@@ -105,5 +118,7 @@ class Recording:
     torque_offset_nm: float = 0.0          # reported at standstill, de-energised; subtracted by identification
     torque_scale_rel_sd: float = 0.0       # 1 sd of the drive's torque scale, as a share of the reading
     gear_ratio: float = 1.0                # i = ω_motor / ω_main
+    timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
+    stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from drivers.drive import Command, RawFrame, Sample
@@ -20,6 +21,7 @@ class RunLog:
         self._writer = writer
         self._builder = RecordingBuilder()
         self._run = dict(run)
+        self._dropped = 0
         writer.configuration(self._run, {})
 
     @property
@@ -46,10 +48,17 @@ class RunLog:
         trace = "".join(traceback.format_exception(error))
         self._writer.event(Event(time_s, "failure", f"{type(error).__name__}: {error}", trace))
 
-    def stage(self, stage: Stage) -> None:
-        """A stage that has ended."""
+    def stage(self, stage: Stage) -> Stage:
+        """A stage that has ended; as it stands in the log: degraded where the log could not take all of it."""
+        dropped = self._writer.dropped - self._dropped
+        if dropped:
+            self._dropped += dropped
+            detail = f"{dropped} records found no place in the log"
+            outcome = "degraded" if stage.outcome == "ok" else stage.outcome
+            stage = replace(stage, outcome=outcome, detail=f"{stage.detail}; {detail}" if stage.detail else detail)
         self._builder.stage(stage)
         self._writer.stage(stage)
+        return stage
 
     def motion(self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()) -> None:
         """Everything known so far of what the shaft was made to do; the last call counts."""

@@ -1,9 +1,10 @@
 """The log of a run as it is written: a cheap front for the control loop, a thread behind it for all the rest.
 
 The front appends to a bounded queue and does nothing else. The thread (`pump`) empties the queue every 50 ms, lays
-out the messages, and closes a chunk after 0.25 s of wall time or 0.4 s of control time, whichever comes first:
+out the messages, and closes a chunk after 0.25 s of wall time or 0.2 s of control time, whichever comes first:
 a kill costs less than half a second. In stepped time, where control time runs ahead of the wall, the front wakes
-the thread as soon as 256 records wait.
+the thread as soon as 256 records wait, and itself waits where the file is 0.4 s of control time behind. A third
+thread (`sync`) has the disk take what was written, against a loss of power.
 """
 
 import errno
@@ -18,13 +19,15 @@ from drivers.drive import Command, RawFrame, Sample
 from tdhil.record import cold
 from tdhil.record.backlog import Backlog
 from tdhil.record.container import Container, RawFile
-from tdhil.record.errors import LogError
+from tdhil.record.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.record.event import Event
 from tdhil.record.pump import Pump
 from tdhil.record.recording import Excitation, Level, Ramp, Stage
+from tdhil.record.sync import Syncer
 
 STEPPED_QUEUE: Final = 1024            # records; small, since in stepped time it can hold much control time
 REAL_TIME_QUEUE: Final = 16384         # some seconds at 250 Hz: what a slow disk may take before records are lost
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class RunWriter:
@@ -34,7 +37,9 @@ class RunWriter:
     ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in
     ``dropped``, and the drop is logged as an event (real time).
 
-    When the thread fails (disk full), the next call raises `LogError`, once; after that records are
+    Raises `LogUnopened` and, where less than ``min_free_bytes`` are free, `LogRefused`.
+
+    When the thread fails (disk full), the next call raises `LogBroken`, once; after that records are
     discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close` raises it again.
     `frame` never raises: it is called from inside the drive's own input and output.
     """
@@ -56,14 +61,16 @@ class RunWriter:
         try:
             free = shutil.disk_usage(path.absolute().parent).free
             if free < min_free_bytes:
-                raise LogError(
+                raise LogRefused(
                     f"only {free / 1e6:.0f} MB free for the log, {min_free_bytes / 1e6:.0f} MB wanted",
                     where=str(path), next_step="Free some space, or log to another disk")
             file = opener(path) if opener else path.open("wb" if overwrite else "xb", buffering=0)
             container = Container(file)
         except OSError as error:
-            raise self._error("the log can't be opened", error) from error
-        self._pump = Pump(self._backlog, container, epoch_ns)
+            kind = LogRefused if error.errno in _FULL else LogUnopened
+            raise self._error(kind, "the log can't be opened", error) from error
+        self._block = block
+        self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns)
         self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
         self._thread.start()
 
@@ -76,12 +83,14 @@ class RunWriter:
     def failure(self) -> LogError | None:
         """What ended the log before its time, or None."""
         cause = self._pump.failure
-        return None if cause is None else self._error("the log can't be written any more", cause)
+        return None if cause is None else self._error(LogBroken, "the log can't be written any more", cause)
 
     def sample(self, sample: Sample) -> None:
         """One cycle's feedback; call it after the cycle's command and frames."""
         if not self._backlog.put(sample):
             self._refused()
+        elif self._block:
+            self._backlog.keep_up(sample[0])
 
     def command(self, time_s: float, command: Command) -> None:
         """One cycle's command; ``time_s`` is control time."""
@@ -115,13 +124,13 @@ class RunWriter:
         self._rare(cold.result_message(result))
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Writes what waits and finishes the file; idempotent. Raises `LogError` if the log isn't whole."""
+        """Writes what waits and finishes the file; idempotent. Raises `LogBroken` if the log isn't whole."""
         self._backlog.end()
         self._backlog.wake.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            raise LogError(f"the disk has not taken the log within {timeout_s:g} s", where=str(self.path),
-                           next_step="What is there can be replayed")
+            raise LogBroken(f"the disk has not taken the log within {timeout_s:g} s", where=str(self.path),
+                            next_step="What is there can be replayed")
         if self.failure is not None:
             raise self.failure from self._pump.failure
 
@@ -147,8 +156,8 @@ class RunWriter:
             self._raised = True
             raise failure from self._pump.failure
 
-    def _error(self, what: str, cause: Exception) -> LogError:
+    def _error(self, kind: type[LogError], what: str, cause: Exception) -> LogError:
         reason = cause.strerror if isinstance(cause, OSError) and cause.strerror else f"{type(cause).__name__}: {cause}"
-        full = isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
-        return LogError(f"{what}: {reason}", where=str(self.path),
-                        next_step="Free some space, or log to another disk" if full else "Choose another file")
+        full = isinstance(cause, OSError) and cause.errno in _FULL
+        return kind(f"{what}: {reason}", where=str(self.path),
+                    next_step="Free some space, or log to another disk" if full else "Choose another file")

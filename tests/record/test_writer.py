@@ -10,10 +10,15 @@ import pytest
 from log_runs import RESULT, fill, frames, make_run, sample
 from mcap.reader import make_reader
 
+from drivers.drive import Command, Mode
+from tdhil.errors import ExitCode, exit_code
+from tdhil.record import sync
 from tdhil.record.builder import RecordingBuilder
-from tdhil.record.errors import LogError
+from tdhil.record.errors import LogBroken, LogError
 from tdhil.record.event import Event
 from tdhil.record.reader import read_run, read_samples
+from tdhil.record.recording import Stage
+from tdhil.record.run_log import RunLog
 from tdhil.record.writer import RunWriter
 
 
@@ -184,3 +189,91 @@ def test_a_quiet_run_reaches_the_disk_too(tmp_path):
         time.sleep(0.02)
     assert path.stat().st_size > before
     writer.close()
+
+
+def test_how_a_log_that_fails_ends_the_run(tmp_path):
+    """Refused before anything moves, or a partial result; never an internal error."""
+    with pytest.raises(LogError) as refused:
+        RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, min_free_bytes=10**18)
+    with pytest.raises(LogError) as nowhere:
+        RunWriter(tmp_path / "none" / "run.mcap", epoch_ns=0, block=True)
+
+    def full(path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(LogError) as at_once:
+        RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=full)
+    disk = Disk(tmp_path / "run.mcap", room=1000)
+    with pytest.raises(LogError) as broken, RunWriter(
+            tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk) as writer:
+        fill(writer, RecordingBuilder(), 500)
+    codes = [exit_code(error.value) for error in (refused, nowhere, at_once, broken)]
+    assert codes == [ExitCode.REFUSED, ExitCode.USAGE, ExitCode.REFUSED, ExitCode.PARTIAL]
+
+
+class Unsynced(Disk):
+    """A disk that takes every byte, but only says when asked for it that it could not keep them."""
+
+    def __init__(self, path, number):
+        super().__init__(path)
+        self.number = number
+
+    def fileno(self):
+        raise OSError(self.number, "what the disk says")
+
+
+def test_a_disk_that_cannot_keep_what_it_took_ends_the_log(tmp_path):
+    disk = Unsynced(tmp_path / "run.mcap", errno.EIO)
+    with pytest.raises(LogBroken, match="what the disk says"), RunWriter(
+            tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk) as writer:
+        fill(writer, RecordingBuilder(), 500)
+    assert disk.closed
+    assert len(read_run(tmp_path / "run.mcap").recording.time_s) > 0
+
+
+def test_what_is_no_disk_needs_no_sync(tmp_path):
+    disk = Unsynced(tmp_path / "run.mcap", errno.EINVAL)
+    with RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True, opener=lambda _: disk) as writer:
+        fill(writer, RecordingBuilder(), 50)
+    assert read_run(tmp_path / "run.mcap").complete
+
+
+def test_a_slow_sync_holds_up_nobody_but_the_end(tmp_path, monkeypatch):
+    asked, gate = threading.Event(), threading.Event()
+
+    def slow(number):
+        asked.set()
+        gate.wait()
+
+    monkeypatch.setattr(sync, "_data_to_disk", slow)
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, epoch_ns=0, block=True)
+    fill(writer, RecordingBuilder(), 2000)
+    assert asked.is_set()
+    written = len(read_run(path).recording.time_s)
+    with pytest.raises(LogBroken, match="has not taken the log"):
+        writer.close(timeout_s=0.05)
+    gate.set()
+    writer.close()
+    assert written >= 2000 - 102               # all but the last 0.4 s were in the file meanwhile
+    assert read_run(path).complete
+
+
+def test_a_stage_that_lost_records_is_marked_so_in_the_log(tmp_path):
+    disk = Disk(tmp_path / "run.mcap")
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=False, queue_size=100, opener=lambda _: disk)
+    log, rng = RunLog(writer, {}), random.Random(1)
+    assert log.stage(Stage("speed", 0.0, 1.0, "ok")) == Stage("speed", 0.0, 1.0, "ok")
+    disk.gate.clear()
+    for cycle in range(3000):
+        log.cycle(Command(Mode.SPEED, 1.0, 0.0), sample(cycle, rng))
+    lost = writer.dropped
+    said = [log.stage(Stage(name, 1.0, 2.0, outcome, "x")) for name, outcome in (("hold", "ok"), ("acquire", "ok"))]
+    disk.gate.set()
+    log.close()
+    assert lost > 0
+    assert said[0] == Stage("hold", 1.0, 2.0, "degraded", f"x; {lost} records found no place in the log")
+    assert said[1].outcome == "ok"
+    run = read_run(tmp_path / "run.mcap")
+    assert run.stages[1:] == tuple(said)
+    assert log.recording(complete=True).stages == run.stages

@@ -1,0 +1,177 @@
+"""Every parser that takes bytes from outside, with its corpus, its mutations and the one thing it may raise.
+
+An input passes when the parser gives something or raises a `TdhilError` that names the place, one line a problem.
+"""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import mutate
+import replies
+
+from drivers.errors import TdhilError
+
+HERE = Path(__file__).parent
+CORPUS = HERE / "corpus"
+YAML_WORDS = [
+    b"!!python/object/apply:os.system [id]", b"!!python/name:os.system", b"!!binary aGk=", b"!!float 1", b"&a", b"*a",
+    b"<<", b"---", b"...", b"%YAML 1.1", b"on", b"off", b"yes", b"null", b"~", b"true", b"1e3", b"010", b"0o7", b"1:30",
+    b"{", b"}", b"[", b"]", b"'", b'"', b"|", b">", b"? ", b": ", b"- ", b"\t", b"# ", b"\xef\xbb\xbf", b"\xff\xfe",
+    b"\xe2\x80\xa8", b"\x00", b"\x85", b"2026-01-01", b"[[[[[[[[[[[[[[[[", b"{a: {a: {a: {a: ", b"\xc3\xa9",
+]
+CSV_WORDS = [b";", b",", b"\t", b"|", b'"', b"\r\n", b"\r", b"\xef\xbb\xbf", b"\xff\xfe", b"\0", b"time_s", b"rpm",
+             b"[Nm]", b"%", b"1,5", b"1.000,5", b"2026-01-01T00:00:00", b"12:30:01,5", b"NaN", b"#", b"\xb5s", b"sep=;"]
+
+
+@dataclass(frozen=True)
+class Parser:
+    """``parse`` reads the file at a path and checks what it gives; ``mutations`` know what kind of file it is."""
+
+    name: str
+    suffix: str
+    parse: Callable[[Path], None]
+    mutations: Sequence[mutate.Mutation]
+
+    @property
+    def folder(self) -> Path:
+        return CORPUS / self.name
+
+    def corpus(self) -> list[bytes]:
+        """Valid files first, then everything that was ever found."""
+        return [path.read_bytes() for path in sorted(self.folder.iterdir())]
+
+
+def try_one(parser: Parser, data: bytes, path: Path) -> str:
+    """'taken' or 'refused'. Anything but a proper refusal goes through as what it is."""
+    path.write_bytes(data)
+    try:
+        parser.parse(path)
+    except TdhilError as error:
+        check_refusal(error, path)
+        return "refused"
+    return "taken"
+
+
+def check_refusal(error: TdhilError, path: Path) -> None:
+    """One line a problem, each with its place; no line goes on for ever."""
+    said = str(error)
+    problems = getattr(error, "problems", None)
+    assert said.count("\n") < (len(problems) if problems else 1), f"more lines than problems: {said!r}"
+    assert all(line.strip() and len(line) < 2000 for line in said.split("\n")), f"no line of a message: {said!r}"
+    assert all(sign.isprintable() or sign == "\n" for sign in said), f"control characters: {said!r}"
+    assert problems is None or all(problem.file for problem in problems)
+    assert problems or error.where or parser_free(said), f"no place: {said!r}"
+
+
+def parser_free(said: str) -> bool:
+    """Errors below a bus name an object, a node or the host in ``where``; these words do so in the text."""
+    return any(word in said for word in ("node", "bus", "drive", "request"))
+
+
+# -- what is done with each -------------------------------------------------------------------------------------------
+
+
+def _profile(path: Path) -> None:
+    from profiles.library import load_profile
+
+    load_profile(str(path))
+
+
+def _rig(path: Path) -> None:
+    from tdhil.rig import load_rig
+
+    rig = load_rig(path)
+    for name in ("limits", "gear.ratio", "run.seed"):
+        rig.source(name)
+
+
+def _plant(path: Path) -> None:
+    from profiles.strict_yaml import load_model
+    from sim_bus.params import RigParams
+
+    load_model(path, RigParams)
+
+
+@cache
+def _studies() -> dict:
+    from tdhil.commands.study import all_studies
+
+    return all_studies()
+
+
+def _study(path: Path) -> None:
+    from tdhil.study.settings_files import load_study_file
+
+    load_study_file(path, _studies())
+
+
+def _excitation(path: Path) -> None:
+    from tdhil.record.csv_excitation import load_excitation
+
+    found, levels = load_excitation(path, np.linspace(0.0, 100.0, 1001))
+    for segment in found.segments:
+        assert np.isfinite([segment.start_s, segment.end_s, segment.period_s, *segment.lines_hz]).all()
+    assert all(np.isfinite([level.start_s, level.end_s]).all() for level in levels)
+
+
+def _csv(path: Path) -> None:
+    from tdhil.record.csv_choice import USUAL, parse_columns
+    from tdhil.record.csv_recording import Bench, read_recording
+
+    choices = USUAL
+    if not path.read_bytes().startswith(b"time_s"):
+        choices = parse_columns(["time=t:ms", "speed=n_rpm:rpm", "torque=m_pct:%"])
+    recording, _ = read_recording(path, choices, None, Bench(rated_torque_nm=480.0))
+    assert len(recording.time_s) == len(recording.speed_rad_s) == len(recording.torque_nm)
+    assert np.isfinite(recording.time_s).all()
+    assert (np.diff(recording.time_s) > 0).all()
+
+
+def _mcap(path: Path) -> None:
+    from tdhil.record.reader import read_frames, read_run, read_samples
+    from tdhil.record.salvage import examine, write_copy
+
+    copy = path.with_suffix(".copy")
+    found = examine(path)                  # as `tdhil recover`: also where the head is damaged
+    write_copy(path, copy, found)
+    again = read_run(copy)
+    assert again.complete == found.whole
+    assert len(again.recording.time_s) == len(found.run.recording.time_s)
+    read_run(path)
+    for _ in read_samples(path):
+        pass
+    for _ in read_frames(path):
+        pass
+
+
+def _can(path: Path) -> None:
+    replies.can_session(path.read_bytes())
+
+
+def _modbus(path: Path) -> None:
+    replies.modbus_replies(path.read_bytes())
+
+
+_YAML = (*mutate.BYTES, mutate.lines, mutate.lines, mutate.number, mutate.number, mutate.tokens(YAML_WORDS),
+         mutate.tokens(YAML_WORDS))
+PARSERS = {
+    parser.name: parser
+    for parser in (
+        Parser("profile", ".yaml", _profile, _YAML),
+        Parser("rig", ".yaml", _rig, _YAML),
+        Parser("plant", ".yaml", _plant, _YAML),
+        Parser("study", ".yaml", _study, _YAML),
+        Parser("excitation", ".yaml", _excitation, _YAML),
+        Parser("csv", ".csv", _csv, (*mutate.BYTES, mutate.lines, mutate.number, mutate.tokens(CSV_WORDS))),
+        Parser("mcap", ".mcap", _mcap, (*mutate.BYTES, *(mutate.inside_chunks,) * 6)),
+        Parser("can", ".bin", _can, (*mutate.BYTES, *(mutate.records,) * 6)),
+        Parser("modbus", ".bin", _modbus, mutate.BYTES),
+    )
+}
