@@ -101,7 +101,7 @@ def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
 def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, report: bool) -> int:
     from rich.console import Console
 
-    from tdhil.errors import Interrupted, TdhilError, exit_code
+    from tdhil.errors import ExitCode, Interrupted, TdhilError, exit_code
     from tdhil.report.live import stderr_console
     from tdhil.study.write import INSTALL, document, write_study
     from tdhil.study.write_progress import StudyBar
@@ -136,6 +136,11 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         if not namespace.json:
             print_outcome(outcome, written, out)
         told.print(_cost(outcome, took_s), style="dim", markup=False)
+        if outcome.interrupted:
+            told.print(f"tdhil: {study.name} was interrupted; its figures are of the runs done by then",
+                       style="bold yellow", markup=False, soft_wrap=True)
+            code = int(ExitCode.INTERRUPTED)
+            break
     if without:
         told.print(f"tdhil: {INSTALL}", markup=False, soft_wrap=True)
     index_path = write_report(chapters, folder) if report else None

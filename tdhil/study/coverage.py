@@ -6,7 +6,8 @@ inertia. Counted are the intervals that miss; bias and scatter are held against 
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import time
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field, model_validator
@@ -67,22 +68,50 @@ class CoverageStudy:
         return CoverageSettings
 
     def run(self, settings: CoverageSettings, progress: Progress) -> StudyOutcome:
-        """Every run of every plant; the same settings give the same bits, whatever the number of processes."""
+        """Every run of every plant; the same settings give the same bits, whatever the number of processes.
+
+        Ctrl-C ends it with the figures of the runs that are done by then (``interrupted``); a second one, or one
+        before the first runs are done, ends it without.
+        """
         plants = settings.chosen
         wanted = tasks(plants, settings.seeds, settings.seed, settings.periods, settings.confidence)
         runs: dict[str, list[Run]] = {plant.name: [] for plant in plants}
         total, done = settings.seeds * len(plants), 0
         progress(0.0, "first runs")
-        for group in run_all(wanted, min(settings.processes, len(wanted))):
-            runs[group[0].plant] += group
-            done += len(group)
-            progress(0.98 * done / total, f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs")
+        begun_s, interrupted = time.monotonic(), False
+        try:
+            for group in run_all(wanted, min(settings.processes, len(wanted))):
+                runs[group[0].plant] += group
+                done += len(group)
+                left_s = (time.monotonic() - begun_s) * (total - done) / done
+                of_plant = f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs"
+                progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {_told(left_s)} left")
+        except KeyboardInterrupt:
+            if done == 0:
+                raise
+            interrupted = True
         found = []
-        for index, plant in enumerate(plants):
-            progress(0.98 + 0.02 * index / len(plants), f"{plant.name}: Cramér-Rao bound")
+        some = [plant for plant in plants if runs[plant.name]]
+        for index, plant in enumerate(some):
+            progress(0.98 + 0.02 * index / len(some), f"{plant.name}: Cramér-Rao bound")
             found.append(figures_of(plant, runs[plant.name], cramer_rao(plant, settings.periods)))
-        progress(1.0, "done")
-        return outcome_of(self, found, settings)
+        progress(1.0, "interrupted" if interrupted else "done")
+        outcome = outcome_of(self, found, settings)
+        return cut_short(outcome, done, total) if interrupted else outcome
+
+
+def _told(duration_s: float) -> str:
+    return f"{duration_s / 60.0:.0f} min" if duration_s >= 90.0 else f"{duration_s:.0f} s"
+
+
+def cut_short(outcome: StudyOutcome, done: int, total: int) -> StudyOutcome:
+    """The same, saying everywhere that it is not all that was asked for."""
+    return replace(
+        outcome,
+        title=f"{outcome.title} (interrupted: {done} of {total} runs)",
+        document={**outcome.document, "interrupted": {"runs": done, "of": total}},
+        interrupted=True,
+    )
 
 
 def outcome_of(study: CoverageStudy, found: list[PlantFigures], settings: CoverageSettings) -> StudyOutcome:

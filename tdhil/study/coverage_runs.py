@@ -6,11 +6,12 @@ of processes nor on how runs are grouped.
 
 from __future__ import annotations
 
+import signal
 import zlib
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 
 from tdhil.identify.identify import identify
 from tdhil.identify.options import Options
@@ -84,11 +85,20 @@ def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[Run, ...]]:
     if processes <= 1:
         yield from map(run_task, wanted)
         return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    others = set(active_children())
+    with ProcessPoolExecutor(processes, get_context("spawn"), _leave_ctrl_c_to_the_parent) as pool:
         waiting = [pool.submit(run_task, task) for task in wanted]
         try:
             for done in as_completed(waiting):
                 yield done.result()
-        finally:
-            for one in waiting:
-                one.cancel()
+        except BaseException:
+            # Whoever interrupts doesn't wait for the groups that are under way.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(active_children()) - others:
+                process.terminate()
+            raise
+
+
+def _leave_ctrl_c_to_the_parent() -> None:
+    """A terminal sends it to the children too, which would each say so with a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

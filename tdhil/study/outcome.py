@@ -48,6 +48,7 @@ class StudyOutcome:
     simulation_wall_s: float = 0.0                                 # what simulating that took; not in the document
     draw: Callable[[Figure], None] | None = None
     figure_size_in: tuple[float, float] = (8.0, 5.0)
+    interrupted: bool = False                                      # by Ctrl-C: the figures are of what was done by then
 
     @property
     def cost_ms_per_simulated_s(self) -> float | None:
