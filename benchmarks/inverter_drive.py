@@ -102,8 +102,9 @@ class MemoryLog:
     def failure(self, time_s: float, error: BaseException) -> None:
         self.events.append(repr(error))
 
-    def stage(self, stage: Stage) -> None:
+    def stage(self, stage: Stage) -> Stage:
         self._builder.stage(stage)
+        return stage
 
     def motion(self, excitation: Excitation | None, levels: Sequence[Level] = (), ramps: Sequence[Ramp] = ()) -> None:
         self._builder.excitation(excitation, levels, ramps)

@@ -179,3 +179,11 @@ def _number(error: BaseException | None) -> int | None:
             return error.errno
         error = error.__cause__ or error.__context__
     return None
+
+
+def link_report(channel: str) -> str | None:
+    """What ``ip -details -json link show`` says of a SocketCAN link; None where it can't be asked.
+
+    Raises PreflightRefused if there is no such link.
+    """
+    return _read_link(channel)

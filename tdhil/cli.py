@@ -14,6 +14,11 @@ from tdhil import __version__
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
     "replay": "identify again from a log, or from a trace that a drive's own tool exported",
+    "profiles": "what is known of which drive, what it needs set, and how sure that is",
+    "scan": "find out who is on the bus; writes nothing to any drive",
+    "doctor": "check adapter, permissions, bus, computer, profile and drive; writes nothing",
+    "recover": "say what a damaged log still holds, and make a clean copy of it",
+    "stop": "stop a drive from outside of any run: best effort, no emergency stop",
     "simulate": "run the simulated rig as a process of its own",
     "study": "run the paper's experiments again, beside what it published",
 }
@@ -73,8 +78,18 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.commands.identify import add_arguments
     elif name == "replay":
         from tdhil.commands.replay import add_arguments
+    elif name == "stop":
+        from tdhil.commands.stop import add_arguments
     elif name == "study":
         from tdhil.commands.study import add_arguments
+    elif name == "recover":
+        from tdhil.commands.recover import add_arguments
+    elif name == "profiles":
+        from tdhil.commands.profiles import add_arguments
+    elif name == "scan":
+        from tdhil.commands.scan import add_arguments
+    elif name == "doctor":
+        from tdhil.commands.doctor import add_arguments
     else:
         from tdhil.commands.simulate import add_arguments
     return add_arguments

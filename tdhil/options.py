@@ -21,12 +21,14 @@ class Option:
     at: str
     default: Any = None
     beside_rig: bool = False       # a path, looked for beside rig.yaml when it stands there
+    joined: bool = False           # a list: what the command line names comes besides rig.yaml's
 
 
 OPTIONS = (
     Option("drive", "--drive", "drive", "canopen"),
     Option("node", "--node", "node"),
     Option("profile", "--profile", "profile", "generic/cia402", beside_rig=True),
+    Option("accept_unverified", "--accept-unverified", "accept_unverified", joined=True),
     Option("rate_hz", "--rate", "rate_hz"),
     Option("excitation", "--excitation", "run.excitation", "multisine"),
     Option("mode", "--mode", "run.mode"),
@@ -74,10 +76,17 @@ class Resolved:
     def rows(self) -> Iterator[tuple[str, str, str]]:
         """(option, value, source) to print; '-' where the profile or the plan will choose."""
         for name, setting in self.settings.items():
-            value = setting.value
-            yield name, "-" if value is None else str(value).lower() if isinstance(value, bool) else str(value), (
-                setting.source
-            )
+            yield name, _shown(setting.value), setting.source
+
+    def replaced(self, **settings: Setting) -> "Resolved":
+        """The same with other settings of these names."""
+        return Resolved(MappingProxyType({**self.settings, **settings}))
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value)) or "-"
+    return "-" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def resolve(cli_values: Mapping[str, Any], rig: Rig | None) -> Resolved:
@@ -87,6 +96,7 @@ def resolve(cli_values: Mapping[str, Any], rig: Rig | None) -> Resolved:
     UsageError names every flag with a value that rig.yaml would not take either.
     """
     given = {option.name: cli_values[option.name] for option in OPTIONS if cli_values.get(option.name) is not None}
+    given |= {option.name: tuple(given[option.name]) for option in OPTIONS if option.joined and option.name in given}
     if given.get("real_time") and "stepped" not in given:
         given["stepped"] = False       # the command line's word on the clock undoes rig.yaml's
     elif given.get("stepped") and "real_time" not in given:
@@ -97,6 +107,8 @@ def resolve(cli_values: Mapping[str, Any], rig: Rig | None) -> Resolved:
 
 
 def _setting(option: Option, given: Mapping[str, Any], cli_values: Mapping[str, Any], rig: Rig | None) -> Setting:
+    if option.joined:
+        return _joined(option, given, rig)
     if option.name in given:
         other = "--real-time" if option.name == "stepped" else "--stepped"
         return Setting(given[option.name], option.flag if cli_values.get(option.name) is not None else other)
@@ -106,6 +118,15 @@ def _setting(option: Option, given: Mapping[str, Any], cli_values: Mapping[str, 
     if option.beside_rig and (option.name != "profile" or value.endswith((".yaml", ".yml"))):
         value = str(rig.folder / value)
     return Setting(value, rig.source(option.at) or "rig")
+
+
+def _joined(option: Option, given: Mapping[str, Any], rig: Rig | None) -> Setting:
+    """Everything that either place names, each thing once."""
+    in_rig = (rig.get(option.at) if rig is not None else None) or ()
+    named = tuple(dict.fromkeys((*given.get(option.name, ()), *in_rig)))
+    at = (rig.source(option.at) or "rig") if rig is not None and in_rig else ""
+    sources = [source for source in (option.flag if option.name in given else "", at) if source]
+    return Setting(named, " and ".join(sources) or "default")
 
 
 def _check(given: Mapping[str, Any]) -> None:

@@ -35,6 +35,28 @@ class Bus(DataModel):
     options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
 
 
+class Modbus(DataModel):
+    """Where a Modbus drive is reached; what is missing here is as the profile's ``line`` says."""
+
+    host: str | None = Field(default=None, min_length=1, description="Modbus TCP: name or address of the drive")
+    port: int | None = Field(default=None, ge=1, le=65535, description="TCP port")
+    serial: str | None = Field(default=None, min_length=1, description="Modbus RTU: device, such as /dev/ttyUSB0")
+    baud: int | None = Field(default=None, ge=1200, le=1_000_000, description="bit/s on the serial line")
+    parity: Literal["N", "E", "O"] | None = Field(default=None, description="of the serial line: N, E or O")
+    stop_bits: Literal[1, 2] | None = Field(default=None, description="of the serial line")
+    unit: int | None = Field(default=None, ge=0, le=255, description="unit (slave) number of the drive")
+
+    @model_validator(mode="after")
+    def _one_line(self) -> Self:
+        findings = []
+        if self.host is not None and self.serial is not None:
+            findings.append(("serial", "and host exclude each other; keep one"))
+        if self.serial is not None and self.unit is not None and not 1 <= self.unit <= 247:
+            findings.append(("unit", f"must be 1 to 247 on a serial line, not {self.unit}"))
+        refuse_if(findings)
+        return self
+
+
 class Limits(DataModel):
     """What the machine may do; watched by the host and, where it can, by the drive."""
 
@@ -75,6 +97,9 @@ class DriveData(DataModel):
     speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
     torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
     torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    parameters: dict[str, float] = Field(
+        default={}, description="drive parameters that can't be read over the bus, by the profile's names, in its units"
+    )
 
     @model_validator(mode="after")
     def _deviations(self) -> Self:
@@ -100,7 +125,7 @@ class Expected(DataModel):
 class Run(DataModel):
     """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
 
-    excitation: Literal["multisine", "sine", "step"] | None = None
+    excitation: Literal["multisine", "sine", "step", "pulses", "coast-down"] | None = None
     mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
     frequency_hz: Positive | None = Field(default=None, description="Hz; base frequency of the excitation")
     amplitude_rad_s: Positive | None = Field(default=None, description="rad/s; amplitude of the speed")
@@ -135,7 +160,11 @@ class Rig(DataModel):
     drive: Literal["canopen", "modbus"] | None = None
     bus: Bus = Bus()
     node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
+    modbus: Modbus = Modbus()
     profile: str | None = Field(default=None, min_length=1, description="name, or a .yaml file beside rig.yaml")
+    accept_unverified: tuple[str, ...] | None = Field(
+        default=None, description="entries of the profile that are taken although nobody verified them"
+    )
     rate_hz: float | None = Field(default=None, gt=0, le=2000, description="cycles a second")
     limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
     gear: Gear = Gear()

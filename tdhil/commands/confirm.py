@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 
@@ -26,6 +26,7 @@ def confirm_motion(
     yes: bool,
     console: Console,
     pause_display: Callable[[], None],
+    unverified: Sequence[str] = (),
 ) -> None:
     """Return if the shaft may be moved; raises PreflightRefused (exit 4) if not.
 
@@ -34,7 +35,7 @@ def confirm_motion(
     if preflight.identity.simulated:
         return
     pause_display()
-    console.print(summary(preflight, task.limits, task.request), markup=False)
+    console.print(summary(preflight, task.limits, task.request, unverified), markup=False)
     if yes:
         console.print("Confirmed by --yes.")
         return
@@ -49,8 +50,10 @@ def confirm_motion(
         raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
 
 
-def summary(preflight: Preflight, limits: MachineLimits, request: ExcitationRequest) -> str:
-    """What will happen, and what the operator must have seen to."""
+def summary(
+    preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
+) -> str:
+    """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
     silent = preflight.safe_action.replace("_", " ")
     return (
         f"\nThis run will move {preflight.identity.name}:\n"
@@ -60,11 +63,18 @@ def summary(preflight: Preflight, limits: MachineLimits, request: ExcitationRequ
         f"  excitation      {request.kind}\n"
         f"  duration        at most {minutes(limits.time_s)}\n"
         f"  watchdog        {preflight.watchdog_s:g} s in the drive, then {silent}\n"
+        f"{_taken(unverified)}"
         "Before you confirm:\n"
         "  [ ] brake released\n"
         "  [ ] pipe handler and people clear of the shaft\n"
         "  [ ] hard-wired emergency stop tested and within reach (Ctrl-C stops, but is no emergency stop)\n"
     )
+
+
+def _taken(unverified: Sequence[str]) -> str:
+    if not unverified:
+        return ""
+    return "Taken as the profile has it, although nobody verified it:\n" + "".join(f"  {one}\n" for one in unverified)
 
 
 def _ask(idle: Idle) -> str:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tdhil.protocol.excitation import RigGuess
+    from tdhil.protocol.excitation import Plan, RigGuess
     from tdhil.protocol.planning import Planned
     from tdhil.protocol.settings import MachineLimits
 
@@ -43,9 +43,12 @@ class Figure:
         return f"{self.value:.4g} {self.unit}"
 
 
-def dry_run(options: Resolved, rig: Rig | None, simulated: bool) -> int:
-    """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would."""
-    planned, figures, limits = plan_dry(options, rig, simulated)
+def dry_run(options: Resolved, rig: Rig | None, simulated: bool, can_torque: bool = True) -> int:
+    """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would.
+
+    ``can_torque``: the drive can regulate torque; without it stage 5 is planned in speed mode.
+    """
+    planned, figures, limits = plan_dry(options, rig, simulated, can_torque)
     if options["json"]:
         json.dump(document(planned, figures, limits), sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
         sys.stdout.write("\n")
@@ -57,7 +60,7 @@ def dry_run(options: Resolved, rig: Rig | None, simulated: bool) -> int:
 
 
 def plan_dry(
-    options: Resolved, rig: Rig | None, simulated: bool
+    options: Resolved, rig: Rig | None, simulated: bool, can_torque: bool = True
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
     from tdhil.protocol import excitation
@@ -78,19 +81,33 @@ def plan_dry(
         Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
         Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
     )
+    assumptions = ControlAssumptions()
+    if options["rate_hz"]:
+        assumptions = assumptions.at_period(1.0 / options["rate_hz"])
     room = excitation.MachineLimits(
-        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(ControlAssumptions())
+        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
     )
     left_s = limits.time_s - BEFORE_ACQUIRE_S
     try:
         planned = plan_acquisition(
-            excitation_request(options), options["mode"] or "torque", room, guess, known, left_s
+            excitation_request(options), _mode(options, can_torque), room, guess, known, left_s
         )
     except PlanRefused as error:
         raise PreflightRefused(
             str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
         ) from error
     return planned, figures, limits
+
+
+def _mode(options: Resolved, can_torque: bool) -> str:
+    wanted: str | None = options["mode"]
+    if wanted == "torque" and not can_torque:
+        raise PreflightRefused(
+            "torque mode was asked for, but this drive has none that can be entered while it turns",
+            where=f"profile {options['profile']}",
+            next_step="Use --mode speed",
+        )
+    return wanted or ("torque" if can_torque else "speed")
 
 
 def _guess(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, tuple[Figure, ...]]:
@@ -116,6 +133,8 @@ def _source(bench: Rig, at: str) -> str:
 
 def document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
     """The plan as plain data."""
+    from tdhil.protocol.excitation import SwingPlan
+
     plan, stopping = planned.plan, planned.stopping
     return {
         "dry_run": True,
@@ -131,7 +150,12 @@ def document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimit
                 "amplitudes_rad_s": list(one.reference.amplitudes_rad_s),
             }
             for one in plan.segments
-        ],
+        ] if not isinstance(plan, SwingPlan) else [],
+        "ways": [
+            {"from_rad_s": way.from_rad_s, "to_rad_s": way.to_rad_s, "duration_s": way.duration_s,
+             "coasting": way.coasting}
+            for way in plan.ways
+        ] if isinstance(plan, SwingPlan) else [],
         "duration_s": planned.duration_s,
         "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
         "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
@@ -151,15 +175,21 @@ def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, c
     """Tables for people, in 80 columns."""
     from rich.text import Text
 
+    from tdhil.protocol.excitation import SwingPlan
+
     console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
     console.print(_motion_table(planned, limits))
-    console.print(_lines_table(planned))
+    if not isinstance(planned.plan, SwingPlan):
+        console.print(_lines_table(planned.plan))
     console.print(_figures_table(figures))
     for text in _conclusions(planned):
         console.print(Text(text))
 
 
 def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
+    from tdhil.protocol.excitation import SwingPlan
+    from tdhil.protocol.excitation.swing import CALM_S
+
     plan, table = planned.plan, _table(f"stage 5: {planned.plan.kind} in {planned.plan.mode} mode")
     for heading in ("", "planned", "limit"):
         table.add_column(heading, overflow="fold")
@@ -171,14 +201,18 @@ def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
         "torque, N·m", f"{plan.torque_min_nm:.3g} to {plan.torque_max_nm:.3g}", f"±{limits.torque_nm:g}"
     )
     table.add_row("time, s", f"{planned.duration_s:.0f} (+ about {BEFORE_ACQUIRE_S:.0f})", f"{limits.time_s:g}")
+    if isinstance(plan, SwingPlan):
+        ways = f"{len(plan.ways)} ways up and down, each with {CALM_S:g} s of calm behind it"
+        table.add_row(f"{plan.speed_min_rad_s:.3g} to {plan.speed_max_rad_s:.3g} rad/s", ways, "")
+        return table
     for one in plan.segments:
         counted = f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle"
         table.add_row(f"at {one.reference.offset_rad_s:.3g} rad/s", counted, "")
     return table
 
 
-def _lines_table(planned: Planned) -> Table:
-    reference, table = planned.plan.segments[0].reference, _table("lines")
+def _lines_table(plan: Plan) -> Table:
+    reference, table = plan.segments[0].reference, _table("lines")
     table.add_column("Hz", justify="right")
     table.add_column("amplitude, rad/s", justify="right")
     for hertz, amplitude in zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True):
@@ -197,11 +231,11 @@ def _figures_table(figures: tuple[Figure, ...]) -> Table:
 
 
 def _conclusions(planned: Planned) -> list[str]:
-    from tdhil.protocol.planning import NOTHING_TO_EXPECT
+    from tdhil.protocol.planning import NOT_PREDICTED, NOTHING_TO_EXPECT
 
     stopping = planned.stopping
     if not math.isfinite(planned.half_width):
-        return [NOTHING_TO_EXPECT]
+        return [NOT_PREDICTED if math.isnan(planned.half_width) else NOTHING_TO_EXPECT]
     found = [f"expected interval of J: ±{100.0 * planned.half_width:.2g} % after {planned.duration_s:.0f} s"]
     if stopping is not None and not stopping.reachable:
         found.append(f"±{100.0 * stopping.tolerance:.3g} % is not to be expected: {stopping.advice}")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from drivers.drive import Command, Identity, Preflight, Sample
     from sim_bus.params import RigParams
     from tdhil.options import Resolved
-    from tdhil.protocol.excitation import Plan
+    from tdhil.protocol.excitation import Plan, SwingPlan
     from tdhil.protocol.runner import Idle, RunOutcome, Task
     from tdhil.record.recording import Recording, Stage
     from tdhil.rig import Rig
@@ -32,7 +32,7 @@ class SimulatedFieldBench:
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
         """The Recording; raises what ended the run before its end."""
-        from tdhil.bus_options import BusConfig
+        from tdhil.commands.connection import simulated_canopen
         from tdhil.commands.peer import PeerPlan, open_drive
         from tdhil.commands.stop_signals import stop_on_signals
         from tdhil.options import resolve
@@ -48,7 +48,7 @@ class SimulatedFieldBench:
             log = RunLog(writer, {"tdhil": __version__, "embedded_simulator": True, "seed": wish.seed})
             try:
                 with stop_on_signals() as stop_request, open_drive(
-                    peer, options, BusConfig({}), None, log.frame, None
+                    peer, options, simulated_canopen(options), None, log.frame, None
                 ) as drive:
                     make_task = partial(_task, options, rig)
                     outcome = Runner(drive, make_task, log, stop_request, _Progress(progress), _no_prompt).run()
@@ -147,7 +147,7 @@ class _Progress:
         """The run is over."""
         self._report(1.0)
 
-    def planned(self, plan: Plan) -> None:
+    def planned(self, plan: Plan | SwingPlan) -> None:
         """Now it is known how long the run takes."""
         self._expected_s = BEFORE_ACQUIRE_S + plan.duration_s + 5.0
 

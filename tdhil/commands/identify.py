@@ -5,19 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-from tdhil import __version__
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from drivers.drive import Identity
-    from tdhil.bus_options import BusConfig
+    from profiles.library import Profile
+    from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
     from tdhil.options import Resolved
     from tdhil.protocol.runner import RunOutcome, Task
@@ -27,20 +27,17 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.options`)."""
-    from can.cli import add_bus_arguments
-
-    from tdhil.commands.models import MODELS
+    from tdhil.commands.line_options import add_drive_arguments, add_line_arguments
+    from tdhil.commands.models import EXCITATIONS, MODELS
     from tdhil.commands.quantities import seconds, share
 
-    drive = parser.add_argument_group("drive")
-    drive.add_argument("--drive", choices=("canopen", "modbus"), help="how the drive is spoken to (default canopen)")
-    drive.add_argument("--node", type=int, metavar="N", help="CANopen node number (default: the profile's)")
-    drive.add_argument("--profile", metavar="NAME", help="vendor/model, or a .yaml file (default generic/cia402)")
-    drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
-    drive.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="cycles a second (default 250)")
+    drive = add_drive_arguments(parser)
+    drive.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="cycles a second (default: profile's)")
+    drive.add_argument("--accept-unverified", action="append", metavar="NAME",
+                       help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
     motion = parser.add_argument_group("motion")
-    motion.add_argument("--excitation", choices=("multisine", "sine", "step"), help="stage 5 (default multisine)")
+    motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
     motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
     motion.add_argument("--frequency", dest="frequency_hz", type=float, metavar="HZ", help="lowest line or the tone")
     motion.add_argument("--amplitude", dest="amplitude_rad_s", type=float, metavar="RAD_S", help="peak of the speed")
@@ -59,34 +56,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
     result.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     simulated = parser.add_argument_group("simulated rig")
-    simulated.add_argument(
-        "--simulate", action="store_const", const=True, help="embedded simulator; the default without a bus"
-    )
+    simulated.add_argument("--simulate", action="store_const", const=True,
+                           help="embedded simulator; the default where nobody says where the drive is")
     simulated.add_argument("--plant", metavar="plant.yaml", help="other parameters of the embedded rig")
     simulated.add_argument("--seed", type=int, metavar="N", help="repeats a simulated run")
     simulated.add_argument("--real-time", action="store_const", const=True, help="against the wall clock")
     simulated.add_argument("--stepped", action="store_const", const=True, help="step a simulator on the bus by SYNC")
     simulated.add_argument("--trace", metavar="shaft.csv", help="true shaft of the embedded rig")
-    add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
+    add_line_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
-    from tdhil.bus_options import bus_config
+    from tdhil.commands.connection import can_torque, connection_of
     from tdhil.commands.peer import plan_peer
-    from tdhil.errors import UsageError
+    from tdhil.commands.settings_said import show_settings
+    from tdhil.commands.simulated_bench import suited
+    from tdhil.commands.unverified import check_names
     from tdhil.options import resolve
     from tdhil.report.live import stderr_console
     from tdhil.rig import load_rig
 
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
-    if options["drive"] == "modbus":
-        raise UsageError("Modbus is not spoken yet", where="--drive", next_step="Use --drive canopen")
     if options["json"] is True:
         namespace.json = True
-    bus = bus_config(vars(namespace), rig)
+    options, connection = connection_of(vars(namespace), rig, options)
+    check_names(connection.profile, options["accept_unverified"], options.source("accept_unverified"))
     console = stderr_console()
     if namespace.report is not None:
         from tdhil.report.html import check_report_path
@@ -95,16 +92,17 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.dry_run:
         from tdhil.commands.dry_run import dry_run
 
-        return dry_run(options, rig, simulated=bool(options["simulate"]) or not bus.configured)
-    peer = plan_peer(options, bus)
-    _show_settings(console, options, bus, peer)
-    return _run(namespace, options, bus, peer, rig, console)
+        simulated = bool(options["simulate"]) or not connection.configured
+        return dry_run(options, rig, simulated, can_torque(connection.profile))
+    peer = plan_peer(options, connection)
+    show_settings(console, options, connection, peer)
+    return _run(namespace, options, connection, peer, suited(rig, peer.plant), console)
 
 
 def _run(
     namespace: argparse.Namespace,
     options: Resolved,
-    bus: BusConfig,
+    connection: Connection,
     peer: PeerPlan,
     rig: Rig | None,
     console: Console,
@@ -112,7 +110,9 @@ def _run(
     from tdhil.commands.confirm import confirm_motion
     from tdhil.commands.log_file import make_room
     from tdhil.commands.peer import open_drive
+    from tdhil.commands.settings_said import configuration
     from tdhil.commands.stop_signals import stop_on_signals
+    from tdhil.commands.unverified import accepted_lines
     from tdhil.errors import exit_code
     from tdhil.protocol.runner import Runner
     from tdhil.record.errors import LogError
@@ -124,22 +124,29 @@ def _run(
     if (older := make_room(path)) is not None:
         console.print(f"an older {path} was kept as {older}", style="dim", markup=False)
     writer = RunWriter(path, epoch_ns=peer.epoch_ns, block=peer.stepped)
-    log = RunLog(writer, _configuration(options, bus, peer, rig))
-    rated_nm = rig.drive_data.rated_torque_nm if rig is not None else None
+    log = RunLog(writer, configuration(options, connection, peer, rig))
+    data = rig.drive_data if rig is not None else None
     trace = None if options["trace"] is None else Path(options["trace"])
+    say = partial(console.print, style="dim", markup=False, highlight=False)
     try:
         with stop_on_signals() as stop_request, open_drive(
-            peer, options, bus, rated_nm, log.frame, trace
+            peer, options, connection, data, log.frame, trace
         ) as drive, LiveDisplay(console, show_preflight=False) as display:
             outcome = Runner(
                 drive,
-                partial(_task, options, rig, log),
+                partial(_task, options, connection.profile, rig, log, say),
                 log,
                 stop_request,
                 display,
-                partial(confirm_motion, yes=bool(options["yes"]), console=console, pause_display=display.pause),
+                partial(
+                    confirm_motion,
+                    yes=bool(options["yes"]),
+                    console=console,
+                    pause_display=display.pause,
+                    unverified=accepted_lines(connection.profile, options["accept_unverified"]),
+                ),
                 reset_fault=namespace.reset_fault,
-                say=partial(console.print, style="dim", markup=False, highlight=False),
+                say=display.say,
             ).run()
         code = _finish(outcome, log, str(path), bool(options["json"]), console, namespace.report)
     except BaseException:
@@ -156,12 +163,20 @@ def _run(
     return code
 
 
-def _task(options: Resolved, rig: Rig | None, log: RunLog, identity: Identity) -> Task:
+def _task(
+    options: Resolved, profile: Profile, rig: Rig | None, log: RunLog, say: Callable[[str], None], identity: Identity
+) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
+    from tdhil.commands.unverified import accepted_lines, note, require_accepted
     from tdhil.protocol.runner import Task
 
     bench = bench_of(identity, rig)
     log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
+    if not identity.simulated:
+        require_accepted(profile, options["accept_unverified"])
+        log.configure(unverified=list(accepted_lines(profile, options["accept_unverified"])))
+    elif text := note(profile):
+        say(text)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))
 
 
@@ -170,12 +185,14 @@ def _finish(
 ) -> int:
     """Identify and print, or say what ended the run."""
     from tdhil.commands.conclude import conclude, print_result, save_report
+    from tdhil.record.errors import LogError
 
     if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
         return _failed(outcome, path, as_json, console)
     with console.status("identifying …") if console.is_terminal else nullcontext():
         document, code = conclude(log.recording(complete=True), log.run, path)
-    log.result(document)
+    with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
+        log.result(document)
     print_result(document, as_json)
     save_report(document, log.recording(complete=True), report)
     return int(code)
@@ -221,37 +238,6 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         }
         print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
     return int(code)
-
-
-def _configuration(options: Resolved, bus: BusConfig, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
-    """What the log keeps of how the run was set up; everything that identification needs is in it."""
-    return {
-        "tdhil": __version__,
-        "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
-        "bus": {name: {"value": value, "source": source} for name, value, source in bus.rows()},
-        "embedded_simulator": peer.embedded,
-        "stepped": peer.stepped,
-        "seed": peer.seed,
-        "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
-        "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
-        "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
-    }
-
-
-def _show_settings(console: Console, options: Resolved, bus: BusConfig, peer: PeerPlan) -> None:
-    """Which value came from where: everything that isn't a default."""
-    if peer.embedded:
-        why = "as asked for" if options["simulate"] else "no CAN bus is configured"
-        clock = "stepped time" if peer.stepped else "real time"
-        console.print(
-            f"SIMULATED: embedded drive and rig on a virtual bus ({why}), {clock}, seed {peer.seed}", style="magenta"
-        )
-    else:
-        for name, value, source in bus.rows():
-            console.print(f"bus {name:<10} {value}  ({source})", style="dim", markup=False)
-    for name, value, source in options.rows():
-        if source != "default":
-            console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
 
 
 __all__ = ["add_arguments", "run"]

@@ -1,3 +1,7 @@
-"""Which shafts may be asked for: `tdhil.identify.options.MODELS`, without what importing that costs."""
+"""Which shafts may be asked for, and which motions of stage 5.
+
+They are `tdhil.identify.options.MODELS` and the kinds of `tdhil.protocol.settings`, without what importing those costs.
+"""
 
 MODELS = ("auto", "rigid", "two-mass", "string", "paper")
+EXCITATIONS = ("multisine", "sine", "step", "pulses", "coast-down")

@@ -1,20 +1,20 @@
-"""The other end: an open bus with a drive on it, or the embedded simulator on a virtual one."""
+"""The other end: a drive on its bus or line, or the embedded simulator."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.cia402.drive import Cia402Drive
 from drivers.clock import Clock, MonotonicClock, SteppedClock
-from drivers.drive import FrameTap
-from profiles.library import load_canopen_profile
-from tdhil.bus_options import BusConfig
+from drivers.drive import Drive, FrameTap
+from tdhil.commands.connection import Connection
+from tdhil.errors import UsageError
 from tdhil.options import Resolved
+from tdhil.rig import DriveData
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,16 @@ class PeerPlan:
         return 0 if self.stepped else time.time_ns()
 
 
-def plan_peer(options: Resolved, bus: BusConfig) -> PeerPlan:
-    """The embedded simulator with --simulate, or when no bus is configured anywhere."""
-    embedded = bool(options["simulate"]) or not bus.configured
+def plan_peer(options: Resolved, connection: Connection) -> PeerPlan:
+    """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
+    embedded = bool(options["simulate"]) or not connection.configured
     if not embedded:
+        if options["stepped"] and connection.drive == "modbus":
+            raise UsageError(
+                "a Modbus line has no SYNC to step by: over a wire it runs in real time",
+                where=options.source("stepped"),
+                next_step="Leave --stepped out, or use --simulate, which is stepped",
+            )
         return PeerPlan(False, bool(options["stepped"]), None, None)
     from sim_bus.params import RigParams
 
@@ -53,33 +59,18 @@ def plan_peer(options: Resolved, bus: BusConfig) -> PeerPlan:
 
 
 @contextmanager
-def open_drive(plan: PeerPlan, options: Resolved, bus: BusConfig, bench_torque_nm: float | None, tap: FrameTap,
-               trace: Path | None) -> Iterator[Cia402Drive]:
-    """The drive, closed with its bus and simulator afterwards."""
-    profile = load_canopen_profile(options["profile"])
+def open_drive(plan: PeerPlan, options: Resolved, connection: Connection, data: DriveData | None, tap: FrameTap,
+               trace: Path | None) -> Iterator[Drive]:
+    """The drive, closed with its bus and simulator afterwards. ``data``: what the bench knows and the drive doesn't."""
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
-    node = options["node"] if options["node"] is not None else profile.node
-    with ExitStack() as stack:
-        if plan.embedded:
-            import can
+    data = data or DriveData()
+    if connection.drive == "modbus":
+        from tdhil.commands.peer_modbus import open_modbus
 
-            from sim_bus.simulator import EmbeddedSimulator
+        with open_modbus(plan, options, connection, data, clock, tap, trace) as modbus:
+            yield modbus
+    else:
+        from tdhil.commands.peer_canopen import open_canopen
 
-            simulator = stack.enter_context(
-                EmbeddedSimulator(plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=plan.stepped)
-            )
-            channel = can.Bus(interface="virtual", channel=simulator.channel)
-        else:
-            from tdhil.bus_open import open_bus
-
-            channel = open_bus(bus)
-        stack.callback(channel.shutdown)
-        yield Cia402Drive(
-            channel,
-            profile,
-            clock,
-            node=node,
-            rate_hz=options["rate_hz"],
-            rated_torque_nm=bench_torque_nm,
-            tap=tap,
-        )
+        with open_canopen(plan, options, connection, data, clock, tap, trace) as canopen:
+            yield canopen

@@ -11,18 +11,12 @@ from tdhil.commands.conclude import conclude, print_result, save_report
 from tdhil.commands.models import MODELS
 from tdhil.commands.quantities import share
 from tdhil.errors import ExitCode, UsageError
-from tdhil.record.errors import LogError
+from tdhil.record.errors import LogError, NothingRecoverable
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
     "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd",
 )
-
-
-class NothingRecoverable(LogError):
-    """A log of which nothing can be read."""
-
-    exit_code = ExitCode.NOTHING_RECOVERABLE
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

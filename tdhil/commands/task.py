@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from drivers.drive import Identity
-from drivers.errors import PreflightRefused
 from tdhil.options import Resolved
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.record.recording import LagPrior
@@ -21,15 +20,8 @@ UNKNOWN_LAG_SD_SHARE = 0.1
 def bench_of(identity: Identity, rig: Rig | None) -> Rig:
     """The bench for this peer: a real one needs rig.yaml's limits, a simulated one has its own.
 
-    Raises PreflightRefused without limits, and for a drill string: stopping it takes bringing its trapped torque down,
-    which this protocol can't do yet, and a stop that leaves it wound up is none.
+    Raises PreflightRefused without limits.
     """
-    if rig is not None and rig.load == "string":
-        raise PreflightRefused(
-            "a drill string hangs on the shaft, and its trapped torque can't be brought down yet",
-            where=rig.source("load") or "rig.yaml",
-            next_step="Disconnect the string and say load: none",
-        )
     if identity.simulated:
         return simulated_default_rig(rig)
     require_limits(rig)

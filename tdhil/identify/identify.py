@@ -27,6 +27,7 @@ from tdhil.identify.options import Options
 from tdhil.identify.paper_method import paper_estimate
 from tdhil.identify.record_route import identify_record
 from tdhil.identify.samples import Samples, Stretch, excited_window, stretches, usable_samples
+from tdhil.identify.stepped import with_stepping
 from tdhil.identify.verdict import Evidence, conclude, refused
 from tdhil.record.recording import Recording
 
@@ -37,6 +38,10 @@ _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the i
 def identify(recording: Recording, options: Options | None = None) -> Identification:
     """Identify the inertia. Pure: the same recording gives the same bits. Never raises on bad data: it refuses."""
     options = options or Options()
+    return with_stepping(_identify(recording, options), recording, options)
+
+
+def _identify(recording: Recording, options: Options) -> Identification:
     refusal = refuse_samples(recording)
     if refusal is not None:
         return refused(refusal, None, 0, 0, ())
@@ -44,7 +49,9 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     paper = paper_estimate(_excited_parts(recording, samples))
     excitation = recording.excitation
     if excitation is None or not excitation.segments:
-        return identify_record(recording, samples, options, paper)
+        record = identify_record(recording, samples, options, paper)
+        # Pulses and coasting of our own have calm between them, which a foreign trace need not have.
+        return record if excitation is None else with_second_look(record, recording, samples, None, options)
     refusal = refuse_motion(recording, samples)
     if refusal is not None:
         return refused(refusal, paper, 0, len(samples), ())

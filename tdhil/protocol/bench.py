@@ -18,6 +18,9 @@ T = TypeVar("T")
 ALIVE_S = 0.2
 """Wall time between two signs of life in stepped time; a simulated peer gives a host a second."""
 
+SWITCH_CYCLES = 10
+"""A drive on a slow line gets so many cycles for a switch of its mode: asked, done, seen, and some that were lost."""
+
 SWITCH_S = 0.0005
 """How long arithmetic beside the control loop may keep the interpreter to itself."""
 
@@ -62,6 +65,7 @@ class Bench:
         self.log.cycle(command, sample)
         self.last = sample
         self.guard.check_sample(command, sample)
+        self.guard.check_pace(self.drive.counters)
         if self._watch is not None:
             self._watch(command, sample)
         return sample
@@ -103,8 +107,8 @@ class Bench:
         )
 
     def switch_mode(self, command: Command, timeout_s: float = 0.5) -> Sample:
-        """Go on with ``command.mode`` while enabled; the drive must display the new mode in time."""
-        for _ in range(self.cycles(timeout_s)):
+        """Go on with ``command.mode`` while enabled; the drive must display the new mode in time, and in ten cycles."""
+        for _ in range(max(SWITCH_CYCLES, self.cycles(timeout_s))):
             sample = self.cycle(command)
             if sample.mode is command.mode:
                 return sample

@@ -1,25 +1,41 @@
 """The guard over every command and every sample. Pure: it looks, and raises.
 
-In torque mode it does not wait for the speed limit to be crossed. What is reported is old: with a reporting
-lag τ and a reaction time t_r the shaft will have reached, before anything the host does can act,
+In torque mode it does not wait for the edge of the speed window to be crossed. What is reported is old: with a
+reporting lag τ and a reaction time t_r the shaft will have reached, before anything the host does can act,
 
-    ω_pred = ω_reported + |T_net| / J_min · (t_r + τ_max)        T_net = T − T_c − B ω
+    ω_pred = ω_reported + T_net / J_min · (t_r + τ_max)        T_net = T − T_c sgn ω − B ω
 
 and it is ω_pred that must stay below the window's upper end (a quantum of speed at 250 Hz is already 2.6 rad/s², so
-differentiating the reported speed instead would see nothing but noise).
+differentiating the reported speed instead would see nothing but noise). t_r is what was assumed of loop and drive, and
+three periods of a slow loop. Downwards ω_pred goes through standstill only where the torque overcomes the friction that
+then holds the shaft, and the shaft must not turn backwards (where it may: not faster than the limit). Between there and
+the window's lower end nothing comes to harm: that end is held by the reported speed.
 """
 
 from __future__ import annotations
 
 import math
 
-from drivers.drive import Command, Mode, PowerState, Sample
+from drivers.drive import Command, Counters, Mode, PowerState, Sample
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
 
 LONGEST_AGE_S = 0.25
 """Feedback may be missing for this long at most; the drive goes on by itself meanwhile, at what it was last told."""
+
+FROZEN_S = 0.5
+"""Feedback that stays the same to the last bit for so long, while the setpoint moves, is none (row 19)."""
+
+FROZEN_SHARE = 0.1
+"""Share of the limit that the setpoint must have moved by, for feedback to count as frozen."""
+
+LIMITED_S = 0.5
+"""In torque mode the drive's internal limit may act for so long: a torque that is not the commanded one moves the shaft
+to where nobody planned (row 33)."""
+
+PACE_S, LATE_SHARE = 2.0, 0.2
+"""A loop that was late in this share of its cycles over this time can't hold its rate (row 8)."""
 
 
 class Guard:
@@ -33,17 +49,22 @@ class Guard:
         torque_resolution_nm: float,
         assumptions: ControlAssumptions | None = None,
     ) -> None:
-        assumptions = assumptions or ControlAssumptions()
+        assumptions = (assumptions or ControlAssumptions()).at_period(period_s)
         self._limits = limits
         self._horizon_s = assumptions.reaction_s + assumptions.largest_speed_lag_s
         self._smallest_share = assumptions.smallest_inertia_share
         # Noise and quantisation about zero are no reverse rotation.
-        self._reverse_rad_s = max(5.0 * speed_resolution_rad_s, 0.02 * limits.speed_max_rad_s)
+        self._speed_noise_rad_s = 5.0 * speed_resolution_rad_s
+        self._reverse_rad_s = max(self._speed_noise_rad_s, 0.02 * limits.speed_max_rad_s)
         # The reported torque is noisy and may overshoot; what was commanded is held exactly.
         self._torque_seen_nm = 1.25 * limits.torque_nm + 10.0 * torque_resolution_nm
         # Half of what the drive's watchdog grants the host, and never on account of two lost frames.
         self._stale_limit = max(3, math.ceil(min(LONGEST_AGE_S, 0.5 * limits.watchdog_s) / period_s))
         self._stale = 0
+        self._still: _Still | None = None
+        self._limited_since_s: float | None = None
+        self._pace_cycles = max(10, round(PACE_S / period_s))
+        self._pace_from = Counters()
         self._started_s: float | None = None
         self.expected: PowerState | None = None
         self.model: RigGuess | None = None
@@ -72,50 +93,54 @@ class Guard:
         """What the time limit leaves, s."""
         return self._limits.time_s - (0.0 if self._started_s is None else time_s - self._started_s)
 
+    def check_pace(self, counters: Counters) -> None:
+        """Raise CommunicationLost when the loop is late again and again: its setpoints then come too late as well."""
+        before = self._pace_from
+        cycles = counters.cycles - before.cycles
+        if cycles < self._pace_cycles:
+            return
+        self._pace_from = counters
+        late = counters.overruns - before.overruns
+        if late > LATE_SHARE * cycles:
+            raise CommunicationLost(
+                f"the control loop was late in {late} of {cycles} cycles",
+                where="host",
+                next_step="Ask for a lower --rate, or end what else keeps this computer busy",
+            )
+
     def check_sample(self, command: Command, sample: Sample) -> None:
         """Raise what the sample shows: CommunicationLost, DriveFault or LimitHit."""
-        self._check_age(sample)
+        where = f"guard at {sample.time_s:.3f} s"
+        self._check_age(sample, where)
         if self.expected is not None and sample.state is not self.expected:
             raise DriveFault(
                 f"the drive left the state '{self.expected.value}' and shows '{sample.state.value}'",
                 where=f"statusword {sample.status:04X}h at {sample.time_s:.3f} s",
                 next_step="Look into the drive's fault list; STO, a fault or a second master may have done it",
             )
-        speed = sample.speed_rad_s
-        if not (math.isfinite(speed) and math.isfinite(sample.torque_nm)):
+        if not (math.isfinite(sample.speed_rad_s) and math.isfinite(sample.torque_nm)):
             raise DriveFault(
-                f"the feedback is not finite (speed {speed}, torque {sample.torque_nm})",
-                where=f"guard at {sample.time_s:.3f} s",
+                f"the feedback is not finite (speed {sample.speed_rad_s}, torque {sample.torque_nm})",
+                where=where,
                 next_step="Do word order and scaling in the profile fit this drive?",
             )
-        if speed > self._limits.speed_max_rad_s or (
-            self._limits.allow_reverse and speed < -self._limits.speed_max_rad_s
-        ):
-            raise LimitHit(
-                f"speed {speed:.3f} rad/s is beyond the limit of {self._limits.speed_max_rad_s:g} rad/s",
-                where=f"guard at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Was the load lost? Check limits.speed_max_rad_s in rig.yaml",
-            )
-        if not self._limits.allow_reverse and speed < -self._reverse_rad_s:
-            raise LimitHit(
-                f"the shaft turns backwards ({speed:.3f} rad/s) and allow_reverse is false",
-                where=f"guard at {sample.time_s:.3f} s",
-                next_step="The shaft was stopped. Reverse rotation backs off tool joints",
-            )
+        self._check_speed(sample.speed_rad_s, where)
         if abs(sample.torque_nm) > self._torque_seen_nm:
             raise LimitHit(
                 f"torque {sample.torque_nm:.1f} N·m is beyond the limit of {self._limits.torque_nm:g} N·m",
-                where=f"guard at {sample.time_s:.3f} s",
+                where=where,
                 next_step="The shaft was stopped. Does the drive's rated torque match rig.yaml?",
             )
-        if self._started_s is not None and sample.time_s - self._started_s > self._limits.time_s:
+        if self.left_s(sample.time_s) < 0.0:
             raise LimitHit(
                 f"the run has taken longer than {self._limits.time_s:g} s",
-                where=f"guard at {sample.time_s:.3f} s",
+                where=where,
                 next_step="Raise limits.time_s in rig.yaml or ask for fewer periods",
             )
+        self._check_frozen(command, sample, where)
+        self._check_limited(command, sample)
         if command.mode is Mode.TORQUE and self.model is not None:
-            self._check_prediction(self.model, command, speed, sample.time_s)
+            self._check_window(self.model, command, sample.speed_rad_s, where)
 
     @staticmethod
     def foresight_s(assumptions: ControlAssumptions) -> float:
@@ -124,21 +149,57 @@ class Guard:
 
     def predicted_speed(self, model: RigGuess, torque_nm: float, speed_rad_s: float) -> float:
         """Where the shaft may be, rad/s, before the host can act on what it now sees."""
-        net_nm = torque_nm - model.steady_torque_nm(speed_rad_s)
-        return speed_rad_s + net_nm / (self._smallest_share * model.inertia_kg_m2) * self._horizon_s
+        inertia = self._smallest_share * model.inertia_kg_m2
+        direction = math.copysign(1.0, speed_rad_s or torque_nm)
+        rate = (torque_nm - direction * model.coulomb_nm - model.viscous_nm_s_rad * speed_rad_s) / inertia
+        ahead = speed_rad_s + rate * self._horizon_s
+        if ahead * direction >= 0.0:
+            return ahead
+        # Through standstill, from where friction holds against what pushes on.
+        push_nm = torque_nm + direction * model.coulomb_nm
+        left_s = self._horizon_s + speed_rad_s / rate
+        return push_nm / inertia * left_s if push_nm * direction < 0.0 else 0.0
 
-    def _check_prediction(self, model: RigGuess, command: Command, speed_rad_s: float, time_s: float) -> None:
-        predicted = self.predicted_speed(model, command.torque_nm, speed_rad_s)
-        if predicted > self._limits.speed_max_rad_s:
+    def _check_speed(self, speed_rad_s: float, where: str) -> None:
+        limits = self._limits
+        if speed_rad_s > limits.speed_max_rad_s or (limits.allow_reverse and speed_rad_s < -limits.speed_max_rad_s):
             raise LimitHit(
-                f"the speed is about to leave its window: {speed_rad_s:.3f} rad/s reported and"
-                f" {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s,"
-                f" beyond {self._limits.speed_max_rad_s:g} rad/s",
-                where=f"guard at {time_s:.3f} s",
-                next_step="The shaft was stopped. Lower the amplitude or the offset",
+                f"speed {speed_rad_s:.3f} rad/s is beyond the limit of {limits.speed_max_rad_s:g} rad/s",
+                where=where,
+                next_step="The shaft was stopped. Was the load lost? Check limits.speed_max_rad_s in rig.yaml",
+            )
+        if not limits.allow_reverse and speed_rad_s < -self._reverse_rad_s:
+            raise LimitHit(
+                f"the shaft turns backwards ({speed_rad_s:.3f} rad/s) and allow_reverse is false",
+                where=where,
+                next_step="The shaft was stopped. Reverse rotation backs off tool joints",
             )
 
-    def _check_age(self, sample: Sample) -> None:
+    def _check_window(self, model: RigGuess, command: Command, speed_rad_s: float, where: str) -> None:
+        limits = self._limits
+        predicted = self.predicted_speed(model, command.torque_nm, speed_rad_s)
+        lowest = -limits.speed_max_rad_s if limits.allow_reverse else -self._reverse_rad_s
+        leads = f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
+        if predicted > limits.speed_max_rad_s:
+            raise LimitHit(
+                f"the speed is about to leave its window: {leads}, beyond {limits.speed_max_rad_s:g} rad/s",
+                where=where,
+                next_step="The shaft was stopped. Lower the amplitude or the offset",
+            )
+        if predicted < lowest:
+            raise LimitHit(
+                f"the shaft is about to turn backwards: {leads}",
+                where=where,
+                next_step="The shaft was stopped. Lower the amplitude or raise the offset",
+            )
+        if speed_rad_s < limits.speed_min_rad_s - self._speed_noise_rad_s:
+            raise LimitHit(
+                f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s",
+                where=where,
+                next_step="The shaft was stopped. Lower the amplitude or raise the offset; did the load grow?",
+            )
+
+    def _check_age(self, sample: Sample, where: str) -> None:
         if sample.fresh:
             self._stale = 0
             return
@@ -146,6 +207,48 @@ class Guard:
         if self._stale >= self._stale_limit:
             raise CommunicationLost(
                 f"no feedback for {self._stale} cycles",
-                where=f"guard at {sample.time_s:.3f} s",
+                where=where,
                 next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
             )
+
+    def _check_frozen(self, command: Command, sample: Sample, where: str) -> None:
+        """Values that no longer follow: a gateway, or a drive's process image, that repeats its last one."""
+        seen, torque_mode = (sample.speed_rad_s, sample.torque_nm), command.mode is Mode.TORQUE
+        setpoint = command.torque_nm if torque_mode else command.speed_rad_s
+        still = self._still
+        if still is None or still.seen != seen or still.mode is not command.mode or sample.limit_active:
+            self._still = _Still(seen, command.mode, sample.time_s, setpoint)
+            return
+        still.lowest, still.highest = min(still.lowest, setpoint), max(still.highest, setpoint)
+        limit = self._limits.torque_nm if torque_mode else self._limits.speed_max_rad_s
+        moved = still.highest - still.lowest > FROZEN_SHARE * limit
+        if moved and sample.time_s - still.since_s >= FROZEN_S:
+            raise CommunicationLost(
+                f"the feedback has been frozen at {seen[0]:.3f} rad/s and {seen[1]:.1f} N·m for {FROZEN_S:g} s,"
+                " while the setpoint moved",
+                where=where,
+                next_step="Does a gateway repeat old values? Check the bus and the drive; is the shaft locked?",
+            )
+
+    def _check_limited(self, command: Command, sample: Sample) -> None:
+        if command.mode is not Mode.TORQUE or not sample.limit_active:
+            self._limited_since_s = None
+        elif self._limited_since_s is None:
+            self._limited_since_s = sample.time_s
+        elif sample.time_s - self._limited_since_s >= LIMITED_S:
+            raise LimitHit(
+                f"the drive's internal limit has been active in torque mode for {LIMITED_S:g} s:"
+                " its torque is not the commanded one",
+                where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
+                next_step="Which limit of the drive acts (torque, current, speed, voltage)? Look at its panel",
+            )
+
+
+class _Still:
+    """Feedback that hasn't changed since ``since_s``, and how far the setpoint has moved meanwhile."""
+
+    def __init__(self, seen: tuple[float, float], mode: Mode, since_s: float, setpoint: float) -> None:
+        self.seen = seen
+        self.mode = mode
+        self.since_s = since_s
+        self.lowest = self.highest = setpoint

@@ -7,16 +7,31 @@ expect, and everything after it is decided by its scatter (`design.stopping`).
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from tdhil.protocol.design.choose import Choice, Knowledge, choose
 from tdhil.protocol.design.expected import Evidence, half_width, longer
 from tdhil.protocol.design.predicted import predicted
 from tdhil.protocol.design.stopping import MARGIN, interval_confidence, least_scale
-from tdhil.protocol.excitation import LEAST_COUNTED, ExcitationWish, MachineLimits, Plan, RigGuess
+from tdhil.protocol.excitation import (
+    LEAST_COUNTED,
+    ExcitationKind,
+    ExcitationWish,
+    MachineLimits,
+    Plan,
+    PlanRefused,
+    RigGuess,
+    SwingKind,
+    SwingPlan,
+    fit_following,
+    held_back_to,
+    make_swings,
+)
 from tdhil.protocol.settings import ExcitationRequest
+from tdhil.protocol.stage_speed import Course
 
+NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
 NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
 _PILOT_SHARE = 0.6        # of the periods that are expected to be needed: the rest is decided by the pilot's scatter
 _EVER = 1000.0            # times as long: what is open then stays open
@@ -49,9 +64,12 @@ class Stopping:
 
 @dataclass(frozen=True)
 class Planned:
-    """The plan (with a stopping rule: its pilot), and the relative half-width of J that may be expected at the end."""
+    """The plan (with a stopping rule: its pilot), and the relative half-width of J that may be expected at the end.
 
-    plan: Plan
+    The half-width is infinite where none is to be expected, and not a number where none is predicted.
+    """
+
+    plan: Plan | SwingPlan
     known: Knowledge
     half_width: float
     usual_half_width: float
@@ -61,7 +79,7 @@ class Planned:
     def said(self) -> str:
         """One line for whoever watches."""
         if not math.isfinite(self.half_width):
-            return NOTHING_TO_EXPECT
+            return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
         noise = f"noise {self.known.noise.source}"
         expected = f"expected interval of J: ±{100.0 * self.half_width:.2g} % after {self.duration_s:.0f} s ({noise})"
         if self.stopping is None or self.stopping.reachable:
@@ -82,7 +100,7 @@ class Planned:
 def wish_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
     """The request as the excitation room takes it."""
     return ExcitationWish(
-        kind=request.kind,
+        kind=_periodic(request.kind),
         mode="speed" if mode == "speed" else "torque",
         frequency_hz=request.frequency_hz,
         amplitude_rad_s=request.amplitude_rad_s,
@@ -92,14 +110,28 @@ def wish_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
 
 
 def adaptive(request: ExcitationRequest) -> bool:
-    """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor for a single tone."""
-    return request.tolerance is not None and request.periods is None and request.kind != "sine"
+    """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor without several lines."""
+    return request.tolerance is not None and request.periods is None and request.kind in ("multisine", "step")
+
+
+def as_followed(
+    guess: RigGuess, limits: MachineLimits, course: Course, speed_lag_s: float
+) -> tuple[RigGuess, MachineLimits]:
+    """Rig and limits as the drive's own speed control leaves them, seen in the ramp of stage 2."""
+    signals = course.time_s, course.setpoint_rad_s, course.reported_rad_s
+    ramp = held_back_to(*signals)
+    following = fit_following(*signals, speed_lag_s, math.inf if ramp is None else ramp)
+    within = limits if ramp is None else replace(limits, acceleration_rad_s2=ramp)
+    return replace(guess, following=following), within
 
 
 def plan_acquisition(
     request: ExcitationRequest, mode: str, limits: MachineLimits, guess: RigGuess, known: Knowledge, left_s: float
 ) -> Planned:
     """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
+    match request.kind:
+        case "pulses" | "coast-down" as kind:
+            return _swings(kind, request, mode, limits, guess, known, left_s)
     wish = wish_of(request, mode)
     allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
     if not adaptive(request):
@@ -109,6 +141,41 @@ def plan_acquisition(
     if chosen.plan.duration_s > allowed_s:
         chosen = choose(limits, guess, wish, known, request.confidence, allowed_s)
     return _with_pilot(request, chosen, known, allowed_s)
+
+
+def _periodic(kind: str) -> ExcitationKind:
+    match kind:
+        case "multisine" | "sine" | "step":
+            return kind
+        case _:
+            raise PlanRefused(f"{kind} is no periodic excitation")
+
+
+def _swings(
+    kind: SwingKind,
+    request: ExcitationRequest,
+    mode: str,
+    limits: MachineLimits,
+    guess: RigGuess,
+    known: Knowledge,
+    left_s: float,
+) -> Planned:
+    """Pulses and coast-down: there is no line to predict, and no scatter of periods to stop by."""
+    if request.frequency_hz is not None:
+        raise PlanRefused(f"{kind} has no frequency; use --amplitude, --offset, --periods or --max-time")
+    plan = make_swings(
+        kind,
+        limits,
+        guess,
+        "speed" if mode == "speed" else "torque",
+        request.amplitude_rad_s,
+        request.offset_rad_s,
+        request.periods,
+        request.max_time_s,
+    )
+    if plan.duration_s > left_s:
+        raise PlanRefused(f"time: {kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left")
+    return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
 
 def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float) -> Planned:

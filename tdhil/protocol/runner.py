@@ -5,6 +5,7 @@ The first cause is kept: what goes wrong while stopping is reported beside it, n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -18,26 +19,26 @@ from tdhil.protocol.bench import Bench
 from tdhil.protocol.control import MeanSpeedControl
 from tdhil.protocol.design import Knowledge, assumed_noise, measured_noise
 from tdhil.protocol.enough import Decision, Enough
-from tdhil.protocol.excitation import Plan, PlanRefused, RigGuess
+from tdhil.protocol.excitation import Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.protocol.guard import Guard
-from tdhil.protocol.planning import Planned, plan_acquisition
+from tdhil.protocol.planning import Planned, as_followed, plan_acquisition
 from tdhil.protocol.settings import ControlAssumptions, ExcitationRequest, MachineLimits, StopRequest
 from tdhil.protocol.stage_acquire import run_acquire
 from tdhil.protocol.stage_hold import run_hold
+from tdhil.protocol.stage_quality import stage_quality
 from tdhil.protocol.stage_setup import measure_offsets, probe_sign
 from tdhil.protocol.stage_speed import SpeedResult, run_speed
+from tdhil.protocol.stage_swing import run_swings
 from tdhil.protocol.stage_torque import TorqueResult, run_torque
 from tdhil.protocol.stop import StopReport, StopSequence
-from tdhil.record.recording import Excitation, LagPrior, Ramp, Stage
+from tdhil.protocol.string_rules import refuse_with_string
+from tdhil.record.recording import Excitation, LagPrior, Ramp, Stage, SteppedSetpoint
 from tdhil.record.run_log import RunLog
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
 RESERVE_S = 30.0
 """Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
-
-TOLERATED_LOSS = 0.01
-"""A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
 
 Idle = Callable[[], None]
 """One cycle of nothing, which keeps the drive's watchdog fed while somebody makes up his mind."""
@@ -52,7 +53,7 @@ class Display(Protocol):
 
     def cycle(self, command: Command, sample: Sample) -> None: ...
 
-    def planned(self, plan: Plan) -> None: ...
+    def planned(self, plan: Plan | SwingPlan) -> None: ...
 
     def stage_ended(self, stage: Stage) -> None: ...
 
@@ -136,6 +137,9 @@ class Runner:
             if self._stop is not None:
                 report = self._stop.run()
                 with suppress(Exception):
+                    for trouble in report.trouble:
+                        self._log.event(self._drive.clock.now_s(), "stop", trouble)
+                with suppress(Exception):
                     self._display.stopped(report.confirmed)
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
@@ -155,12 +159,18 @@ class Runner:
         with self._stage("setup", 10.0):
             task, bench, preflight = self._prepare()
             limits, assumptions = task.limits, task.assumptions
-            mode = _choose_mode(task.request.mode, preflight)
+            mode = _choose_mode(task.request, limits, preflight)
             _, torque_offset = measure_offsets(bench, limits)
             self._log.learn(torque_offset_nm=torque_offset)
             self._confirm(task, preflight, lambda: self._idle(bench))
             self._stop = StopSequence(
-                bench, limits, preflight.speed_resolution_rad_s, preflight.quick_stop_in_torque_mode, assumptions
+                bench,
+                limits,
+                preflight.speed_resolution_rad_s,
+                preflight.quick_stop_in_torque_mode,
+                assumptions,
+                torque_resolution_nm=preflight.torque_resolution_nm,
+                torque_offset_nm=torque_offset,
             )
             bench.guard.start_clock(bench.now_s)
             breakaway = probe_sign(bench, limits, mode, preflight.speed_resolution_rad_s)
@@ -170,6 +180,7 @@ class Runner:
             speed = run_speed(bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset)
             self._log.motion(None, speed.levels, (speed.ramp,))
             self._note_rough(bench, speed)
+            self._note_timing(bench, speed)
         ramps: tuple[Ramp, ...] = (speed.ramp,)
         drifted: TorqueResult | None = None
         if mode is Mode.TORQUE:
@@ -178,7 +189,8 @@ class Runner:
                 ramps = (speed.ramp, drifted.ramp)
                 self._log.motion(None, speed.levels, ramps)
         else:
-            self._skip("torque", bench, "speed mode")
+            why = _no_torque(task.request.mode, preflight)
+            self._skip("torque", bench, f"{why}: no switch, and no second look at the inertia by a drift")
         model = self._model(bench, speed, drifted)
         planned = self._plan(task, bench, speed, mode)
         plan = planned.plan
@@ -186,13 +198,16 @@ class Runner:
         if drifted is not None:
             with self._stage("hold", 15.0):
                 control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
-                target = plan.segments[0].reference.offset_rad_s
+                target = plan.start_rad_s if isinstance(plan, SwingPlan) else plan.segments[0].reference.offset_rad_s
                 run_hold(bench, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
         else:
-            self._skip("hold", bench, "speed mode")
+            self._skip("hold", bench, f"{why}: the drive's own speed control holds the mean speed")
         with self._stage("acquire", planned.duration_s + 10.0):
             announced = self._announcer(speed, ramps)
-            run_acquire(bench, limits, plan, control, announced, self._enough(planned, bench))
+            if isinstance(plan, SwingPlan):
+                run_swings(bench, limits, plan, control, assumptions, announced)
+            else:
+                run_acquire(bench, limits, plan, control, announced, self._enough(planned, bench))
 
     def _prepare(self) -> tuple[Task, Bench, Preflight]:
         identity = self._drive.connect()
@@ -213,7 +228,14 @@ class Runner:
             self._log.event(self._drive.clock.now_s(), "preflight", text)
         if preflight.refused:
             raise _refusal(preflight)
+        refuse_with_string(limits, task.request, preflight)
+        # What the line carries is known only now: the driver may have measured it in preflight.
+        period_s = self._drive.period_s
+        task = replace(task, assumptions=task.assumptions.at_period(period_s))
+        self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
+        self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles a second")
         self._prior = _with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
+        task = replace(task, assumptions=_with_known_lag(task.assumptions, self._prior))
         self._log.learn(
             speed_resolution_rad_s=preflight.speed_resolution_rad_s,
             torque_resolution_nm=preflight.torque_resolution_nm,
@@ -222,7 +244,7 @@ class Runner:
         )
         guard = Guard(
             limits,
-            self._drive.period_s,
+            period_s,
             preflight.speed_resolution_rad_s,
             preflight.torque_resolution_nm,
             task.assumptions,
@@ -243,6 +265,7 @@ class Runner:
         room = excitation.MachineLimits(
             limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
         )
+        course = speed.course if mode is Mode.SPEED else None
         last = bench.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
         keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
@@ -252,7 +275,10 @@ class Runner:
 
         def work() -> Planned:
             known = Knowledge(measured_noise(speed.steady, theta, assumed), self._prior)
-            return plan_acquisition(request, mode.value, room, model, known, left_s)
+            if course is None:
+                return plan_acquisition(request, mode.value, room, model, known, left_s)
+            seen, within = as_followed(model, room, course, known.speed_lag_s)
+            return plan_acquisition(request, mode.value, within, seen, known, left_s)
 
         try:
             planned = bench.compute(work, keep)
@@ -261,6 +287,8 @@ class Runner:
                 str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
             ) from error
         plan = planned.plan
+        if course is not None:
+            self._note_following(bench, plan)
         self._display.planned(plan)
         self._log.event(
             bench.now_s,
@@ -273,6 +301,21 @@ class Runner:
         if planned.stopping is not None:
             self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})
         return planned
+
+    def _note_following(self, bench: Bench, plan: Plan | SwingPlan) -> None:
+        """What slow sampling of a stepped setpoint may do to J is identification's to say; it needs these."""
+        following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
+        if math.isfinite(ramp):
+            text = f"the drive's own speed ramp holds the shaft to {ramp:.3g} rad/s²; stage 5 stays below it"
+            self._tell(bench, text)
+        if following is None:
+            self._tell(bench, "how the drive follows its setpoint was not clear; stage 5 takes it to follow at once")
+            return
+        self._log.learn(
+            stepped_setpoint=SteppedSetpoint(
+                bench.period_s, following.zero_s, following.first_s, following.second_s2
+            )
+        )
 
     def _tell(self, bench: Bench, text: str) -> None:
         self._log.event(bench.now_s, "plan", text)
@@ -290,10 +333,20 @@ class Runner:
             self._log.configure(stopping=rule.plain() | {"decisions": list(told)})
             self._tell(bench, decision.why)
 
+        assert isinstance(planned.plan, Plan)
         return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
 
     def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
         return lambda motion: self._log.motion(motion, speed.levels, ramps)
+
+    def _note_timing(self, bench: Bench, speed: SpeedResult) -> None:
+        """How far a sample's time may be off; torque and speed may be apart by as much."""
+        half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
+        if half_s > 0.0:
+            self._prior = replace(self._prior, skew_sd_s=math.hypot(self._prior.skew_sd_s, half_s))
+            self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
+            text = f"a sample's time is known to ±{1e3 * half_s:.3g} ms, the half of a transaction"
+            self._log.event(bench.now_s, "rate", text)
 
     def _note_rough(self, bench: Bench, speed: SpeedResult) -> None:
         model = speed.model
@@ -320,9 +373,10 @@ class Runner:
                 error.add_note(f"and the end of the stage was not taken: {also}")
             raise
         after = self._drive.counters
-        lost, cycles = after.missed - before.missed, after.cycles - before.cycles
-        detail = f"{lost} of {cycles} cycles without feedback" if lost else ""
-        outcome = "degraded" if lost > TOLERATED_LOSS * cycles else "ok"
+        if after.wall_jumps > before.wall_jumps:
+            self._log.event(self._drive.clock.now_s(), "clock",
+                            "the wall clock jumped: stamps on the bus moved, the times in this log did not")
+        outcome, detail = stage_quality(before, after)
         self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), outcome, detail))
 
     def _skip(self, name: str, bench: Bench, why: str) -> None:
@@ -331,7 +385,7 @@ class Runner:
 
     def _end_stage(self, stage: Stage) -> None:
         self._stages.append(stage)
-        self._log.stage(stage)
+        self._stages[-1] = stage = self._log.stage(stage)
         self._display.stage_ended(stage)
 
     def _idle(self, bench: Bench) -> None:
@@ -360,16 +414,44 @@ def _short(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"[:300]
 
 
-def _choose_mode(wanted: str | None, preflight: Preflight) -> Mode:
+def _choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Preflight) -> Mode:
     """Torque mode where the drive has it and can enter it while it turns, unless speed mode was asked for."""
-    can_torque = Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
+    wanted, can_torque = request.mode, Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
     if wanted == Mode.TORQUE.value and not can_torque:
         raise PreflightRefused(
             "torque mode was asked for, but this drive has none that can be entered while it turns",
             where="6502h and profile",
             next_step="Use --mode speed",
         )
-    return Mode.SPEED if wanted == Mode.SPEED.value or not can_torque else Mode.TORQUE
+    mode = Mode.SPEED if wanted == Mode.SPEED.value or not can_torque else Mode.TORQUE
+    if request.kind == "coast-down" and limits.load != "none":
+        raise PreflightRefused(
+            f"coast-down was asked for, but a {limits.load} hangs on the shaft and would drive it back",
+            where="--excitation and load in rig.yaml",
+            next_step="Use --excitation multisine",
+        )
+    if request.kind == "coast-down" and mode is Mode.SPEED:
+        raise PreflightRefused(
+            f"coast-down was asked for, but {_no_torque(wanted, preflight)}: a shaft under speed control never coasts",
+            where="--excitation",
+            next_step="Use --excitation pulses or multisine",
+        )
+    return mode
+
+
+def _no_torque(wanted: str | None, preflight: Preflight) -> str:
+    """Why the run is not in torque mode."""
+    if Mode.TORQUE not in preflight.modes:
+        return "the drive has no torque mode"
+    if not preflight.switch_while_enabled:
+        return "the drive can't enter torque mode while it turns"
+    return "speed mode was asked for" if wanted == Mode.SPEED.value else "speed mode was chosen"
+
+
+def _with_known_lag(assumptions: ControlAssumptions, prior: LagPrior) -> ControlAssumptions:
+    """Reports that are known to lag further than usual are reckoned with by guard, control and stop."""
+    known_s = 0.0 if prior.speed_lag_s is None else prior.speed_lag_s + 2.0 * prior.speed_lag_sd_s
+    return replace(assumptions, largest_speed_lag_s=max(assumptions.largest_speed_lag_s, known_s))
 
 
 READ_FILTER_SD_SHARE = 0.1

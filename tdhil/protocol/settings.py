@@ -1,6 +1,6 @@
 """What a run is allowed to do and asked to do: plain numbers, SI at the motor shaft."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 
@@ -25,7 +25,7 @@ class MachineLimits:
 class ExcitationRequest:
     """What stage 5 shall do; None = the default, scaled to the rig."""
 
-    kind: Literal["multisine", "sine", "step"] = "multisine"
+    kind: Literal["multisine", "sine", "step", "pulses", "coast-down"] = "multisine"
     mode: str | None = None            # torque, speed; None = torque where the drive has it
     frequency_hz: float | None = None
     amplitude_rad_s: float | None = None
@@ -43,6 +43,14 @@ class ControlAssumptions:
     largest_speed_lag_s: float = 0.5   # largest plausible lag of the reported speed
     reaction_s: float = 0.1            # from a sample to the torque that answers it
     smallest_inertia_share: float = 0.7    # smallest plausible J as a share of the rough J
+
+    def at_period(self, period_s: float) -> "ControlAssumptions":
+        """The same where a cycle takes so long: whoever sees a sample answers in the next cycle but one, at worst."""
+        return replace(self, reaction_s=max(self.reaction_s, REACTION_CYCLES * period_s))
+
+
+REACTION_CYCLES = 3.0
+"""The sample's own cycle, the one that carries the answer, and one that may be lost."""
 
 
 class StopRequest:

@@ -44,8 +44,8 @@ class Follower:
     def follow(self, reference: Reference, duration_s: float) -> float:
         """Run ``reference`` for a duration from the next cycle on; the control time at which it began."""
         start_s = self.time_s + self._bench.period_s
-        for _ in range(self._bench.cycles(duration_s)):
-            self.step(reference, start_s)
+        # By time, not by a number of cycles: a slow line keeps its period on average at best.
+        self.follow_until(reference, start_s, start_s + max(duration_s, self._bench.period_s))
         return start_s
 
     def follow_until(self, reference: Reference, start_s: float, end_s: float) -> None:
@@ -64,8 +64,11 @@ class Follower:
         torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
         wanted = max(lowest, min(limits.speed_max_rad_s, speed_rad_s))
-        sample: Sample = self._bench.cycle(Command(self._mode, wanted, torque_nm))
-        self.time_s, self.reported_rad_s, self.wanted_rad_s = sample.time_s, sample.speed_rad_s, wanted
+        self.saw(self._bench.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+
+    def saw(self, sample: Sample, wanted_rad_s: float) -> None:
+        """Where the shaft is, after a cycle in which it was to have this speed."""
+        self.time_s, self.reported_rad_s, self.wanted_rad_s = sample.time_s, sample.speed_rad_s, wanted_rad_s
 
 
 def run_acquire(

@@ -42,7 +42,7 @@ def probe_sign(bench: Bench, limits: MachineLimits, mode: Mode, speed_resolution
     recent: deque[float] = deque(maxlen=bench.cycles(0.1))
     travel_rad = 0.0
     torque_nm = speed_rad_s = 0.0
-    bench.enable(mode, Command(mode, 0.0, 0.0))
+    before_s = bench.enable(mode, Command(mode, 0.0, 0.0)).time_s
     for step in range(1, bench.cycles(RAMP_S + 2.0) + 1):
         share = min(1.0, step * bench.period_s / RAMP_S)
         if mode is Mode.TORQUE:
@@ -57,7 +57,8 @@ def probe_sign(bench: Bench, limits: MachineLimits, mode: Mode, speed_resolution
             raise
         recent.append(sample.speed_rad_s)
         mean_rad_s = sum(recent) / len(recent)
-        travel_rad += sample.speed_rad_s * bench.period_s
+        travel_rad += sample.speed_rad_s * (sample.time_s - before_s)
+        before_s = sample.time_s
         if mean_rad_s < -threshold_rad_s:
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
@@ -72,7 +73,9 @@ def probe_sign(bench: Bench, limits: MachineLimits, mode: Mode, speed_resolution
         if mode is Mode.TORQUE
         else f"the shaft did not follow a speed of {speed_rad_s:.3f} rad/s",
         where="sign probe",
-        next_step="Is the brake released? Else raise limits.probe_torque_nm in rig.yaml",
+        next_step="Is the brake released? Else raise limits.probe_torque_nm in rig.yaml"
+        if mode is Mode.TORQUE
+        else "Is the brake released, the drive's enable there, and its lowest speed below this one?",
     )
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from drivers.drive import Command, Mode, Sample
 from drivers.errors import DriveFault
 from tdhil.identify.rough import RoughInertia, rough_inertia
@@ -16,7 +18,7 @@ from tdhil.protocol.bench import Bench
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
 from tdhil.protocol.steady import SteadyLevel, steady_level, trace, wait_until_steady
-from tdhil.record.recording import Level, Ramp
+from tdhil.record.recording import FloatArray, Level, Ramp
 
 LEVEL_S = 6.0
 FIRST_RAMP_S = 8.0
@@ -26,6 +28,15 @@ GOOD_ENOUGH = 0.2
 """Relative uncertainty of the rough inertia that is good enough to plan with."""
 
 TRIES = 4
+
+
+@dataclass(frozen=True)
+class Course:
+    """Setpoint and reported speed of the ramp between the levels, with the calm at both ends, (N,) each."""
+
+    time_s: FloatArray
+    setpoint_rad_s: FloatArray
+    reported_rad_s: FloatArray
 
 
 @dataclass(frozen=True)
@@ -39,6 +50,7 @@ class SpeedResult:
     ramp: Ramp
     last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
     steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
+    course: Course | None = None       # how the drive followed the ramp
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -68,6 +80,7 @@ def run_speed(
     low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions)
     for _ in range(TRIES):
         between = _ramp(bench, low_rad_s, high_rad_s, rate)
+        ramped = len(between)
         high_samples = _settle_and_hold(bench, high_rad_s, tolerance_rad_s, assumptions, between)
         held = bench.cycles(LEVEL_S)
         low, high = steady_level(low_samples[-held:]), steady_level(high_samples[-held:])
@@ -103,7 +116,20 @@ def run_speed(
         Ramp(low.level.end_s, high.level.start_s),
         tuple(high_samples[-bench.cycles(0.5) :]),
         tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
+        _course(low_samples[-held:], between[:ramped], [*between[ramped:], *high_samples[-held:]], mean_speeds(limits)),
     )
+
+
+def _course(low: list[Sample], ramp: list[Sample], high: list[Sample], speeds_rad_s: tuple[float, float]) -> Course:
+    low_rad_s, high_rad_s = speeds_rad_s
+    setpoint = np.concatenate([
+        np.full(len(low), low_rad_s),
+        low_rad_s + (high_rad_s - low_rad_s) * np.arange(1, len(ramp) + 1) / len(ramp),
+        np.full(len(high), high_rad_s),
+    ])
+    rows = np.array([(one.time_s, one.speed_rad_s, one.fresh) for one in (*low, *ramp, *high)], dtype=np.float64)
+    fresh = rows[:, 2] > 0.0
+    return Course(rows[fresh, 0], setpoint[fresh], rows[fresh, 1])
 
 
 def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:

@@ -3,23 +3,34 @@
 1. Quick stop under the drive's speed control; where the profile says that a quick stop does not decelerate from
    torque mode, speed mode at zero first.
 2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer
-   than the largest plausible lag.
-3. With a drill string, bring trapped torque down under speed control (a later protocol).
-4. Only then disable, and confirm.
+   than the largest plausible lag. How long that takes depends on the torque limit and on what swings: as long as the
+   shaft keeps getting slower, it is waited for.
+3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`let_go`). Since a drive may
+   end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in speed mode,
+   at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at once, and is
+   then left holding what it holds: a wound-up string is not let go by disabling.
+4. Only then disable, and confirm: torque off by status word, and the shaft still at rest without it.
+
+What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been
+quiet for half a swing (`let_go.QUIET_S`); its motor does not follow, since its friction holds.
 
 A turning shaft is never disabled from here. If the drive can't be reached, its own watchdog must act, and that
-is what the report says.
+is what the report says. Nothing that is raised on the way, an interrupt included, skips any of it.
 """
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import StopNotConfirmed
 from tdhil.protocol.bench import Bench
+from tdhil.protocol.let_go import MEAN_S, LetGo, LetGoLimits
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
+from tdhil.protocol.stop_patience import Patience
 
 AT_REST_SHARE = 0.005
 """Standstill is a speed below this share of the speed limit, or three quanta if that is more."""
@@ -30,7 +41,17 @@ LONGEST_GAP_S = 0.2
 SILENT_S, SILENT_CYCLES = 1.0, 25
 """After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
 
+MODE_S = 0.5
+"""The drive may take so long to change to speed mode."""
+
+REST_AFTER_S = 10.0
+"""A shaft that begins to turn once its torque is off gets so long to come to rest by itself."""
+
+MOST_INTERRUPTIONS = 5
+"""The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
+
 _NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT, PowerState.NOT_READY)
+_REST = Command(Mode.SPEED, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -41,6 +62,7 @@ class StopReport:
     at_rest_s: float | None            # control time at which the shaft was seen at rest
     disabled: bool
     trouble: tuple[str, ...] = ()
+    trapped_nm: float = 0.0            # what a drill string held at standstill, before it was let go; signed
 
 
 class StopSequence:
@@ -53,92 +75,219 @@ class StopSequence:
         speed_resolution_rad_s: float,
         quick_stop_in_torque_mode: bool,
         assumptions: ControlAssumptions | None = None,
+        *,
+        torque_resolution_nm: float = 0.0,
+        torque_offset_nm: float = 0.0,
     ) -> None:
         assumptions = assumptions or ControlAssumptions()
         self._bench = bench
         self._limits = limits
         self._at_rest_rad_s = max(3.0 * speed_resolution_rad_s, AT_REST_SHARE * limits.speed_max_rad_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
+        # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
+        ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
+        self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
+        self._string = None
+        if limits.load == "string":
+            self._string = LetGoLimits(
+                torque_nm=limits.torque_nm,
+                speed_rad_s=limits.speed_max_rad_s,
+                ramp_nm_s=limits.torque_ramp_nm_s,
+                torque_resolution_nm=torque_resolution_nm,
+                torque_offset_nm=torque_offset_nm,
+            )
+        self._held: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
+        self._trapped_nm = 0.0
         self._trouble: list[str] = []
         self._silent = 0
         self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
+        self._running = False
         self._report: StopReport | None = None
 
     def run(self) -> StopReport:
         """Bring the shaft to rest and disable. Never raises; what went wrong is in the report."""
-        if self._report is None:
-            self._bench.guard.expected = None
-            at_rest_s = self._decelerate()
-            disabled = self._disable() if at_rest_s is not None else False
-            self._report = StopReport(at_rest_s is not None and disabled, at_rest_s, disabled, tuple(self._trouble))
-        return self._report
+        if self._running:
+            return StopReport(False, None, False, ("the stop sequence is under way already",))
+        self._running = True
+        for _ in range(MOST_INTERRUPTIONS):
+            if self._report is not None:
+                break
+            try:
+                self._report = self._sequence()
+            except BaseException as error:  # an interrupt must not end it either: from the beginning, then
+                self._note(error)
+        self._running = False
+        return self._report or StopReport(False, None, False, tuple(self._trouble))
+
+    def _sequence(self) -> StopReport:
+        self._bench.guard.expected = None
+        if self._string is not None and self._slow_down():
+            self._let_go(self._string)
+        at_rest_s = self._decelerate()
+        disabled = stays = False
+        if at_rest_s is not None and not self._wound_up():
+            disabled = self._disable()
+            stays = disabled and self._stays_at_rest()
+        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
+
+    # -- with a drill string -----------------------------------------------------------------------------------
+
+    def _slow_down(self) -> bool:
+        """Speed mode, ramped to zero: whether the drive followed, and so holds the shaft under speed control now."""
+        last = self._bench.last
+        speed = last.speed_rad_s if last is not None and math.isfinite(last.speed_rad_s) else 0.0
+        came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._bench.period_s
+        patience = Patience(self._enough_s, self._at_rest_rad_s)
+        since_s = 0.0
+        while not patience.over:
+            speed = math.copysign(max(0.0, abs(speed) - step), came_from)
+            sample = self._exchange(Command(Mode.SPEED, speed, 0.0))
+            since_s += self._bench.period_s
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    return False
+                patience.wait(self._bench.period_s)
+                continue
+            regulated = sample.mode is Mode.SPEED
+            if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S):
+                return False
+            patience.see(sample.speed_rad_s, self._bench.period_s)
+            if regulated and speed == 0.0 and sample.speed_rad_s * came_from <= self._at_rest_rad_s:
+                return True
+        self._trouble.append("the shaft did not follow speed mode to standstill; quick stop instead")
+        return False
+
+    def _let_go(self, string: LetGoLimits) -> None:
+        """Yield to what the string holds, until nothing is left or the bounds are reached."""
+        going = LetGo(string, self._at_rest_rad_s, self._bench.period_s)
+        command = _REST
+        while not (going.done or going.failed):
+            sample = self._exchange(command)
+            if sample is None:
+                command = _REST
+                if self._silent >= self._enough_silent:
+                    return
+                continue
+            if sample.state is not PowerState.ENABLED or sample.mode is not Mode.SPEED:
+                self._trouble.append(f"the drive shows '{sample.state.value}' while trapped torque is let go")
+                break
+            command = Command(Mode.SPEED, going.step(sample.torque_nm, sample.speed_rad_s), 0.0)
+        self._trapped_nm = going.trapped_nm
+        if going.failed:
+            self._trouble.append(
+                f"trapped torque did not come down: {going.trapped_nm:.0f} N·m at first, {going.torque_nm:.0f} N·m"
+                f" after {going.travel_rad:.1f} rad"
+            )
+
+    def _wound_up(self) -> bool:
+        """Does the drive hold a torque that disabling would let go at once?"""
+        last = self._bench.last
+        if self._string is None or not self._held or last is None or last.state in _NO_TORQUE:
+            return False
+        held_nm = math.fsum(self._held) / len(self._held) - self._string.torque_offset_nm
+        if abs(held_nm) <= 2.0 * self._string.residual_nm:
+            return False
+        self._trouble.append(
+            f"the drill string still holds {held_nm:.0f} N·m: the drive was not disabled and holds the shaft at rest"
+        )
+        return True
+
+    # -- with any load -----------------------------------------------------------------------------------------
 
     def _decelerate(self) -> float | None:
-        command = Command(Mode.SPEED, 0.0, 0.0)
         if not self._quick_stop_in_torque_mode:
-            for _ in range(self._bench.cycles(0.5)):
-                sample = self._exchange(command)
+            for _ in range(self._bench.cycles(MODE_S)):
+                sample = self._exchange(_REST)
                 if sample is not None and sample.mode is Mode.SPEED:
                     break
         asked = self._ask(self._bench.drive.quick_stop)
-        # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
-        slowest_s = 3.0 * self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2 + 2.0 * self._settle_s + 1.0
+        patience = Patience(self._enough_s, self._at_rest_rad_s)
         quiet_since_s: float | None = None
         heard_s = 0.0
-        for _ in range(self._bench.cycles(slowest_s)):
+        while not patience.over:
             asked = asked or self._ask(self._bench.drive.quick_stop)
-            sample = self._exchange(command)
+            sample = self._exchange(_REST)
             if sample is None:
                 if self._silent >= self._enough_silent:
+                    self._trouble.append("no feedback from the drive any more")
                     return None
+                patience.wait(self._bench.period_s)
                 continue
+            patience.see(sample.speed_rad_s, self._bench.period_s)
             # Single lost frames don't unsay what the others showed; a longer gap does.
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
-            if abs(sample.speed_rad_s) > self._at_rest_rad_s:
+            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
                 quiet_since_s = None
             elif quiet_since_s is None or unheard_s > LONGEST_GAP_S:
                 quiet_since_s = sample.time_s
             elif sample.time_s - quiet_since_s >= self._settle_s and (sample.standstill or sample.state in _NO_TORQUE):
                 return sample.time_s
-        self._trouble.append(f"the shaft was not seen at rest within {slowest_s:.1f} s of the quick stop")
+        self._trouble.append(f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop")
         return None
 
     def _disable(self) -> bool:
         asked = self._ask(self._bench.drive.disable)
-        command = Command(Mode.SPEED, 0.0, 0.0)
         for _ in range(self._bench.cycles(3.0)):
             asked = asked or self._ask(self._bench.drive.disable)
-            sample = self._exchange(command)
-            if sample is not None and sample.fresh and sample.state in (PowerState.OFF, PowerState.FAULT):
+            sample = self._exchange(_REST)
+            if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
             if self._silent >= self._enough_silent:
                 break
         self._trouble.append("the drive did not confirm that it is disabled")
         return False
 
+    def _stays_at_rest(self) -> bool:
+        """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
+        quiet_s, told = 0.0, False
+        for _ in range(self._bench.cycles(REST_AFTER_S)):
+            sample = self._exchange(_REST)
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    self._trouble.append("nothing was heard of the drive once it was disabled")
+                    return True
+                continue
+            quiet_s += self._bench.period_s
+            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
+                quiet_s = 0.0
+                if not told:
+                    told = True
+                    self._trouble.append(
+                        f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
+                        " is something wound up, or hanging on it?"
+                    )
+            elif quiet_s >= self._settle_s:
+                return True
+        return False
+
     def _ask(self, request: Callable[[], None]) -> bool:
         """Whether the drive took a request; one that fails is made again in the next cycle."""
         try:
             request()
-        except Exception as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # whatever it is, the stop goes on
             self._note(error)
             return False
         return True
 
-    def _note(self, error: Exception) -> None:
+    def _note(self, error: BaseException) -> None:
         if len(self._trouble) < 20:
-            self._trouble.append(str(error))
+            self._trouble.append(str(error) or type(error).__name__)
 
     def _exchange(self, command: Command) -> Sample | None:
         try:
             sample = self._bench.stop_cycle(command)
-        except Exception as error:  # whatever it is, the stop goes on
+        except BaseException as error:  # whatever it is, the stop goes on
             self._silent += 1
             self._note(error)
             return None
-        self._silent = 0 if sample.fresh else self._silent + 1
-        return sample if sample.fresh else None
+        if not sample.fresh:
+            self._silent += 1
+            return None
+        self._silent = 0
+        self._bench.last = sample
+        self._held.append(sample.torque_nm)
+        return sample
 
 
 def not_confirmed(report: StopReport) -> StopNotConfirmed:

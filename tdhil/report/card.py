@@ -55,6 +55,9 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
         rows.add_row("the paper's method", _paper_text(paper, inertia))
+    for stage in document.get("stages", ()):
+        if stage["outcome"] == "skipped":
+            rows.add_row(f"stage {stage['name']}", f"skipped: {stage.get('detail', '')}")
     rows.add_row("model", document["model"])
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:

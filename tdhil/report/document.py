@@ -50,6 +50,7 @@ def result_document(
         "complete": recording.complete,
         "log": log,
         "cycles": run.get("counters"),
+        "cycle": run.get("cycle"),
         "stages": [
             {"name": stage.name, "outcome": stage.outcome, "duration_s": stage.end_s - stage.start_s}
             | ({"detail": stage.detail} if stage.detail else {})

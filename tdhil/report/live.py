@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from rich.console import Console, Group, RenderableType
@@ -16,6 +18,7 @@ from drivers.drive import Command, Outcome, Preflight, Sample
 from tdhil.record.recording import Stage
 from tdhil.report.document import SIMULATED
 from tdhil.report.numbers import minutes
+from tdhil.report.painter import Painter
 
 
 class PlannedMotion(Protocol):
@@ -46,59 +49,87 @@ class PlannedMotion(Protocol):
 _EXPECTED_S = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
 _MARKS = {"ok": "[green]✓[/]", "degraded": "[yellow]~[/]", "aborted": "[red]✗[/]", "skipped": "[dim]-[/]"}
 _REFRESH_S = 0.2
+_LONGEST_FLUSH_S = 2.0
+_SWITCH_S = 0.0005
+
+
+@dataclass(frozen=True)
+class View:
+    """What there is to show at one moment; never changed, only replaced."""
+
+    expected_s: Mapping[str, float]
+    ended: Mapping[str, Stage] = field(default_factory=dict)
+    current: str | None = None
+    elapsed_s: float = 0.0             # of the current stage, control time
+    last: tuple[Command, Sample] | None = None
+    simulated: bool = False
+    taken: bool = False                # the terminal, by a cycle since the last pause
+    end: str = ""
 
 
 class LiveDisplay:
-    """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle."""
+    """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle.
+
+    Nothing here writes: a thread does (`painter`), from a view that no longer changes once it is handed over.
+    """
 
     def __init__(self, console: Console, show_preflight: bool) -> None:
         self._console = console
         self._show_preflight = show_preflight
-        self._simulated = False
-        self._expected_s = dict(_EXPECTED_S)
-        self._ended: dict[str, Stage] = {}
-        self._current: str | None = None
+        self._painter = Painter()
+        self._view = View(expected_s=dict(_EXPECTED_S))
         self._started_s: float | None = None
-        self._last: tuple[Command, Sample] | None = None
         self._next_s = 0.0
-        self._live: Live | None = None
-        self._end = ""
+        self._live: Live | None = None         # the painter's own
+        self._usual_s = sys.getswitchinterval()
 
     def __enter__(self) -> LiveDisplay:
+        # The control loop must get the interpreter back soon while a picture is being drawn.
+        self._usual_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._usual_s, _SWITCH_S))
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.pause()
+        sys.setswitchinterval(self._usual_s)
 
     def pause(self) -> None:
-        """Leave the terminal to somebody else (a prompt); the next stage or cycle takes it back."""
-        if self._live is not None:
-            self._live.update(self._picture(), refresh=True)
-            self._live.stop()
-            self._live = None
+        """Leave the terminal to somebody else (a prompt); the next stage or cycle takes it back.
+
+        Waits until all is written, but not for ever.
+        """
+        view = self._view = replace(self._view, taken=False)
+        self._painter.line(lambda: self._let_go(view))
+        self._painter.flush(_LONGEST_FLUSH_S)
+
+    def say(self, text: str) -> None:
+        """One line."""
+        self._print(text, style="dim")
 
     def preflight(self, preflight: Preflight) -> None:
         """The preflight table, on a real peer or where something was refused."""
-        self._simulated = preflight.identity.simulated
+        self._view = replace(self._view, simulated=preflight.identity.simulated)
         if self._show_preflight or preflight.refused or not preflight.identity.simulated:
-            self.pause()
-            self._console.print(preflight_table(preflight))
+            view = self._view
+            self._painter.line(lambda: self._let_go(view))
+            self._painter.line(lambda: self._console.print(preflight_table(preflight)))
 
     def stage_started(self, name: str, expected_s: float) -> None:
-        self._current = name
-        self._expected_s[name] = expected_s
+        self._view = replace(
+            self._view, current=name, expected_s={**self._view.expected_s, name: expected_s}, elapsed_s=0.0
+        )
         self._started_s = None
         if not self._console.is_terminal:
-            self._console.print(f"{self._prefix()}stage {name} …", highlight=False)
+            self._print(f"{self._prefix()}stage {name} …")
 
     def planned(self, plan: PlannedMotion) -> None:
         """The plan of stage 5, as soon as there is one."""
-        self._expected_s["acquire"] = plan.duration_s + 5.0
+        self._view = replace(self._view, expected_s={**self._view.expected_s, "acquire": plan.duration_s + 5.0})
         text = (
             f"plan: {plan.kind} in {plan.mode} mode, {minutes(plan.duration_s)}, speed {plan.speed_min_rad_s:.2f} to "
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m"
         )
-        (self._live.console if self._live else self._console).print(self._prefix() + text, style="dim", highlight=False)
+        self._print(self._prefix() + text, style="dim")
 
     def cycle(self, command: Command, sample: Sample) -> None:
         """Called in every cycle."""
@@ -108,70 +139,93 @@ class LiveDisplay:
         self._next_s = now_s + _REFRESH_S
         if self._started_s is None:
             self._started_s = sample.time_s
-        self._last = (command, sample)
-        if self._console.is_terminal:
-            if self._live is None:
-                self._live = Live(console=self._console, auto_refresh=False, transient=False)
-                self._live.start()
-            self._live.update(self._picture(), refresh=True)
+        elapsed_s = sample.time_s - self._started_s
+        self._view = replace(self._view, last=(command, sample), elapsed_s=elapsed_s, taken=True)
+        self._show()
 
     def stage_ended(self, stage: Stage) -> None:
-        self._ended[stage.name] = stage
+        self._view = replace(self._view, ended={**self._view.ended, stage.name: stage})
         if not self._console.is_terminal:
             detail = f": {stage.detail}" if stage.detail else ""
             took = minutes(stage.end_s - stage.start_s)
-            self._console.print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}", highlight=False)
-        elif self._live is not None:
-            self._live.update(self._picture(), refresh=True)
+            self._print(f"{self._prefix()}stage {stage.name} {stage.outcome}, {took}{detail}")
+        else:
+            self._show()
 
     def stopped(self, confirmed: bool) -> None:
         """The stop sequence has ended."""
-        self._end = "shaft at rest, drive disabled" if confirmed else "STOP NOT CONFIRMED"
-        if self._live is not None:
-            self._live.update(self._picture(), refresh=True)
-        elif not self._console.is_terminal:
-            self._console.print(f"{self._prefix()}{self._end}", highlight=False)
+        end = "shaft at rest, drive disabled" if confirmed else "STOP NOT CONFIRMED"
+        self._view = replace(self._view, end=end)
+        if not self._console.is_terminal:
+            self._print(f"{self._prefix()}{end}")
+        else:
+            self._show()
 
     def _prefix(self) -> str:
-        return f"{SIMULATED} " if self._simulated else ""
+        return f"{SIMULATED} " if self._view.simulated else ""
 
-    def _picture(self) -> RenderableType:
-        table = Table.grid(padding=(0, 1))
-        table.add_column(width=1)
-        table.add_column(width=8)
-        table.add_column(width=34)
-        table.add_column()
-        left_s = 0.0
-        for name, expected_s in self._expected_s.items():
-            stage = self._ended.get(name)
-            if stage is not None:
-                took = minutes(stage.end_s - stage.start_s)
-                note = stage.outcome if stage.outcome != "ok" else ""
-                table.add_row(_MARKS.get(stage.outcome, " "), name, note, f"[dim]{took}[/]")
-            elif name == self._current:
-                done_s = self._elapsed_s()
-                left_s += max(0.0, expected_s - done_s)
-                bar = ProgressBar(total=max(expected_s, 0.1), completed=min(done_s, expected_s), width=32)
-                table.add_row("[cyan]▸[/]", f"[bold]{name}[/]", bar, minutes(done_s))
-            else:
-                left_s += expected_s
-                table.add_row(" ", f"[dim]{name}[/]", "", "")
-        parts: list[RenderableType] = [table]
-        if self._last is not None:
-            command, sample = self._last
-            text = self._end or (
-                f"{sample.speed_rad_s:7.3f} rad/s  {sample.torque_nm:8.1f} N·m  {sample.state.value}, "
-                f"{command.mode.value} mode  {minutes(left_s)} left"
+    def _print(self, text: str, style: str | None = None) -> None:
+        def job() -> None:
+            (self._live.console if self._live else self._console).print(
+                text, style=style, highlight=False, markup=False
             )
-            parts.append(Text(text, no_wrap=True, overflow="ellipsis"))
-        if self._simulated:
-            parts.insert(0, Text(f"{SIMULATED} drive and rig: nothing real turns", style="magenta"))
-        return Group(*parts)
 
-    def _elapsed_s(self) -> float:
-        if self._last is None or self._started_s is None:
-            return 0.0
-        return self._last[1].time_s - self._started_s
+        self._painter.line(job)
+
+    def _show(self) -> None:
+        if self._console.is_terminal:
+            view = self._view
+            self._painter.picture(lambda: self._draw(view))
+
+    # -- in the painter's thread ------------------------------------------------------------------------------
+
+    def _draw(self, view: View) -> None:
+        if self._live is None and view.taken:
+            self._live = Live(console=self._console, auto_refresh=False, transient=False)
+            self._live.start()
+        if self._live is not None:
+            self._live.update(picture(view), refresh=True)
+
+    def _let_go(self, view: View) -> None:
+        if self._live is not None:
+            self._live.update(picture(view), refresh=True)
+            self._live.stop()
+            self._live = None
+
+
+def picture(view: View) -> RenderableType:
+    """Stages, bars, speed and torque."""
+    table = Table.grid(padding=(0, 1))
+    table.add_column(width=1)
+    table.add_column(width=8)
+    table.add_column(width=34)
+    table.add_column()
+    left_s = 0.0
+    for name, expected_s in view.expected_s.items():
+        stage = view.ended.get(name)
+        if stage is not None:
+            took = minutes(stage.end_s - stage.start_s)
+            note = stage.outcome if stage.outcome != "ok" else ""
+            table.add_row(_MARKS.get(stage.outcome, " "), name, note, f"[dim]{took}[/]")
+        elif name == view.current:
+            done_s = view.elapsed_s
+            left_s += max(0.0, expected_s - done_s)
+            bar = ProgressBar(total=max(expected_s, 0.1), completed=min(done_s, expected_s), width=32)
+            table.add_row("[cyan]▸[/]", f"[bold]{name}[/]", bar, minutes(done_s))
+        else:
+            left_s += expected_s
+            table.add_row(" ", f"[dim]{name}[/]", "", "")
+    parts: list[RenderableType] = [table]
+    if view.last is not None:
+        command, sample = view.last
+        text = view.end or (
+            f"{sample.speed_rad_s:7.3f} rad/s  {sample.torque_nm:8.1f} N·m  {sample.state.value}, "
+            f"{command.mode.value} mode  {minutes(left_s)} left"
+        )
+        parts.append(Text(text, no_wrap=True, overflow="ellipsis"))
+    if view.simulated:
+        parts.insert(0, Text(f"{SIMULATED} drive and rig: nothing real turns", style="magenta"))
+    return Group(*parts)
 
 
 def preflight_table(preflight: Preflight) -> Table:

@@ -18,6 +18,7 @@ from tdhil.rig import Rig, load_rig, require_limits
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "rig.yaml"
+MODBUS = ROOT / "examples" / "rig_modbus.yaml"
 PLANT = ROOT / "examples" / "plant.yaml"
 
 
@@ -47,8 +48,26 @@ def test_rig_example_is_a_bench_that_may_move():
     assert rig.run.yes is None
 
 
-def test_rig_example_shows_every_key_but_those_for_trying_things_out():
-    text = EXAMPLE.read_text(encoding="utf-8")
+def test_modbus_example_is_a_bench_that_may_move():
+    rig = load_rig(MODBUS)
+    require_limits(rig)
+    assert (rig.drive, rig.modbus.host, rig.modbus.serial) == ("modbus", "192.0.2.10", None)
+
+
+def test_modbus_example_is_valid_on_a_serial_line_too(tmp_path):
+    text = MODBUS.read_text(encoding="utf-8")
+    text = re.sub(r"^# (serial|baud|parity|stop_bits|parameters):", r"  \1:", text, flags=re.MULTILINE)
+    text = re.sub(r"^# (accept_unverified):", r"\1:", text, flags=re.MULTILINE)
+    path = tmp_path / "rig.yaml"
+    path.write_text(re.sub(r"^  (host|port):.*\n", "", text, flags=re.MULTILINE), encoding="utf-8")
+    rig = load_rig(path)
+    assert (rig.modbus.serial, rig.modbus.baud, rig.modbus.parity) == ("/dev/ttyUSB0", 115200, "E")
+    assert rig.accept_unverified == ("watchdog",)
+    assert rig.drive_data.parameters == {"speed_scaling": 1500}
+
+
+def test_the_examples_show_every_key_but_those_for_trying_things_out():
+    text = EXAMPLE.read_text(encoding="utf-8") + MODBUS.read_text(encoding="utf-8")
     missing = {key for key in keys(Rig) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
                        "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped", "run.yes",

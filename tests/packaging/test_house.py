@@ -33,7 +33,7 @@ def test_import_contracts_hold():
 def test_help_lists_the_commands():
     done = run("-m", "tdhil", "--help")
     assert done.returncode == 0
-    assert {"identify", "replay", "simulate"} <= set(done.stdout.split())
+    assert {"identify", "replay", "profiles", "scan", "doctor", "simulate"} <= set(done.stdout.split())
     assert "no emergency stop" in " ".join(done.stdout.split())
 
 
@@ -50,7 +50,7 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.splitlines()[-1].split() == ["loaded:"]
 
 
-@pytest.mark.parametrize("command", ["identify", "replay", "simulate"])
+@pytest.mark.parametrize("command", ["identify", "replay", "profiles", "scan", "doctor", "simulate"])
 def test_help_of_a_command_comes_quickly(command):
     done = run("-X", "importtime", "-m", "tdhil", command, "--help")
     assert done.returncode == 0

@@ -90,7 +90,14 @@ def test_an_older_log_is_kept(tmp_path):
         (("--amplitude", "inf"), "--amplitude"),
         (("--confidence", "95"), "--confidence"),
         (("--real-time", "--stepped"), "exclude"),
-        (("--drive", "modbus"), "--drive"),
+        (("--drive", "profibus"), "--drive"),
+        (("--drive", "modbus", "-i", "virtual"), "--interface: belongs to CANopen"),
+        (("--drive", "canopen", "--host", "192.0.2.10"), "--host: belongs to Modbus"),
+        (("--drive", "modbus", "--profile", "generic/cia402"), "--drive says modbus"),
+        (("--serial", "/dev/ttyUSB0", "--unit", "300"), "--unit"),
+        (("--serial", "/dev/ttyUSB0", "--parity", "X"), "--parity"),
+        (("--host", "192.0.2.10", "--stepped"), "--stepped"),
+        (("--accept-unverified", "wachdog"), "did you mean 'watchdog'?"),
         (("--rig", "no-rig.yaml"), "no-rig.yaml"),
         (("--plant", "no-plant.yaml"), "no-plant.yaml"),
         (("-i", "nosuch"), "nosuch"),
@@ -297,7 +304,7 @@ def test_help_is_quick_because_it_loads_nothing(tmp_path):
 
 
 def test_every_command_has_its_help():
-    for command in ("identify", "replay", "simulate"):
+    for command in ("identify", "replay", "profiles", "scan", "doctor", "simulate"):
         done = tdhil(command, "--help")
         assert done.code == 0
         assert done.out.startswith("usage: tdhil")

@@ -13,8 +13,10 @@ import pytest
 from path_runs import REAL, Terminal, host, identify, peer, tail_time, wait_for
 
 WATCHDOG_S = 2.0
+ACCEPTED = "accept_unverified: [likely]\n"
 RIG = f"""\
 rate_hz: 20
+{ACCEPTED}\
 limits:
   speed_min_rad_s: 0.5
   speed_max_rad_s: 10.0
@@ -84,6 +86,23 @@ def test_a_rig_without_limits_is_refused(tmp_path, drive):
     assert_untouched(drive)
 
 
+def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
+    rig.write_text(RIG.replace(ACCEPTED, ""))
+    done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
+    assert done.code == 4
+    assert done.document["error"]["kind"] == "PreflightRefused"
+    for said in ("5 entries", "speed (likely): CiA 402-2, 606Ch", "watchdog (likely)", "profiles show generic/cia402",
+                 "--accept-unverified likely", "nothing has moved"):
+        assert said in done.err
+    partly = identify(tmp_path, *drive.options, "--rig", rig, "--yes", "--accept-unverified", "speed",
+                      "--accept-unverified", "watchdog")
+    assert partly.code == 4
+    assert "3 entries" in partly.err
+    assert "speed (likely)" not in partly.err
+    shaft = assert_untouched(drive)
+    assert not shaft.events("heartbeat supervision began")
+
+
 def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
     with host(tmp_path, *drive.options, "--rig", rig) as running:
         done = running.finish()
@@ -92,6 +111,8 @@ def test_without_a_terminal_and_without_yes_it_is_refused(tmp_path, drive, rig):
     assert "--yes" in done.err
     assert "preflight" in done.err                    # the table was shown
     assert "This run will move" in done.err
+    assert "although nobody verified it" in done.err
+    assert "torque (likely): CiA 402-2" in done.err
     assert "SIMULATED" not in done.err
     assert_untouched(drive)
 

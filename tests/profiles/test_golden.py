@@ -23,7 +23,7 @@ from drivers.modbus.parameters import Parameters, find_filters
 from drivers.modbus.plan import plan_cycle
 from drivers.modbus.scales import find_scales, settle
 from drivers.modbus.states import Wish, controlword_towards, decode, seen
-from drivers.modbus.table import Table
+from drivers.table import Table
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.parameters import reporting_lag_s

@@ -181,10 +181,11 @@ class FakeLog:
     def failure(self, time_s: float, error: BaseException) -> None:
         self.failures.append(error)
 
-    def stage(self, stage) -> None:
+    def stage(self, stage):
         if self.on_stage is not None:
             self.on_stage(stage.name)
         self.stages.append(stage)
+        return stage
 
     def motion(self, excitation, levels=(), ramps=()) -> None:
         self.motions.append((excitation, levels, ramps))

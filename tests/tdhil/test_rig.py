@@ -56,6 +56,8 @@ run:
   trace: shaft.csv
   max_time_s: 300
   model: two-mass
+accept_unverified: [watchdog, likely]
+modbus: {host: 192.0.2.10, port: 5020, unit: 7}
 """
 
 
@@ -108,6 +110,12 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("allow_reverse: false", "allow_reverse: off", 19, "write false"),
         ("ratio: 10.5", "ratio: 0", 15, "greater than 0"),
         ("confidence: 0.99", "confidence: 95", 34, "less than 1"),
+        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 46, "a list"),
+        ("unit: 7}", "unit: 256}", 47, "at most 255"),
+        ("unit: 7}", "serial: /dev/ttyUSB0}", 47, "exclude each other"),
+        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 47, "1 to 247 on a serial line"),
+        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 47, "'N', 'E' or 'O'"),
+        ("  speed_lag_s: 0.4\n", "  speed_lag_s: 0.4\n  parameters: {speed_scaling: fast}\n", 24, "a number"),
     ],
 )
 def test_what_is_refused(tmp_path: Path, old: str, new: str, line: int, words: str) -> None:
@@ -159,6 +167,15 @@ def test_command_line_before_rig_before_default(tmp_path: Path) -> None:
 def test_every_option_can_stand_in_the_rig(tmp_path: Path) -> None:
     found = resolve({}, rig_of(tmp_path, FULL))
     assert all(found.source(option.name).startswith("rig.yaml:") for option in OPTIONS)
+
+
+def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
+    rig = rig_of(tmp_path, "accept_unverified: [watchdog, likely]\n")
+    found = resolve({"accept_unverified": ["speed", "watchdog"]}, rig)
+    assert found["accept_unverified"] == ("speed", "watchdog", "likely")
+    assert found.source("accept_unverified") == "--accept-unverified and rig.yaml:1"
+    assert ("accept_unverified", "speed, watchdog, likely", "--accept-unverified and rig.yaml:1") in list(found.rows())
+    assert resolve({}, None)["accept_unverified"] == ()
 
 
 def test_files_named_in_the_rig_lie_beside_it(tmp_path: Path) -> None:

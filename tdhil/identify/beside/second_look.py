@@ -15,16 +15,16 @@ from tdhil.record.recording import Recording
 
 
 def with_second_look(
-    found: Identification, recording: Recording, samples: Samples, levels: Levels, options: Options
+    found: Identification, recording: Recording, samples: Samples, levels: Levels | None, options: Options
 ) -> Identification:
     """The same result with what else the run says. Not for data that were refused as such: a second opinion would be
-    a number out of them. Never raises.
+    a number out of them. ``levels``: of the excited segments; without any there is no friction curve. Never raises.
     """
     opinions = second_opinions(recording, samples, levels, found, options)
     points = found.friction_curve
     warnings = (*found.warnings, *disagreements(opinions, found))
     inertia = _inertia(found, opinions, options.confidence)
-    if inertia is not None:
+    if inertia is not None and levels is not None:
         curve = friction_curve(
             recording, samples, levels, Inertia(*inertia, delay=known_delay(recording, found)), options
         )

@@ -37,6 +37,7 @@ _LEAST_BINS = 8
 _ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
 _LEAST_LAG_S = 1e-3
 _ABOUT_AS_WELL = 9.0     # of −2 ln L
+_UNSEEN = 0.1            # standard deviations that friction as large as the whole torque would show: it is not seen
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
         _, leverage = covariance(problem, fit.theta, free)
         taken = np.zeros(len(bins))
         taken[keep] = leverage
-        found = evaluate(fit.theta, bins)
+        found = evaluate(_levelled(every, fit.theta, _unseen_levels(problem, fit.theta)), bins)
         every = replace(every, variance=noise.from_residuals(bins, found.error, taken).variance)
         explained, _ = noise.smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy)
         stands = explained * bins.energy > _CLEAR * every.variance
@@ -75,7 +76,32 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
         keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands]))
         problem = _part(every, keep)
         fit = minimise(problem, fit.theta)
+    if unseen := _unseen_levels(problem, fit.theta):
+        problem = replace(problem, free=tuple(index for index in problem.free if index not in unseen))
+        fit = minimise(problem, _levelled(every, fit.theta, unseen))
     return Found(problem, fit, clear)
+
+
+def _unseen_levels(problem: Problem, theta: FloatArray) -> tuple[int, ...]:
+    """A constant friction shows at frequency zero and next to it alone; without those bins its value is anything.
+
+    What is then left of it in the others is the arithmetic's, and following it would leave everything open.
+    """
+    _, slopes = problem.stacked(theta)
+    weight = np.linalg.norm(slopes, axis=0) * problem.box.scale
+    return tuple(index for index in (FORWARD, BACK) if index in problem.free and weight[index] < _UNSEEN)
+
+
+def _levelled(every: Problem, theta: FloatArray, unseen: tuple[int, ...]) -> FloatArray:
+    """The same with the levels that no chosen bin sees as frequency zero has them, all else given."""
+    if not unseen:
+        return theta
+    still = every.bins.chosen(every.bins.hertz == 0.0)
+    found = theta.copy()
+    found[list(unseen)] = 0.0
+    at = evaluate(found, still)
+    found[list(unseen)] = np.linalg.lstsq(-at.slopes[:, list(unseen)].real, at.error.real, rcond=None)[0]
+    return found
 
 
 def _plain(problem: Problem, fit: Fit) -> FloatArray:

@@ -36,7 +36,7 @@ def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) ->
     if nu < 2.0:
         return math.inf
     amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
-    seen = amplitudes / np.abs(1.0 + s * theta[RIGID.at(reports.SPEED_LAG)])
+    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(reports.SPEED_LAG)]))
     weight = 2.0 * (counts @ seen**2) / variance * (nu - 1.0) / nu
     fisher = np.einsum("k,ki,kj->ij", weight, columns.conj(), columns).real
     fisher[VISCOUS, VISCOUS] += _tie(plan, counts * period, float(noise.error_density(np.zeros(1), theta)[0]))

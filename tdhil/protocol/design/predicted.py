@@ -27,7 +27,7 @@ def predicted(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> E
     nu = float(np.sum(counts - 1.0))
     variance = 4.0 * noise.error_density(hertz, theta) / reference.period_s
     amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
-    seen = amplitudes / (1.0 + s * theta[RIGID.at(SPEED_LAG)])
+    seen = amplitudes / (1.0 + s * theta[RIGID.at(SPEED_LAG)]) * plan.followed(hertz)
     in_speed = plan.mode == "torque"
     lines = []
     for k, line_hz in enumerate(reference.lines_hz):

@@ -78,6 +78,10 @@ class _Room:
         self._speed = amplitudes.astype(np.complex128)
         self._ahead = amplitudes * (1.0 + 1j * omega * foresight)
         self._torque = amplitudes * (guess.viscous_nm_s_rad + 1j * omega * guess.inertia_kg_m2)
+        self._both_ends = mode == "speed" and guess.following is not None
+        if self._both_ends and guess.following is not None:     # what the shaft makes of the setpoint
+            gains = guess.following.shaft(proposal.lowest_hz * harmonics)
+            self._ahead, self._torque = amplitudes * gains, self._torque * gains
         steady = max(guess.steady_torque_nm(limits.usable_low_rad_s), guess.steady_torque_nm(limits.usable_high_rad_s))
         self._speed_room = (limits.usable_high_rad_s - limits.usable_low_rad_s) / guess.speed_swing_factor(mode)
         self._torque_room = max(limits.usable_torque_nm - steady, 1e-9) / guess.torque_swing_factor(mode)
@@ -88,6 +92,7 @@ class _Room:
         speed, ahead, torque = (
             (self._turns @ (weights[:, None] * turned)).real for weights in (self._speed, self._ahead, self._torque)
         )
-        span = np.maximum(ahead.max(axis=0), speed.max(axis=0)) - speed.min(axis=0)
+        lowest = np.minimum(ahead.min(axis=0), speed.min(axis=0)) if self._both_ends else speed.min(axis=0)
+        span = np.maximum(ahead.max(axis=0), speed.max(axis=0)) - lowest
         room: FloatArray = np.minimum(self._speed_room / span, self._torque_room / np.abs(torque).max(axis=0))
         return room

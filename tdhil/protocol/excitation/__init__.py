@@ -1,15 +1,26 @@
 """What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
 
+from tdhil.protocol.excitation.following import Following, fit_following, held_back_to
 from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, PlanRefused, RigGuess
 from tdhil.protocol.excitation.periodic import PeriodicReference
-from tdhil.protocol.excitation.plan import LEAST_COUNTED, ExcitationWish, Plan, PlannedSegment, make_plan
+from tdhil.protocol.excitation.plan import (
+    LEAST_COUNTED,
+    ExcitationKind,
+    ExcitationWish,
+    Plan,
+    PlannedSegment,
+    make_plan,
+)
 from tdhil.protocol.excitation.shape import Shape
+from tdhil.protocol.excitation.swing import SwingKind, SwingPlan, make_swings
 from tdhil.protocol.excitation.transition import Transition, make_transition
 
 __all__ = [
     "LEAST_COUNTED",
     "DriveMode",
+    "ExcitationKind",
     "ExcitationWish",
+    "Following",
     "MachineLimits",
     "PeriodicReference",
     "Plan",
@@ -17,7 +28,12 @@ __all__ = [
     "PlannedSegment",
     "RigGuess",
     "Shape",
+    "SwingKind",
+    "SwingPlan",
     "Transition",
+    "fit_following",
+    "held_back_to",
     "make_plan",
+    "make_swings",
     "make_transition",
 ]

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from tdhil.protocol.excitation.following import Following
+
 DriveMode = Literal["torque", "speed"]
 
 TORQUE_RESERVE = 0.15   # share of the torque limit that a plan leaves to the speed control
@@ -19,13 +21,15 @@ class MachineLimits:
     """The window that the shaft must not leave, rad/s, and the greatest torque either way, N·m.
 
     ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
-    what is reported is old; the plan must keep that free too.
+    what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
+    lets through, where it was seen to hold the shaft back (speed mode only).
     """
 
     speed_low_rad_s: float
     speed_high_rad_s: float
     torque_limit_nm: float
     foresight_s: float = 0.0
+    acceleration_rad_s2: float = math.inf
 
     def __post_init__(self) -> None:
         values = (self.speed_low_rad_s, self.speed_high_rad_s, self.torque_limit_nm)
@@ -60,12 +64,14 @@ class RigGuess:
     """A rough rig: T = inertia·dω/dt + viscous·ω + coulomb, forward rotation.
 
     ``inertia_rel_error`` is how wrong the inertia may be (0.2 = a fifth either way); the plan keeps room for it.
+    ``following``: how the shaft follows a speed setpoint, where that was seen.
     """
 
     inertia_kg_m2: float
     viscous_nm_s_rad: float = 0.0
     coulomb_nm: float = 0.0
     inertia_rel_error: float = 0.2
+    following: Following | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.inertia_kg_m2) and self.inertia_kg_m2 > 0.0):

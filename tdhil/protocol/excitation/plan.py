@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tdhil.protocol.excitation import multisine, sine, step
 from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, PlanRefused, RigGuess
@@ -17,6 +18,7 @@ ExcitationKind = Literal["multisine", "sine", "step"]
 
 _OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
 LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
+RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
 _SETTLE_S = 10.0         # at least this long before the first period that counts
 _SINGLE_TONE_S = 100.0   # shortest useful measurement of one tone
 
@@ -109,6 +111,13 @@ class Plan:
         )
         return between + sum(segment.duration_s for segment in self.segments)
 
+    def followed(self, hertz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """How much of a line of the reference the shaft makes, (K,): all, but for a drive's own speed control."""
+        following = self.guess.following
+        if self.mode != "speed" or following is None:
+            return np.ones(len(hertz), dtype=np.complex128)
+        return following.shaft(hertz)
+
     def with_counted(self, periods: int) -> "Plan":
         """The same motion with so many periods that count at each mean speed, settling on top."""
         segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
@@ -159,15 +168,25 @@ class _Fit:
 
     @classmethod
     def of(cls, shape: Shape, period_s: float, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
+        following = guess.following if mode == "speed" else None
+        moved = shape if following is None else shape.followed(period_s, following)
         speed = shape.deviation()
         ahead = shape.foreseen_deviation(period_s, limits.foresight_s if mode == "torque" else 0.0)
-        torque = shape.torque_deviation(period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
-        peaks = (float(np.max(speed)), float(-np.min(speed)), float(np.max(torque)), float(-np.min(torque)))
+        torque = moved.torque_deviation(period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
+        both = np.concatenate([speed, moved.deviation()])
+        peaks = (float(np.max(both)), float(-np.min(both)), float(np.max(torque)), float(-np.min(torque)))
         return cls(shape, period_s, limits, guess, mode, *peaks, foreseen=max(peaks[0], float(np.max(ahead))))
 
     @property
     def swing(self) -> float:
         return self.guess.speed_swing_factor(self.mode)
+
+    @property
+    def ramp_room(self) -> float:
+        """The greatest amplitude that the drive's own speed ramp lets through."""
+        if self.mode == "torque" or math.isinf(self.limits.acceleration_rad_s2):
+            return math.inf
+        return RAMP_SHARE * self.limits.acceleration_rad_s2 / float(np.max(np.abs(self.shape.steepness(self.period_s))))
 
     def largest_at(self, offset_rad_s: float) -> tuple[float, str]:
         """The greatest amplitude that fits about a mean speed, and the limit that sets it."""
@@ -180,6 +199,7 @@ class _Fit:
             ((usable - steady) / (self.torque_up * torque_factor), "torque limit"),
             ((usable + steady) / (self.torque_down * torque_factor), "torque limit"),
         ]
+        candidates.append((self.ramp_room, f"the drive's speed ramp ({self.limits.acceleration_rad_s2:.3g} rad/s²)"))
         return min(candidates, key=lambda candidate: candidate[0])
 
     def segment(self, offset_rad_s: float, amplitude_rad_s: float, periods: int, settle: int) -> PlannedSegment:
@@ -268,7 +288,7 @@ def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
             f"torque limit: steady friction leaves nothing of the {fit.limits.usable_torque_nm:g} N·m "
             "that a plan may use"
         )
-    amplitude = min(amplitude, torque_room / torque_swing)
+    amplitude = min(amplitude, torque_room / torque_swing, fit.ramp_room)
     if wish.amplitude_rad_s is not None:
         amplitude = min(amplitude, wish.amplitude_rad_s) if wish.amplitude_rad_s > 0.0 else amplitude
     first = low + amplitude * fit.down * fit.swing

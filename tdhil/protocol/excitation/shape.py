@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.protocol.excitation.following import Following
+
 _GRID = 1024
 
 
@@ -32,6 +34,19 @@ class Shape:
         """(1024,) torque over one period, N·m per rad/s of peak speed: Re Σ (J jω_k + B) a_k e^(j(ω_k t + φ_k))."""
         omega = 2.0 * np.pi * np.asarray(self.harmonics, dtype=np.float64) / period_s
         return self._wave((viscous_nm_s_rad + 1j * omega * inertia_kg_m2) * np.asarray(self.amplitudes), 0.0)
+
+    def followed(self, period_s: float, following: Following) -> "Shape":
+        """What the shaft makes of it, as a setpoint under the drive's speed control."""
+        gains = following.shaft(np.asarray(self.harmonics, dtype=np.float64) / period_s)
+        return Shape(
+            self.harmonics,
+            tuple(float(a) for a in np.asarray(self.amplitudes) * np.abs(gains)),
+            tuple(float(phase) for phase in np.asarray(self.phases_rad) + np.angle(gains)),
+        )
+
+    def steepness(self, period_s: float) -> NDArray[np.float64]:
+        """(1024,) acceleration over one period, 1/s: rad/s² per rad/s of peak speed."""
+        return self.torque_deviation(period_s, 1.0, 0.0)
 
     def shifted(self, share: float) -> "Shape":
         """The same motion begun ``share`` of a period later."""

@@ -48,4 +48,6 @@ def make_transition(
             f"torque limit: friction takes {friction:g} N·m of the {limits.usable_torque_nm:g} N·m that a plan may use"
         )
     needed = math.pi * abs(to_rad_s - from_rad_s) * guess.inertia_kg_m2 / (2.0 * room)
+    if mode == "speed":
+        needed = max(needed, math.pi * abs(to_rad_s - from_rad_s) / (2.0 * limits.acceleration_rad_s2))
     return Transition(from_rad_s, to_rad_s, max(_SHORTEST_S, needed), guess)

@@ -1,0 +1,75 @@
+"""A CANopen drive on an open bus, or the embedded simulator on a virtual one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import Clock
+from drivers.drive import FrameTap
+from profiles.schema import CanopenProfile
+from tdhil.commands.connection import Connection
+from tdhil.commands.profile_said import rated_torque_is_told_by_hand
+from tdhil.options import Resolved
+from tdhil.rig import DriveData
+
+if TYPE_CHECKING:
+    import can
+
+    from tdhil.commands.peer import PeerPlan
+
+PLAIN = "generic/cia402"
+"""What the simulator is when it wears no profile."""
+
+
+@contextmanager
+def open_canopen(plan: PeerPlan, options: Resolved, connection: Connection, data: DriveData, clock: Clock,
+                 tap: FrameTap, trace: Path | None) -> Iterator[Cia402Drive]:
+    """The node that the options, or else the profile, name."""
+    profile = connection.profile
+    assert isinstance(profile, CanopenProfile)
+    node = options["node"] if options["node"] is not None else profile.node
+    with open_can(plan, connection, node, trace) as channel:
+        yield Cia402Drive(
+            channel,
+            profile,
+            clock,
+            node=node,
+            rate_hz=options["rate_hz"],
+            rated_torque_nm=rated_torque_nm(plan, profile, data),
+            tap=tap,
+        )
+
+
+def rated_torque_nm(plan: PeerPlan, profile: CanopenProfile, data: DriveData) -> float | None:
+    """As rig.yaml has it; a simulated motor has no plate to read it from."""
+    if data.rated_torque_nm is None and plan.embedded and rated_torque_is_told_by_hand(profile):
+        return float(plan.plant.drive.rated_torque_nm)
+    return data.rated_torque_nm
+
+
+@contextmanager
+def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | None = None) -> Iterator[can.BusABC]:
+    """The bus, shut down afterwards, with the simulated drive on it where one was asked for."""
+    with ExitStack() as stack:
+        if plan.embedded:
+            import can
+
+            from sim_bus.simulator import EmbeddedSimulator
+
+            worn: dict[str, Any] = {} if connection.profile.name == PLAIN else {"profile": connection.profile}
+            simulator = stack.enter_context(
+                EmbeddedSimulator(
+                    plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=plan.stepped, **worn
+                )
+            )
+            channel = can.Bus(interface="virtual", channel=simulator.channel)
+        else:
+            from tdhil.bus_open import open_bus
+
+            channel = open_bus(connection.bus)
+        stack.callback(channel.shutdown)
+        yield channel

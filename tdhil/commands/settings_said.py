@@ -1,0 +1,53 @@
+"""How a run was set up: what is printed of it, and what its log keeps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tdhil import __version__
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from tdhil.commands.connection import Connection
+    from tdhil.commands.peer import PeerPlan
+    from tdhil.options import Resolved
+    from tdhil.rig import Rig
+
+
+def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
+    """For the log: everything that identification needs.
+
+    And the whole profile, so that a later decoder can start again from the raw frames.
+    """
+    return {
+        "tdhil": __version__,
+        "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
+        "drive": connection.drive,
+        "bus": {name: {"value": value, "source": source} for name, value, source in connection.rows()},
+        "profile": connection.profile.model_dump(mode="json", by_alias=True),
+        "embedded_simulator": peer.embedded,
+        "stepped": peer.stepped,
+        "seed": peer.seed,
+        "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
+        "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
+        "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
+    }
+
+
+def show_settings(console: Console, options: Resolved, connection: Connection, peer: PeerPlan) -> None:
+    """Which value came from where: everything that isn't a default."""
+    if peer.embedded:
+        why = "as asked for" if options["simulate"] else connection.nothing_there
+        clock = "stepped time" if peer.stepped else "real time"
+        what = "Modbus drive and rig" if connection.drive == "modbus" else "drive and rig on a virtual bus"
+        console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")
+    else:
+        for name, value, source in connection.rows():
+            console.print(f"{_PREFIX[connection.drive]} {name:<10} {value}  ({source})", style="dim", markup=False)
+    for name, value, source in options.rows():
+        if source != "default":
+            console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
+
+
+_PREFIX = {"canopen": "bus", "modbus": "line"}

@@ -1,0 +1,135 @@
+"""How a drill string's trapped torque is let go: the speed that the motor yields with. Pure.
+
+A string that was twisted turns back as soon as nobody holds it. So the motor holds it under speed control, and yields:
+
+    ω = −(T − T_ref)/Z        T_ref falls from the trapped torque to zero on the rig's ramp
+
+with T the torque that the drive reports, which is what it holds. The host only ever *yields*: ω and T have opposite
+signs, or ω is zero, so no work is done on the string. It is turned backwards no further than its own twist takes it,
+never driven that way, and the torque ends at zero instead of becoming negative: a tool joint is never backed off by it,
+and ``allow_reverse: false`` doesn't forbid it. The same law damps a string that swings: it takes its energy away.
+
+Z is the torque limit over half the speed limit, which suits a long string. A short and stiff one would answer a late
+report with an oscillation: whenever the torque changes its sign faster than any string swings, Z is doubled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+SPEED_SHARE = 0.1
+"""Yielding is never faster than this share of the speed limit."""
+
+IMPEDANCE_SPEED_SHARE = 0.5
+RESIDUAL_SHARE, RESIDUAL_QUANTA = 0.02, 5.0
+"""Torque is gone when its mean is below this share of the torque limit, or so many quanta of what is reported."""
+
+MEAN_S = 0.5
+"""The mean of the reported torque that counts; takes the noise away."""
+
+QUIET_S = 6.0
+"""Torque and speed must have been quiet for so long: half a swing of a string that swings in 12 s."""
+
+FASTEST_SWING_S = 2.0
+STIFFEST = 64.0
+TRAVEL_RAD = 250.0
+"""About 40 turns: no string holds more twist below its make-up torque."""
+
+EXTRA_S = 90.0
+"""Beyond the ramp, for a string that swings."""
+
+
+@dataclass(frozen=True)
+class LetGoLimits:
+    """Torque in N·m at the motor shaft; ``ramp_nm_s`` as in rig.yaml."""
+
+    torque_nm: float
+    speed_rad_s: float
+    ramp_nm_s: float
+    torque_resolution_nm: float
+    torque_offset_nm: float = 0.0      # what is reported where nothing flows
+
+    @property
+    def residual_nm(self) -> float:
+        """What counts as nothing."""
+        return max(RESIDUAL_SHARE * self.torque_nm, RESIDUAL_QUANTA * self.torque_resolution_nm)
+
+
+class LetGo:
+    """Fed with every fresh sample; says how fast to yield, and when nothing is left."""
+
+    def __init__(self, limits: LetGoLimits, at_rest_rad_s: float, period_s: float) -> None:
+        self._limits = limits
+        self._at_rest_rad_s = at_rest_rad_s
+        self._period_s = period_s
+        self._fastest_rad_s = SPEED_SHARE * limits.speed_rad_s
+        self._impedance = limits.torque_nm / (IMPEDANCE_SPEED_SHARE * limits.speed_rad_s)
+        self._stiffest = STIFFEST * self._impedance
+        self._recent: deque[float] = deque(maxlen=max(1, round(MEAN_S / period_s)))
+        self._reference_nm: float | None = None
+        self._side = 0.0               # of zero, on which the torque was last seen clear of it
+        self._since_side_s = 0.0
+        self._quiet_s = 0.0
+        self._time_s = 0.0
+        self.trapped_nm = 0.0
+        """The torque at the beginning, signed."""
+        self.travel_rad = 0.0
+        """How far the shaft has yielded, by what was commanded; signed."""
+
+    @property
+    def torque_nm(self) -> float:
+        """The mean of what is held, N·m."""
+        return math.fsum(self._recent) / len(self._recent) if self._recent else 0.0
+
+    @property
+    def longest_s(self) -> float:
+        """It must be over by then."""
+        return 2.0 * abs(self.trapped_nm) / self._limits.ramp_nm_s + EXTRA_S
+
+    @property
+    def done(self) -> bool:
+        """Quiet for long enough, with no torque left."""
+        return self._quiet_s >= QUIET_S
+
+    @property
+    def failed(self) -> bool:
+        """Its bounds in time or travel are reached."""
+        return self._time_s > self.longest_s or abs(self.travel_rad) > TRAVEL_RAD
+
+    def step(self, torque_nm: float, speed_rad_s: float) -> float:
+        """The speed to command next, rad/s, from what was reported last; anything not finite counts as unheard."""
+        if not (math.isfinite(torque_nm) and math.isfinite(speed_rad_s)):
+            self._quiet_s = 0.0
+            return 0.0
+        torque_nm -= self._limits.torque_offset_nm
+        self._recent.append(torque_nm)
+        self._time_s += self._period_s
+        held_nm = self.torque_nm
+        if self._reference_nm is None:
+            self._reference_nm, self.trapped_nm = abs(held_nm), held_nm
+        self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
+        calm = abs(held_nm) <= self._limits.residual_nm and abs(speed_rad_s) <= self._at_rest_rad_s
+        self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
+        self._watch_sign(held_nm)
+        speed = self._yielding(torque_nm)
+        self.travel_rad += speed * self._period_s
+        return speed
+
+    def _yielding(self, torque_nm: float) -> float:
+        assert self._reference_nm is not None
+        # The ramp belongs to the side on which the torque was trapped; what swings to the other is let go at once.
+        same_side = torque_nm * self.trapped_nm > 0.0
+        excess_nm = max(0.0, abs(torque_nm) - (self._reference_nm if same_side else 0.0))
+        return -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance), torque_nm)
+
+    def _watch_sign(self, held_nm: float) -> None:
+        self._since_side_s += self._period_s
+        if abs(held_nm) <= self._limits.residual_nm:
+            return
+        side = math.copysign(1.0, held_nm)
+        if side != self._side:
+            if self._side and self._since_side_s < FASTEST_SWING_S:
+                self._impedance = min(2.0 * self._impedance, self._stiffest)
+            self._side, self._since_side_s = side, 0.0

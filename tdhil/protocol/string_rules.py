@@ -1,0 +1,47 @@
+"""What a drill string on the shaft forbids, looked at before anything moves (DESIGN.md, Stopping)."""
+
+from __future__ import annotations
+
+from drivers.drive import Preflight
+from drivers.errors import PreflightRefused
+from tdhil.protocol.settings import ExcitationRequest, MachineLimits
+
+_LETS_GO = ("coast", "none")
+"""Reactions to a silent host after which nothing holds the string."""
+
+_QUICK_STOP_ROW = "quick-stop option"
+_HOLDS_FROM = 5
+"""CiA 402-2, 605Ah: with 5 to 8 the drive holds the shaft after a quick stop, below it switches its torque off."""
+
+
+def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
+    """PreflightRefused where torque could be lost while a string is wound up; nothing without a string."""
+    if limits.load != "string":
+        return
+    if request.kind == "coast-down":
+        raise PreflightRefused(
+            "coast-down was asked for, and a drill string hangs on the shaft: it would turn the motor back",
+            where="--excitation",
+            next_step="Use --excitation multisine",
+        )
+    if limits.torque_ramp_nm_s <= 0.0:
+        raise PreflightRefused(
+            "a drill string hangs on the shaft, and nothing says how fast its trapped torque is let go",
+            where="torque_ramp_nm_s",
+            next_step="Give torque_ramp_nm_s in rig.yaml, such as 50",
+        )
+    if preflight.safe_action in _LETS_GO:
+        raise PreflightRefused(
+            f"a drill string hangs on the shaft, and the drive's watchdog reaction is '{preflight.safe_action}':"
+            " it would let go of the trapped torque",
+            where="watchdog of the profile",
+            next_step="Choose a reaction that brakes and holds: in CiA 402 object 6007h = 3 (quick stop)",
+        )
+    for check in preflight.checks:
+        if check.name == _QUICK_STOP_ROW and check.found.isdecimal() and int(check.found) < _HOLDS_FROM:
+            raise PreflightRefused(
+                f"a drill string hangs on the shaft, and after a quick stop the drive lets go of it (option"
+                f" {check.found})",
+                where=check.where,
+                next_step="Use a profile whose quick_stop.option_code is 5 or 6",
+            )

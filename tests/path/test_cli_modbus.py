@@ -1,0 +1,214 @@
+"""`tdhil identify --drive modbus`: the whole path on the embedded simulator, and everything that can be mistyped."""
+
+import os
+import re
+import subprocess
+import sys
+import termios
+from types import SimpleNamespace
+
+import pytest
+from path_runs import identify, process, tdhil
+
+from profiles.library import load_modbus_profile, load_profile, profile_path
+from tdhil.record.reader import read_frames, read_run
+
+WRITING = {5, 6, 15, 16, 22, 23}
+"""Function codes that write (Modbus Application Protocol V1.1b3, section 6)."""
+RIG = """\
+modbus: {unit: 1}
+limits:
+  speed_min_rad_s: 0.5
+  speed_max_rad_s: 10.0
+  torque_nm: 400.0
+  time_s: 900.0
+  quick_stop_rad_s2: 2.0
+  watchdog_s: 2.0
+  probe_torque_nm: 200.0
+  probe_travel_rad: 3.0
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return identify(tmp_path_factory.mktemp("modbus"), "--drive", "modbus", "--simulate", "--seed", 1)
+
+
+def test_the_inertia_of_the_simulated_rig(run):
+    assert run.code == 0, run.err
+    document = run.document
+    inertia = document["inertia_kg_m2"]
+    assert document["verdict"] == "valid"
+    assert inertia["value"] == pytest.approx(104.0, rel=0.02)
+    assert inertia["low"] < 104.0 < inertia["high"]
+    assert document["simulated"] is True
+    assert run.outcomes == [(name, "ok") for name in ("setup", "speed", "torque", "hold", "acquire")]
+    assert "SIMULATED: embedded Modbus drive and rig (as asked for), stepped time, seed 1" in run.err
+
+
+def test_its_replay_is_identical(run):
+    again = tdhil("replay", "--json", run.log)
+    assert again.code == 0, again.err
+    assert again.document | {"log": ""} == run.document | {"log": ""}
+    assert "SIMULATED" in tdhil("replay", run.log).out
+
+
+def test_the_log_says_how_the_drive_was_spoken_to(run):
+    configuration = read_run(run.log).configuration
+    assert configuration["drive"] == "modbus"
+    assert configuration["bus"] == {"unit": {"value": "1", "source": "profile generic/modbus"}}
+    assert configuration["profile"]["name"] == "generic/modbus"
+    assert configuration["options"]["profile"] == {"value": "generic/modbus", "source": "default"}
+    frames = list(read_frames(run.log))
+    assert {frame.identifier for frame in frames} == {1}
+    assert {True, False} == {frame.outgoing for frame in frames}
+
+
+def test_a_seed_repeats_it(tmp_path):
+    runs = [identify(tmp_path, "--profile", "generic/modbus", "--amplitude", 9, "--seed", 3, log=name)
+            for name in ("a.mcap", "b.mcap")]
+    for done in runs:
+        assert done.code == 4                                  # it got as far as the plan, which does not fit
+        assert "amplitude of 9 rad/s" in done.err
+        assert "no Modbus host and no serial device is named" in done.err.replace("\n", " ")
+    assert list(read_frames(runs[0].log)) == list(read_frames(runs[1].log))
+
+
+def test_the_unit_is_the_one_asked_for(tmp_path):
+    done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, "--amplitude", 9)
+    assert done.code == 4
+    assert {frame.identifier for frame in read_frames(done.log)} == {17}
+
+
+def test_a_dry_run_knows_the_drive(tmp_path):
+    done = tdhil("identify", "--drive", "modbus", "--simulate", "--dry-run", "--json")
+    assert done.code == 0, done.err
+    assert done.document["mode"] == "torque"
+    options = ("--profile", "schneider/atv320", "--simulate", "--dry-run", "--json")
+    assert tdhil("identify", *options).document["mode"] == "speed"       # that drive has no torque mode
+    refused = tdhil("identify", *options, "--mode", "torque")
+    assert refused.code == 4
+    assert "--mode speed" in refused.err
+
+
+@pytest.mark.parametrize(("name", "bus"), [("maxon/epos4", "canopen"), ("siemens/g130-s120", "modbus")])
+def test_the_simulator_wears_the_profile(tmp_path, name, bus):
+    profile = load_profile(name)
+    done = identify(tmp_path, "--profile", name, "--simulate", "--amplitude", 9)
+    assert "SIMULATED" in done.err
+    assert f"drive          {bus}  (profile {name})" in done.err
+    configuration = read_run(done.log).configuration
+    assert configuration["profile"]["name"] == name
+    assert configuration["identity"]["simulated"] is True
+    if bus == "canopen":
+        assert configuration["identity"]["vendor"] == profile.identity.vendor
+    assert done.outcomes[0] == ("setup", "ok")
+    doubts = len(profile.below("likely")) + len(profile.below("unverified"))
+    assert f"profile {name}: {doubts} entries are not verified" in done.err
+
+
+# -- what is not there, or may not be used -------------------------------------------------------------------
+
+
+def test_nobody_listens_there(tmp_path):
+    done = identify(tmp_path, "--host", "127.0.0.1", "--port", 1)
+    assert done.code in (4, 5)
+    assert "127.0.0.1:1" in done.err
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize(("number", "said"), [(2, "no such device"), (13, "sudo "), (16, "another program")])
+@pytest.mark.parametrize("command", ["identify", "scan", "doctor"])
+def test_a_serial_device_that_can_not_be_opened(monkeypatch, command, number, said):
+    def refuse(*arguments, **options):
+        raise OSError(number, os.strerror(number), "/dev/ttyUSB9")
+
+    monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=refuse))
+    done = tdhil(command, "--serial", "/dev/ttyUSB9")
+    assert done.code == 4
+    (line,) = [line for line in (done.err + done.out).splitlines() if "/dev/ttyUSB9: can't open" in line]
+    assert said in done.err + done.out, line
+    assert "Traceback" not in done.err
+
+
+@pytest.mark.parametrize("command", ["identify", "scan", "doctor"])
+def test_a_serial_device_that_refuses_its_settings(monkeypatch, command):
+    def refuse(*arguments, **options):
+        raise termios.error(22, "Invalid argument")               # no OSError; a pseudo terminal refuses parity so
+
+    monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=refuse))
+    done = tdhil(command, "--serial", "/dev/ttyUSB9")
+    assert done.code == 4
+    assert "/dev/ttyUSB9: the device refuses" in done.err + done.out
+    assert "--parity" in done.err + done.out
+    assert "Traceback" not in done.err
+
+
+def test_a_drive_in_another_process_over_tcp():
+    with process(sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--unit", 3,
+                 stdout=subprocess.PIPE) as drive:
+        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
+        options = ("--host", "127.0.0.1", "--port", port)
+        scanned = tdhil("scan", *options, "--units", "2-3", "--json")
+        looked = tdhil("doctor", *options, "--unit", 3)
+        nobody = tdhil("scan", *options, "--units", "9")
+        profile = tdhil("doctor", *options, "--unit", 3, "--profile", "siemens/g130-s120")
+    (found,) = scanned.document["found"]
+    assert (found["address"], found["simulated"], found["profile"]) == (3, True, "generic/modbus")
+    assert found["line"] == {"host": "127.0.0.1", "port": int(port)}
+    assert looked.code == 0, looked.out
+    assert "305419896" in looked.out
+    assert nobody.code == 5
+    assert "units 9" in nobody.err
+    assert profile.code == 4                                       # not its profile, and that is said
+    assert "can't be read" in profile.out
+
+
+# -- a drive that is taken for a real one --------------------------------------------------------------------
+
+
+@pytest.fixture
+def real(monkeypatch, tmp_path):
+    """The embedded drive without the simulator's marker, in real time; its profile has doubtful entries."""
+    from sim_bus.modbus import slots
+
+    monkeypatch.setattr(slots, "MARKER_TEXT", "somebody's drive")
+    text = profile_path("generic/modbus").read_text(encoding="utf-8")
+    text = text.replace("confidence: verified", "confidence: likely", 1)                     # line
+    text = text.replace("name: check_sign", "name: sign_check", 1)
+    head, tail = text.split("watchdog:\n", 1)
+    path = tmp_path / "mine.yaml"
+    path.write_text(head + "watchdog:\n" + tail.replace("confidence: verified", "confidence: unverified", 1),
+                    encoding="utf-8")
+    assert load_modbus_profile(str(path)).below("unverified") == ("watchdog",)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG)
+    return "--profile", path, "--rig", rig, "--simulate", "--real-time"
+
+
+def test_what_nobody_verified_is_refused_and_nothing_was_written(tmp_path, real):
+    for named in ((), ("--accept-unverified", "likely"), ("--accept-unverified", "watchdog")):
+        done = identify(tmp_path, *real, "--yes", *named)
+        assert done.code == 4
+        assert done.document["error"]["kind"] == "PreflightRefused"
+        assert "nothing has moved" in done.err
+        assert ("line (likely)" in done.err) == ("likely" not in named)
+        assert ("watchdog (unverified)" in done.err) == ("watchdog" not in named)
+        written = [frame for frame in read_frames(done.log) if frame.outgoing and frame.data[0] in WRITING]
+        assert written == []
+
+
+def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
+    done = identify(tmp_path, *real, "--accept-unverified", "likely", "--accept-unverified", "watchdog")
+    assert done.code == 4
+    assert "nobody is there to confirm" in done.err
+    assert "although nobody verified it" in done.err
+    assert "watchdog (unverified): this project's own map" in done.err
+    kept = read_run(done.log).configuration["unverified"]
+    assert [line.split(":")[0] for line in kept] == ["line (likely)", "watchdog (unverified)"]
+
+
+def test_without_limits_nothing_is_moved(tmp_path, real):
+    done = identify(tmp_path, *real[:2], *real[4:], "--yes")
+    assert done.code == 4
+    assert "no machine limits" in done.err

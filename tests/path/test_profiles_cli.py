@@ -1,0 +1,103 @@
+"""`tdhil profiles`: the table, a page for a person at the drive, and a file that is wrong."""
+
+import pytest
+from path_runs import tdhil
+
+from profiles.library import load_profile, profile_names, profile_path
+from profiles.modbus_schema import ModbusProfile
+
+
+def test_the_table_has_every_profile_that_ships():
+    done = tdhil("profiles")
+    assert done.code == 0
+    shown = "".join(done.out.split())
+    assert all(name in shown for name in profile_names())
+    document = tdhil("profiles", "--json").document
+    assert [one["name"] for one in document["profiles"]] == list(profile_names())
+    (generic,) = [one for one in document["profiles"] if one["name"] == "generic/cia402"]
+    assert generic["modes"] == "speed, torque"
+    assert generic["watchdog"] == "heartbeat, then quick stop"
+    assert generic["entries"] == {"verified": 2, "likely": 5, "unverified": 0}
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_a_page_leaves_nothing_out(name, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    profile = load_profile(name)
+    done = tdhil("profiles", "show", name)
+    assert done.code == 0, done.err
+    for one in profile.parameters:
+        assert one.title in done.out
+        if one.require is not None and one.advice:
+            assert one.advice in done.out
+    for hint in profile.hints:
+        assert hint in done.out
+    for level in ("likely", "unverified"):
+        for entry in profile.below(level):
+            assert entry in done.out
+    if isinstance(profile, ModbusProfile):
+        for register in [profile.cycle.speed.register_, profile.cycle.status.register_]:
+            assert f"{register.address} ({register.address:04X}h)" in done.out
+            assert (register.reference or "") in done.out
+        assert all((one.advice or "") in done.out for one in profile.filters)
+    document = tdhil("profiles", "show", name, "--json").document
+    assert document["profile"]["name"] == name
+    assert len(document["not_verified"]) == len(profile.below("likely")) + len(profile.below("unverified"))
+
+
+def test_a_page_fits_80_columns(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for name in ("abb/acs880-enhanced", "siemens/s120-canopen"):
+        assert max(map(len, tdhil("profiles", "show", name).out.splitlines())) <= 80
+    assert max(map(len, tdhil("profiles").out.splitlines())) <= 80
+
+
+def test_an_unknown_name_is_answered_with_those_that_come_close():
+    done = tdhil("profiles", "show", "generic/modbuss")
+    assert done.code == 2
+    assert "did you mean 'generic/modbus' or" in done.err
+
+
+def test_what_ships_is_right():
+    done = tdhil("profiles", "check", *profile_names())
+    assert done.code == 0, done.err
+    assert len(done.out.splitlines()) == len(profile_names())
+    assert "generic/modbus: ok, generic/modbus on modbus" in done.out
+
+
+def test_every_problem_is_a_line_with_its_place(tmp_path):
+    text = profile_path("generic/modbus").read_text(encoding="utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text(text.replace("word_order: high_first ", "word_order: highfirst ").replace("rate_hz: 100.0",
+                                                                                          "rate: 100.0"), "utf-8")
+    at = {word: number for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+          for word in ("highfirst", "rate: 100.0") if word in line}
+    done = tdhil("profiles", "check", path, "generic/cia402")
+    assert done.code == 2
+    lines = done.err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith(f"{path}:{at['highfirst']}: line.word_order: ")
+    assert lines[1].startswith(f"{path}:{at['rate: 100.0']}: ")
+    assert "generic/cia402: ok" in done.out                        # one that is wrong hides no other
+    document = tdhil("profiles", "check", "--json", path).document
+    assert (document["ok"], document["exit_code"], len(document["problems"])) == (False, 2, 2)
+    assert document["problems"][0]["line"] == at["highfirst"]
+
+
+@pytest.mark.parametrize("content", ["", "bus: profibus\n", "- a\n", "bus: canopen\neds: 3\n"])
+def test_no_traceback_whatever_the_file_is(tmp_path, content):
+    path = tmp_path / "mine.yaml"
+    path.write_text(content)
+    done = tdhil("profiles", "check", path)
+    assert done.code == 2
+    assert "Traceback" not in done.err
+    assert str(path) in done.err
+    assert tdhil("profiles", "check", tmp_path / "none.yaml").code == 2
+
+
+def test_an_eds_that_is_not_there(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(profile_path("generic/cia402").read_text(encoding="utf-8"), encoding="utf-8")
+    done = tdhil("profiles", "check", path)
+    assert done.code == 2
+    assert "no file 'cia402.eds' beside" in done.err

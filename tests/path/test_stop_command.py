@@ -1,0 +1,196 @@
+"""`tdhil stop`: against drives in a process of their own, turned by somebody else, dead, or gone mad."""
+
+import signal
+import sys
+
+import can
+import pytest
+from path_runs import host, peer, process, tdhil, wait_for
+
+NODE = 1
+REAL_TIME = ("--seed", 1)
+
+
+def stop(drive, *arguments):
+    return tdhil("stop", *drive.options, "--node", NODE, *arguments)
+
+
+class Master:
+    """Another master: enables, turns the shaft, and (``stubborn``) goes on with its RPDO and SYNC whatever happens."""
+
+    def __init__(self, drive):
+        from drivers.cia402.link import CanLink
+        from drivers.cia402.sdo import Objects
+        from drivers.clock import MonotonicClock
+
+        options = dict(text.split("=") for text in drive.options if "=" in text)
+        self.bus = can.Bus(interface="socketcand", channel=drive.options[3], host=options["host"],
+                           port=int(options["port"]), tcp_tune=True)
+        self.link = CanLink(self.bus, MonotonicClock())
+        self.objects = Objects(self.link, NODE)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        self.bus.shutdown()
+
+    def turn(self, speed_lsb=400, option=6):
+        write = self.objects.write
+        write(0x605A, 0, option, 16)
+        write(0x6085, 0, 300, 32)                     # 0.1 rpm/s: 3.1 rad/s²
+        write(0x6060, 0, 9, 8)
+        for word in (0x06, 0x07, 0x0F):
+            write(0x6040, 0, word, 16)
+        write(0x60FF, 0, speed_lsb, 32)
+        assert wait_for("speed", lambda: self.objects.read(0x606C, signed=True) > 0.5 * speed_lsb)
+
+    def state(self):
+        return self.objects.read(0x6041) & 0x6F
+
+
+@pytest.fixture
+def turning(tmp_path):
+    with peer(tmp_path, *REAL_TIME) as drive, Master(drive) as master:
+        yield drive, master
+
+
+def test_a_turning_shaft_is_brought_to_rest_and_never_disabled(turning):
+    drive, master = turning
+    master.turn()
+    done = stop(drive, "--json")
+    assert done.code == 0, done.err + done.out
+    assert "NO emergency stop" in done.err
+    assert (done.document["ended"], done.document["emergency_stop"]) == ("at rest", False)
+    assert done.document["first"]["speed"] > 2.0
+    assert abs(done.document["last"]["speed"]) < 0.1
+    assert "quick stop active" in done.document["last"]["state"]
+    assert master.state() == 0x07
+    shaft = drive.shaft
+    assert abs(shaft.speed_rad_s[-1]) < 0.05
+    assert shaft.state[-1] == "quick stop active"      # held, not let go
+
+
+def test_a_drive_that_is_off_already_is_left_alone(turning):
+    drive, _ = turning
+    done = stop(drive)
+    assert done.code == 0
+    assert "switch on disabled" in done.out
+    assert "at rest" in done.out.splitlines()[-1]
+    assert drive.shaft.state[-1] == "switch on disabled"
+
+
+def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
+    drive, master = turning
+    master.turn(option=0)
+    done = stop(drive)
+    assert done.code == 0
+    assert "605Ah was changed from 0 to 6" in done.out
+    assert drive.shaft.state[-1] == "quick stop active"
+
+
+def test_while_a_run_of_ours_is_under_way(tmp_path):
+    """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
+    rig = tmp_path / "rig.yaml"        # a slow cycle and a long watchdog bear a loaded machine
+    rig.write_text(
+        "rate_hz: 20\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
+        " quick_stop_rad_s2: 2.0, watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+    )
+    with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
+        assert running.wait_for_line("stage speed …"), running.err
+        assert wait_for("speed", lambda: max(drive.shaft.speed_rad_s, default=0.0) > 1.0)
+        done = stop(drive)
+        ended = running.finish()
+        shaft = drive.shaft
+    assert done.code == 0, done.out
+    assert "another master is there" in done.out
+    assert ended.code in (6, 8), ended.err
+    assert abs(shaft.speed_rad_s[-1]) < 0.05
+    shaft.assert_never_let_go()
+
+
+STUBBORN = """
+import sys, time, can
+channel, host, port = sys.argv[1:4]
+bus = can.Bus(interface="socketcand", channel=channel, host=host, port=int(port), tcp_tune=True)
+send = lambda identifier, data=b"": bus.send(
+    can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+send(0x000, bytes((1, 1)))
+print("on", flush=True)
+while True:
+    send(0x201, (0x0F).to_bytes(2, "little"))
+    send(0x080)
+    while bus.recv(0.0) is not None:
+        pass
+    time.sleep(0.005)
+"""
+
+
+def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
+    drive, master = turning
+    master.objects.write(0x1400, 1, 0x80000201, 32)
+    master.objects.write(0x1600, 0, 0, 8)
+    master.objects.write(0x1600, 1, 0x60400010, 32)
+    master.objects.write(0x1600, 0, 1, 8)
+    master.objects.write(0x1400, 2, 1, 8)
+    master.objects.write(0x1400, 1, 0x201, 32)
+    master.turn()
+    found = dict(text.split("=") for text in drive.options if "=" in text)
+    with process(sys.executable, "-c", STUBBORN, drive.options[3], found["host"], found["port"],
+                 stdout=-1) as other:
+        assert other.stdout.readline() == "on\n"
+        done = stop(drive)
+    assert done.code == 0, done.out
+    assert "another master is there" in done.out
+    assert "1400h:1 = 80000201h" in done.out
+    assert drive.shaft.state[-1] == "quick stop active"
+
+
+def test_nobody_answers(tmp_path):
+    with peer(tmp_path, *REAL_TIME) as drive:
+        done = tdhil("stop", *drive.options, "--node", 5)
+    assert done.code == 5
+    assert "NO ANSWER" in done.out
+    assert "hard-wired emergency stop" in done.out
+
+
+def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
+    from drivers import bare_stop
+
+    monkeypatch.setattr(bare_stop, "NO_SLOWER_S", 1.0)
+    drive, master = turning
+    master.turn(speed_lsb=800)
+    master.objects.write(0x6085, 0, 1, 32)             # as good as no deceleration: 0.1 rpm/s
+    monkeypatch.setattr(bare_stop, "SLOWER", 0.5)
+    done = stop(drive)
+    assert done.code == 8
+    assert "NOT seen at rest" in done.out
+    assert drive.shaft.state[-1] == "quick stop active"
+
+
+def test_a_stepped_drive_whose_host_has_died_is_stopped_too(tmp_path):
+    with peer(tmp_path, *REAL_TIME, "--stepped") as drive, host(
+        tmp_path, *drive.options, "--stepped", "--periods", 40
+    ) as running:
+        assert running.wait_for_line("stage torque …"), running.err
+        running.signal(signal.SIGKILL)
+        running.child.wait()
+        done = stop(drive)
+    assert done.code == 0, done.out
+
+
+def test_without_a_bus_it_says_what_to_name():
+    done = tdhil("stop")
+    assert done.code == 2
+    assert "--host" in done.err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT])
+def test_ctrl_c_ends_the_watching_only(turning, number):
+    drive, master = turning
+    master.turn()
+    with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
+        assert wait_for("stop", lambda: master.state() == 0x07)
+        child.send_signal(number)
+        assert child.wait(60) in (130, -2)
+    assert wait_for("rest", lambda: abs(master.objects.read(0x606C, signed=True)) < 5)

@@ -1,0 +1,63 @@
+"""Stopping a simulated drill string through the whole path: wound up, swinging, or stuck at the bottom."""
+
+from pathlib import Path
+
+import pytest
+from path_runs import HELD, Shaft, identify
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+RIG = """
+rate_hz: 100
+limits: {{speed_min_rad_s: 2.0, speed_max_rad_s: {speed}, torque_nm: {torque}, time_s: {time},
+         quick_stop_rad_s2: {ramp}, watchdog_s: 0.5, probe_torque_nm: {probe}, probe_travel_rad: 60.0}}
+load: string
+make_up_torque_nm: 29000
+torque_ramp_nm_s: 400
+run: {{mode: speed}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("plant", "speed", "torque", "probe", "ramp", "time"),
+    [("plant_two_mass.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0), ("plant_string.yaml", 10.0, 4000.0, 2000.0, 2.0, 14.0),
+     ("plant_stick_slip.yaml", 22.0, 15000.0, 8000.0, 3.0, 25.0)],
+)
+def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, plant, speed, torque, probe, ramp, time):
+    rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
+    rig.write_text(RIG.format(speed=speed, torque=torque, probe=probe, ramp=ramp, time=time))
+    done = identify(
+        tmp_path, "--simulate", "--seed", 3, "--plant", EXAMPLES / plant, "--rig", rig, "--trace", trace
+    )
+    assert done.code == 7, done.err                        # the time limit, while it turns
+    assert "the shaft is at rest" in done.document["stop"]
+    shaft = Shaft.read(trace)
+    assert shaft.state[-1] == "switch on disabled"
+    off = max(k for k, state in enumerate(shaft.state) if state in HELD)
+    stopped = [k for k, time_s in enumerate(shaft.time_s[:off]) if time_s > time]
+    residual_nm = max(0.02 * torque, 5.0 * 0.001 * 20000.0 if "stick" in plant else 50.0)
+    # Over the last second under power the drive holds next to nothing, and the shaft does not turn.
+    last = shaft.time_s[off] - 1.0
+    held = [(t, w) for s, t, w in zip(shaft.time_s[:off], shaft.torque_nm, shaft.speed_rad_s, strict=False) if s > last]
+    assert abs(sum(t for t, _ in held) / len(held)) < 2.0 * residual_nm
+    assert max(abs(w) for _, w in held) < 0.15
+    # Afterwards it stays where it is.
+    assert max(abs(w) for w in shaft.speed_rad_s[off:]) < 0.05
+    # And it was wound up: the way to rest went through far more torque than that.
+    assert max(abs(shaft.torque_nm[k]) for k in stopped) > 4.0 * residual_nm
+
+
+def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
+    from sim_bus.params import RigParams
+    from sim_bus.params import load_rig as load_plant
+    from tdhil.commands.simulated_bench import suited
+    from tdhil.rig import Rig, load_rig
+
+    bench = suited(None, load_plant(EXAMPLES / "plant_string.yaml"))
+    assert (bench.load, bench.limits.torque_nm, bench.make_up_torque_nm) == ("string", 4000.0, 8000.0)
+    assert suited(None, None) is None
+    assert suited(None, RigParams()) is None
+    assert suited(Rig(node=3), load_plant(EXAMPLES / "plant_two_mass.yaml")).node == 3
+    path = tmp_path / "rig.yaml"
+    path.write_text(RIG.format(speed=10, torque=400, probe=200, ramp=2, time=20))
+    rig = load_rig(path)
+    assert suited(rig, load_plant(EXAMPLES / "plant_string.yaml")) is rig

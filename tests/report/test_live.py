@@ -1,0 +1,184 @@
+"""The live display: what it shows, and that a terminal that takes nothing never holds the control loop up."""
+
+import os
+import pty
+import threading
+
+import pytest
+from rich.console import Console
+
+from drivers.drive import Command, Mode, PowerState, Sample
+from tdhil.record.recording import Stage
+from tdhil.report.live import LiveDisplay
+from tdhil.report.painter import MOST_LINES, Painter
+
+COMMAND = Command(Mode.SPEED, 3.0, 0.0)
+
+
+def sample(time_s):
+    return Sample(time_s, 0.0, 0.0, True, 3.0, 80.0, None, Mode.SPEED, PowerState.ENABLED, False, False, 0x27)
+
+
+class Stuck:
+    """A terminal on which somebody pressed Ctrl-S: every write waits until it is let go."""
+
+    encoding = "utf-8"
+
+    def __init__(self):
+        self.go = threading.Event()
+        self.writes = 0
+
+    def write(self, text):
+        self.writes += 1
+        self.go.wait()
+        return len(text)
+
+    def flush(self):
+        pass
+
+    def isatty(self):
+        return True
+
+
+def whole_run(display, cycles=300):
+    """Everything that a run asks of a display, from the control loop."""
+    for name in ("setup", "speed"):
+        display.stage_started(name, 10.0)
+        for cycle in range(cycles):
+            display._next_s = 0.0      # every cycle draws
+            display.cycle(COMMAND, sample(0.004 * cycle))
+        display.say("a line")
+        display.stage_ended(Stage(name, 0.0, 1.0, "ok"))
+    display.stopped(True)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_writer_that_blocks_holds_up_no_cycle(terminal):
+    stuck = Stuck()
+    console = Console(file=stuck, force_terminal=terminal, width=80)
+    display = LiveDisplay(console, show_preflight=False)
+    done = threading.Event()
+
+    def control_loop():
+        whole_run(display)
+        done.set()
+
+    threading.Thread(target=control_loop, daemon=True).start()
+    assert done.wait(30.0), "the control loop hangs on the terminal"
+    assert stuck.writes <= 2           # one is stuck, nothing else was tried
+    stuck.go.set()
+    assert display._painter.flush(30.0)
+
+
+def test_a_pty_that_nobody_reads_holds_up_no_cycle():
+    leader, follower = pty.openpty()
+    done = threading.Event()
+    try:
+        file = os.fdopen(follower, "w", encoding="utf-8")
+        display = LiveDisplay(Console(file=file, force_terminal=True, width=80), show_preflight=False)
+
+        def control_loop():
+            for _ in range(200):        # far more than a pty holds
+                display.say("x" * 1000)
+            whole_run(display, cycles=50)
+            done.set()
+
+        threading.Thread(target=control_loop, daemon=True).start()
+        assert done.wait(30.0), "the control loop hangs on the terminal"
+        assert not display._painter.flush(0.2)      # it is full indeed
+    finally:
+        reader = threading.Thread(target=lambda: _drain(leader), daemon=True)
+        reader.start()
+        assert display._painter.flush(30.0)
+        os.close(leader)
+
+
+def _drain(leader):
+    try:
+        while os.read(leader, 65536):
+            pass
+    except OSError:
+        pass
+
+
+def test_leaving_it_waits_for_a_blocked_terminal_but_not_for_ever(monkeypatch):
+    monkeypatch.setattr("tdhil.report.live._LONGEST_FLUSH_S", 0.05)
+    stuck = Stuck()
+    done = threading.Event()
+
+    def run():
+        with LiveDisplay(Console(file=stuck, force_terminal=True, width=80), show_preflight=False) as display:
+            display.stage_started("setup", 10.0)
+            display.cycle(COMMAND, sample(0.0))
+        done.set()
+
+    threading.Thread(target=run, daemon=True).start()
+    assert done.wait(30.0)
+    stuck.go.set()
+
+
+def test_lines_come_in_order_and_before_it_is_left():
+    import io
+
+    shown = io.StringIO()
+    with LiveDisplay(Console(file=shown, width=100), show_preflight=False) as display:
+        whole_run(display, cycles=3)
+    assert [line for line in shown.getvalue().splitlines() if line] == [
+        "stage setup …", "a line", "stage setup ok, 1 s", "stage speed …", "a line", "stage speed ok, 1 s",
+        "shaft at rest, drive disabled",
+    ]
+
+
+def test_on_a_terminal_the_last_picture_is_that_of_the_end():
+    import io
+
+    shown = io.StringIO()
+    with LiveDisplay(Console(file=shown, force_terminal=True, width=100), show_preflight=False) as display:
+        whole_run(display, cycles=3)
+    assert shown.getvalue().rstrip().splitlines()[-1].startswith("shaft at rest")
+
+
+def test_a_terminal_that_has_gone_is_no_trouble_of_the_run():
+    painter = Painter()
+
+    def gone():
+        raise OSError(5, "hung up")
+
+    painter.line(gone)
+    assert painter.flush(30.0)
+    seen = []
+    painter.line(lambda: seen.append(1))
+    assert painter.flush(30.0)
+    assert not seen
+
+
+def test_a_mistake_of_ours_is_raised_in_the_control_loop():
+    painter = Painter()
+    painter.line(lambda: 1 / 0)
+    assert painter.flush(30.0)
+    with pytest.raises(ZeroDivisionError):
+        painter.picture(lambda: None)
+    painter.picture(lambda: None)      # once
+    assert painter.flush(30.0)
+
+
+def test_of_pictures_the_latest_and_of_lines_so_many():
+    painter, go, seen = Painter(), threading.Event(), []
+    started = threading.Event()
+
+    def slow():
+        started.set()
+        go.wait()
+
+    painter.line(slow)
+    assert started.wait(30.0)
+    for number in range(MOST_LINES + 100):
+        painter.line(lambda number=number: seen.append(number))
+        painter.picture(lambda number=number: seen.append(-number))
+    go.set()
+    assert painter.flush(30.0)
+    assert seen == [*range(100, MOST_LINES + 100), -(MOST_LINES + 99)]
+
+
+def test_nothing_to_wait_for_before_the_first_job():
+    assert Painter().flush(0.0)
