@@ -11,7 +11,8 @@ import zlib
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 
 from tdhil.identify.identify import identify
 from tdhil.identify.options import Options
@@ -19,6 +20,8 @@ from tdhil.study.coverage_plants import CoveragePlant
 from tdhil.study.coverage_simulator import simulate
 
 GROUP = 20     # runs simulated together: some 200 MB
+
+_interrupted: Event | None = None      # in a worker: set when the whole benchmark was
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ def run_task(task: Task) -> tuple[Run, ...]:
     options = Options(confidence=task.confidence)
     found = []
     for number, recording in zip(numbers, recordings, strict=True):
+        if _interrupted is not None and _interrupted.is_set():
+            break
         said = identify(recording, options)
         seconds = float(recording.time_s[-1] - recording.time_s[0])
         run = Run(task.plant.name, number, seconds, said.verdict.value, said.reason)
@@ -85,20 +90,21 @@ def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[Run, ...]]:
     if processes <= 1:
         yield from map(run_task, wanted)
         return
-    others = set(active_children())
-    with ProcessPoolExecutor(processes, get_context("spawn"), _leave_ctrl_c_to_the_parent) as pool:
+    interrupted = get_context("spawn").Event()
+    with ProcessPoolExecutor(processes, get_context("spawn"), _as_worker, (interrupted,)) as pool:
         waiting = [pool.submit(run_task, task) for task in wanted]
         try:
             for done in as_completed(waiting):
                 yield done.result()
         except BaseException:
-            # Whoever interrupts doesn't wait for the groups that are under way.
+            # The groups under way end with the run they are at; a worker killed in the middle may leave the pool stuck.
+            interrupted.set()
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(active_children()) - others:
-                process.terminate()
             raise
 
 
-def _leave_ctrl_c_to_the_parent() -> None:
-    """A terminal sends it to the children too, which would each say so with a traceback."""
+def _as_worker(interrupted: Event) -> None:
+    """A terminal sends Ctrl-C to the children too, which would each say so with a traceback."""
+    global _interrupted  # noqa: PLW0603
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _interrupted = interrupted

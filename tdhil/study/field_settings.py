@@ -72,6 +72,7 @@ class LoopPair(DataModel):
 class ScatterSettings(FieldSettings):
     """Figure 19: the paper's method at several settings of the speed loop, one of them repeated."""
 
+    torque_limit_nm: Positive = Field(default=500.0, description="N·m; P 300 with I 2500 rings, and takes above 400")
     frequency_hz: Positive = 0.3
     amplitude_rad_s: Positive = 0.8
     offset_rad_s: Positive = 2.5

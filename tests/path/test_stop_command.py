@@ -189,6 +189,7 @@ def test_without_a_bus_it_says_what_to_name():
 def test_ctrl_c_ends_the_watching_only(turning, number):
     drive, master = turning
     master.turn()
+    master.objects.write(0x6085, 0, 60, 32)           # slowly, so that there is something left to watch
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         child.send_signal(number)
