@@ -87,8 +87,8 @@ def measure(profile: str, seeds: range, options: list[str], *, every: bool) -> b
     if errors:
         worst = max(errors, key=abs)
         print(f"{profile:<24} {found:<24} {misses:>2} of {len(errors)} missed ({100 * low:4.1f} to {100 * high:4.1f} %)"
-              f"  error {100 * fmean(errors):+5.2f} %, worst {100 * worst:+5.2f} %  half-width {100 * median(halves):4.2f} %"
-              f"  {took_s:.0f} s", flush=True)
+              f"  error {100 * fmean(errors):+5.2f} %, worst {100 * worst:+5.2f} %"
+              f"  half-width {100 * median(halves):4.2f} %  {took_s:.0f} s", flush=True)
     for trouble in troubles:
         print(f"{profile:<24} {trouble}", flush=True)
     return good
@@ -103,7 +103,7 @@ def main() -> int:
     parser.add_argument("--every", action="store_true", help="a line for every seed, too")
     parser.add_argument("--max-time", default=None, help="of stage 5 (default: as identify has it)")
     asked = parser.parse_args()
-    os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")})
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
     options = [] if asked.max_time is None else ["--max-time", asked.max_time]
     seeds = range(asked.first, asked.first + asked.seeds)
     names = [name for name in profile_names() if asked.profiles in name]

@@ -158,6 +158,8 @@ class Counters:
     late: int = 0                  # feedback that came after its cycle
     overruns: int = 0              # cycles that began late by more than half a period
     wall_offset_s: float | None = None     # stamps of frames minus control time; None where they bear no wall clock
+    error_frames: int = 0          # that the adapter told of
+    passive: int = 0               # how often it said that it is error-passive
     wall_jumps: int = 0            # how often that offset jumped: somebody set the wall clock
 
 

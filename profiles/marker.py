@@ -6,7 +6,9 @@ manufacturer's range, and no real drive does.
 
 MARKER_INDEX = 0x5FFE
 """Record. Sub 1 (VISIBLE_STRING, ro): `MARKER_TEXT`. Sub 2 (UNSIGNED8, rw): 1 = stepped time, 0 = its own clock.
-Sub 3 (UNSIGNED32, rw): period of a SYNC in stepped time, µs, for a simulated drive that wears one without 1006h."""
+Sub 3 (UNSIGNED32, rw): period of a SYNC in stepped time, µs, for a simulated drive that wears one without 1006h.
+Sub 4 (UNSIGNED8, rw): the stage of the protocol that has begun, by `STAGE_NUMBERS`, 0 before any; scripted faults of
+the simulator wait for it. Told to simulated peers only."""
 
 MARKER_TEXT = "tdhil simulated drive"
 
@@ -15,3 +17,20 @@ MARKER_REGISTER = 0xFDE8
 with zeros to `MARKER_REGISTERS`; the one after them reads 1 in stepped time, else 0."""
 
 MARKER_REGISTERS = 12
+
+MARKER_STAGE = 4
+"""The subindex of `MARKER_INDEX` that takes the stage."""
+
+MARKER_STAGE_REGISTER = MARKER_REGISTER + MARKER_REGISTERS + 1
+"""Modbus: the holding register, behind that of stepped time, that takes the stage (function 6 or 16)."""
+
+STAGE_NUMBERS = {"setup": 1, "speed": 2, "torque": 3, "hold": 4, "acquire": 5}
+"""The five stages as a peer is told of them."""
+
+CYCLE_ID = 0x6FE
+"""Frames of one byte from a simulated drive with scripted faults, in stepped time only, where waiting for a frame that
+was lost would cost wall time, and a late one might come in this cycle or in the next: `CYCLES_END` says that from the
+next SYNC on each cycle is ended by `CYCLE_OVER`, or `LAST_CYCLE_OVER` when that ends. CiA 301 keeps 6E1h to 6FFh free
+of other uses."""
+
+LAST_CYCLE_OVER, CYCLE_OVER, CYCLES_END = b"\x00", b"\x01", b"\x02"

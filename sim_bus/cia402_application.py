@@ -64,6 +64,8 @@ class Application:
         self.target_torque_nm = 0.0
         self.modes = frozenset(Mode)
         self.warning = False
+        self.deaf = False              # scripted: no command moves the state machine
+        self.keeps_mode = False        # scripted: 6060h is taken and not followed
         self.on_event: Callable[[str], None] = _ignore
         self.on_fault_reset: Callable[[], None] = lambda: None
         self._after_stop: State | None = None       # where a stop under way ends
@@ -77,7 +79,7 @@ class Application:
 
     def write_controlword(self, word: int) -> None:
         """6040h: a state command, fault reset on the rising edge of bit 7, halt in bit 8."""
-        if self._weighed == (word, self.state):
+        if self.deaf or self._weighed == (word, self.state):
             return
         before, self.controlword = self.controlword, word
         if self.state is State.FAULT and sm.fault_reset_edge(before, word):
@@ -92,7 +94,7 @@ class Application:
 
     def set_mode(self, code: int) -> bool:
         """6060h; False where the mode is not supported. 0 means no change (CiA 402-2)."""
-        if code in {0, self.mode}:
+        if code in {0, self.mode} or self.keeps_mode:
             return True
         if code not in self.modes:
             return False

@@ -11,8 +11,9 @@ from importlib.resources import files
 from struct import error as StructError
 
 import numpy as np
+from canopen.objectdictionary import datatypes
 
-from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.marker import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from profiles.schema import CanopenProfile
 from sim_bus import emergency as emcy
 from sim_bus.application_objects import ApplicationObjects
@@ -36,6 +37,10 @@ MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker stays as it is
 Route = Callable[[bytes | bytearray], None]
 
 
+def _ignore(_number: int) -> None:
+    pass
+
+
 def generic_eds() -> str:
     """The path of our own EDS."""
     return str(files("profiles") / "generic" / "cia402.eds")
@@ -51,6 +56,8 @@ class Cia402Node:
         self.stepped = stepped
         self.sync_seen = False
         self.trace = trace
+        self.on_time: Callable[[int], None] = _ignore       # plant time in µs, before each piece of it
+        self.on_stage: Callable[[int], None] = _ignore      # the host says that a stage begins
         self._send = sender.send
         self._next_row_us = 0
         self.inverter = Inverter(params, np.random.default_rng(seed))
@@ -105,9 +112,16 @@ class Cia402Node:
         """Power-on: everything at its defaults, boot-up message, pre-operational."""
         self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
         self.note("power on")
+        self.on_time(self.time_us)
         self._send(0x700 + self.id, b"\0")
         self.nmt.state = NmtState.PRE_OPERATIONAL
         self._changed_state()
+
+    def pass_cycle(self) -> None:
+        """A SYNC that the drive did not hear: nothing happens, but in stepped time it is one period later."""
+        self.sync_seen = True
+        if self.stepped and self._period_us:
+            self.advance_us(self._period_us)
 
     def _on_sync(self) -> None:
         self.sync_seen = True
@@ -171,6 +185,7 @@ class Cia402Node:
     def advance_us(self, duration_us: int) -> None:
         """The plant, and all that is timed, moves on."""
         application, inverter = self.application, self.inverter
+        self.on_time(self.time_us)
         application.regulate()
         count, dt_s = inverter.steps(duration_us * 1e-6)
         begin_us = self.time_us
@@ -240,6 +255,9 @@ class Cia402Node:
         hooks[key_of(0x1017)] = self._producer.configure
         hooks[key_of(MARKER_INDEX, 2)] = self._set_stepped
         live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
+        self.store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
+        self.store.values[key_of(MARKER_INDEX, MARKER_STAGE)] = 0
+        hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = self._set_stage
         self.store.values[key_of(MARKER_INDEX, 0)] = max(self.store.object_dictionary[MARKER_INDEX].subindices)
         self.store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
 
@@ -250,6 +268,10 @@ class Cia402Node:
         if bool(value) is not self.stepped:
             self.stepped = bool(value)
             self.note("stepped time" if value else "own time")
+
+    def _set_stage(self, number: int) -> None:
+        self.note(f"stage {number}")
+        self.on_stage(number)
 
     def _set_consumer(self, value: int) -> None:
         self._consumer.configure(value)

@@ -7,7 +7,15 @@ import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from sim_bus.command_common import Unusable, add_rig_arguments, host_and_port, number_from, ready, until_stopped
+from sim_bus.command_common import (
+    EXIT_OK,
+    Unusable,
+    add_rig_arguments,
+    host_and_port,
+    number_from,
+    ready,
+    until_stopped,
+)
 
 if TYPE_CHECKING:
     import can
@@ -26,22 +34,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--profile", metavar="NAME",
                        help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
     add_rig_arguments(group)
+    group.add_argument("--fault", metavar="FAULT", action="append", default=[],
+                       help="a scripted fault, such as heartbeat-lost@hold+2s; repeatable; 'list' shows them all")
     group.add_argument("--stepped", action="store_true", help="plant time moves with SYNC, by the period of 1006h")
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    if "list" in namespace.fault:
+        from sim_bus.fault_catalogue import listing
+
+        print(listing())  # noqa: T201
+        return EXIT_OK
+
     def simulate(stop: threading.Event) -> None:
         from profiles.library import load_canopen_profile
+        from sim_bus.fault_catalogue import parse_all
         from sim_bus.params import RigParams, load_rig
         from sim_bus.simulator import Simulator
 
+        faults = parse_all(namespace.fault)
         profile = load_canopen_profile(namespace.profile) if namespace.profile is not None else None
         params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
         with _open_bus(namespace) as (bus, reached_by):
             simulator = Simulator(
                 bus, params, node_id=namespace.node, seed=namespace.seed, trace=namespace.trace,
-                stepped=namespace.stepped, profile=profile,
+                stepped=namespace.stepped, profile=profile, faults=faults,
             )
             worn = f" profile {profile.name}" if profile is not None else ""
             ready(f"{reached_by} node {namespace.node}{worn}")

@@ -14,6 +14,8 @@ import numpy as np
 from sim_bus.control import Controller, Regulation
 from sim_bus.noise import Disturbance, normals
 from sim_bus.params import RigParams
+from sim_bus.plant import Params as RigidParams
+from sim_bus.plant import State as RigidState
 from sim_bus.plant_kinds import MotorState, build
 from sim_bus.reporting import Reporting, lag_gain
 
@@ -68,6 +70,17 @@ class Inverter:
         """How many equal steps, none longer than the control period, make up ``duration_s``."""
         count = max(1, -int(-duration_s / self.params.drive.control_period_s * (1.0 - 1e-9) // 1))
         return count, duration_s / count
+
+    def lose_load(self, share: float) -> None:
+        """Scripted: what hangs on the motor comes off; a rigid shaft with this share of the motor end's is left."""
+        motor, before = self.params.plant, self.state
+        left = RigidParams(
+            inertia_kg_m2=share * motor.inertia_kg_m2,
+            viscous_nm_s_rad=share * motor.viscous_nm_s_rad,
+            coulomb_nm=share * motor.coulomb_nm,
+        )
+        self.state = RigidState(before.speed_rad_s, before.angle_rad)
+        self._move = build(left).step
 
     def _prepare(self, dt_s: float) -> None:
         self._dt_s = dt_s

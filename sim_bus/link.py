@@ -1,6 +1,6 @@
 """Frames out: one sender that survives a dying bus, a cheap message, canopen's network on top of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import can
 import canopen
@@ -28,12 +28,22 @@ class Sender:
         self._bus_send = bus.send
         self._on_lost = on_lost
         self.lost = False
+        self.script: Callable[[int, bytes], Sequence[tuple[int, bytes | bytearray]]] | None = None
+        """What becomes of a frame on its way out, where faults are scripted."""
 
     def revive(self) -> None:
         """The bus has been heard again."""
         self.lost = False
 
     def send(self, can_id: int, data: bytes) -> None:
+        """Sends one data frame, or what the script makes of it."""
+        if self.script is None:
+            self.put(can_id, data)
+            return
+        for one, body in self.script(can_id, data):
+            self.put(one, bytes(body))
+
+    def put(self, can_id: int, data: bytes) -> None:
         """Puts one data frame on the bus."""
         if self.lost:
             return

@@ -22,7 +22,7 @@ class Reporting:
 
     __slots__ = (
         "_params", "_speed_gain", "_speed_lagged", "_speed_quantum", "_torque_gain", "_torque_lagged",
-        "_torque_quantum", "speed_rad_s", "torque_nm",
+        "_torque_quantum", "speed_rad_s", "speed_scale", "torque_nm", "torque_scale",
     )
 
     def __init__(self, rig: RigParams) -> None:
@@ -33,6 +33,8 @@ class Reporting:
         self._torque_lagged = 0.0
         self.speed_rad_s = 0.0
         self.torque_nm = 0.0
+        self.speed_scale = self.torque_scale = 1.0
+        """Scripted: what is reported is multiplied by these."""
         self.prepare(rig.drive.control_period_s)
 
     def prepare(self, dt_s: float) -> None:
@@ -45,8 +47,8 @@ class Reporting:
         params = self._params
         self._speed_lagged = speed = self._speed_lagged + self._speed_gain * (speed_rad_s - self._speed_lagged)
         self._torque_lagged = torque = self._torque_lagged + self._torque_gain * (torque_nm - self._torque_lagged)
-        speed += params.speed_noise_rad_s * speed_normal
-        torque += params.torque_noise_nm * torque_normal
+        speed = self.speed_scale * (speed + params.speed_noise_rad_s * speed_normal)
+        torque = self.torque_scale * (torque + params.torque_noise_nm * torque_normal)
         quantum = self._speed_quantum
         self.speed_rad_s = round(speed / quantum) * quantum if quantum else speed
         quantum = self._torque_quantum

@@ -18,6 +18,8 @@ import can
 
 from profiles.schema import CanopenProfile
 from sim_bus.cia402_node import Cia402Node
+from sim_bus.fault_script import Scripted
+from sim_bus.faults import Faults
 from sim_bus.link import BUS_ERRORS, Sender
 from sim_bus.params import RigParams
 from sim_bus.trace import Trace
@@ -26,6 +28,9 @@ _CHUNK_US = 2_000
 _POLL_OWN_TIME_S = 0.005
 _POLL_STEPPED_S = 0.05
 _RETRY_S = 0.05
+_RUN_OUT_US = 120_000_000
+_REST_US = 1_500_000
+_AT_REST_RAD_S = 0.02
 
 
 class Simulator:
@@ -33,7 +38,7 @@ class Simulator:
 
     def __init__(self, bus: can.BusABC, params: RigParams, *, node_id: int = 1, seed: int = 0,
                  trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0,
-                 profile: CanopenProfile | None = None) -> None:
+                 profile: CanopenProfile | None = None, faults: tuple[Scripted, ...] = ()) -> None:
         self._bus = bus
         self._silence_s = silence_s
         self._sender = Sender(bus, self._on_send_failed)
@@ -41,6 +46,9 @@ class Simulator:
         self.node = Cia402Node(
             self._sender, params, node_id=node_id, seed=seed, trace=self._trace, stepped=stepped, profile=profile,
         )
+        self._faults = Faults(faults, seed) if faults else None
+        if self._faults is not None:
+            self._faults.attach(self.node, self._sender)
         self._wall_s = 0.0                 # wall time up to which the plant has run, in its own time
         self._running_on = False           # stepped, but the host is silent
         self._silent_s = 0.0
@@ -73,6 +81,17 @@ class Simulator:
                     self._nothing_came(timeout_s, before_s, stop)
                 elif not (message.is_extended_id or message.is_error_frame):
                     self._frame_came(message)
+            if self._faults is not None and self.node.stepped and self.node.sync_seen:
+                self._run_out()
+
+    def _run_out(self) -> None:
+        """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
+        end_us = self.node.time_us + _RUN_OUT_US
+        quiet_us = 0
+        while quiet_us < _REST_US and self.node.time_us < end_us:
+            self.node.advance_us(_CHUNK_US)
+            turning = abs(self.node.inverter.speed_rad_s) > _AT_REST_RAD_S
+            quiet_us = 0 if turning else quiet_us + _CHUNK_US
 
     def _frame_came(self, message: can.Message) -> None:
         node = self.node
@@ -88,6 +107,8 @@ class Simulator:
         was_stepped = node.stepped
         if message.is_remote_frame:
             node.on_remote(message.arbitration_id)
+        elif self._faults is not None:
+            self._faults.came(message.arbitration_id, message.data)
         else:
             node.on_frame(message.arbitration_id, message.data)
         if was_stepped and not node.stepped:
@@ -143,12 +164,14 @@ class EmbeddedSimulator:
     """
 
     def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
-                 stepped: bool = True, silence_s: float = math.inf, profile: CanopenProfile | None = None) -> None:
+                 stepped: bool = True, silence_s: float = math.inf, profile: CanopenProfile | None = None,
+                 faults: tuple[Scripted, ...] = ()) -> None:
         self.channel = f"tdhil-{uuid.uuid4().hex}"
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self.simulator = Simulator(
             self._bus, params or RigParams(),
             node_id=node_id, seed=seed, trace=trace, stepped=stepped, silence_s=silence_s, profile=profile,
+            faults=faults,
         )
         self._stop = threading.Event()
         self._failure: BaseException | None = None

@@ -52,7 +52,15 @@ from drivers.drive import (
 )
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.table import Table
-from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.marker import (
+    CYCLE_ID,
+    CYCLES_END,
+    LAST_CYCLE_OVER,
+    MARKER_INDEX,
+    MARKER_STAGE,
+    MARKER_TEXT,
+    STAGE_NUMBERS,
+)
 from profiles.schema import CanopenProfile
 
 if TYPE_CHECKING:
@@ -66,6 +74,8 @@ HEARTBEAT_S = 0.1
 """Both ways; the host's comes faster where the watchdog is shorter than five of them."""
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
+DOUBLED_ANSWERS = 3
+"""So many answers that came twice are no accident; `connect` asks some ten questions."""
 ANSWER_S = 0.2
 """Wall time that the drive may take to answer the first question of the node guarding."""
 STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
@@ -112,7 +122,12 @@ class Cia402Drive:
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
         self._link.handlers[self._tpdo1_id] = self._on_feedback
         self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
+        for identifier in (SYNC, self._rpdo1_id, self._rpdo2_id, 0x700 + host_node):
+            self._link.handlers[identifier] = self._watch.on_foreign
+        if clock.stepped:
+            self._link.handlers[CYCLE_ID] = self._on_cycle_end
         self._identity: Identity | None = None
+        self._stage = ""               # as announced
         self._taken = False
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
@@ -137,6 +152,7 @@ class Cia402Drive:
         self._sent_code = 0
         self._since_mode_sent = 0
         self._feedback = _NO_WORD
+        self._ends_cycles = self._over = False     # a simulated peer says where a cycle ends, and this one is over
         self._heard = True
         self._next_tick_s = 0.0
         self._next_heartbeat_s = 0.0
@@ -148,6 +164,7 @@ class Cia402Drive:
         stamps = self._link.stamps
         return Counters(
             self._cycles, self._missed, self._late, self._overruns,
+            error_frames=self._link.error_frames, passive=self._link.passive,
             wall_offset_s=stamps.offset_s, wall_jumps=stamps.jumps,
         )
 
@@ -174,7 +191,24 @@ class Cia402Drive:
                 where=name(MARKER_INDEX, 1),
                 next_step="Leave --stepped out: a real shaft moves in real time",
             )
+        if self._objects.doubled >= DOUBLED_ANSWERS:
+            raise PreflightRefused(
+                "every question is answered twice: two nodes have the same node-ID",
+                where=f"node {self._node}",
+                next_step="Take one of them off the bus, or give each a node-ID of its own",
+            )
+        self.announce(self._stage)
         return self._identity
+
+    def announce(self, stage: str) -> None:
+        """Tell a simulated peer that a stage of the protocol begins (5FFEh:4); a real drive is told nothing.
+
+        An expedited SDO download (CiA 301) whose answer nobody waits for.
+        """
+        self._stage = stage
+        if self._identity is not None and self._identity.simulated and stage in STAGE_NUMBERS:
+            request = bytes((0x2F, MARKER_INDEX & 0xFF, MARKER_INDEX >> 8, MARKER_STAGE, STAGE_NUMBERS[stage], 0, 0, 0))
+            self._link.send(0x600 + self._node, request)
 
     def preflight(self, limits: Limits) -> Preflight:
         """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
@@ -227,6 +261,10 @@ class Cia402Drive:
             return False
 
     def _start(self, allowed_silence_s: float) -> None:
+        try:
+            self._watch.check()        # nothing moves yet: what is wrong already is a refusal
+        except CommunicationLost as error:
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
         now_s = self.clock.now_s()
@@ -290,10 +328,12 @@ class Cia402Drive:
             RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
         )
         self._feedback = self._data_half = self._status_half = _NO_WORD
+        self._over = False
         self._link.send(SYNC, _NO_WORD)
         age_s = self._await_feedback(now_s)
         self._cycles += 1
-        fresh = self._heard = bool(self._feedback)
+        fresh = bool(self._feedback)
+        self._heard = fresh or self._over
         if fresh:
             self._status, self._torque_raw, self._speed_raw = self._layout.unpack(self._feedback)
             self._state = decode(self._status)
@@ -354,7 +394,7 @@ class Cia402Drive:
         if clock.stepped:
             # In stepped time nothing is late, it is lost; a peer that has fallen silent must not hold the host up.
             deadline_s = time.monotonic() + (STEPPED_WAIT_S if self._heard else STEPPED_WAIT_SILENT_S)
-            while not self._feedback and (left_s := deadline_s - time.monotonic()) > 0.0:
+            while not self._cycle_done and (left_s := deadline_s - time.monotonic()) > 0.0:
                 link.receive(left_s)
             return 0.0
         deadline_s = sync_s + 0.8 * self.period_s
@@ -386,12 +426,29 @@ class Cia402Drive:
                 self._data_half = data
                 self._join()
             else:
-                self._feedback = data
+                self._take(data)
+
+    def _take(self, feedback: bytes) -> None:
+        """The first of a cycle counts. A second one is seen here only while a peer says where the cycle ends."""
+        if self._ends_cycles and self._feedback:
+            self._late += 1
+        else:
+            self._feedback = feedback
+
+    def _on_cycle_end(self, data: bytes) -> None:
+        """Of a simulated peer with scripted faults, in stepped time (`profiles.marker.CYCLE_ID`)."""
+        self._ends_cycles = data != LAST_CYCLE_OVER
+        self._over = data != CYCLES_END
+
+    @property
+    def _cycle_done(self) -> bool:
+        """In stepped time: nothing more is waited for."""
+        return self._over or (bool(self._feedback) and not self._ends_cycles)
 
     def _join(self) -> None:
         """A wide drive's two TPDOs of one SYNC, in whichever order they came."""
         if self._data_half and self._status_half:
-            self._feedback = self._status_half + self._data_half
+            self._take(self._status_half + self._data_half)
 
     def _on_slow_feedback(self, data: bytes) -> None:
         if self._wide and len(data) == 2 + self._slow_layout.size:

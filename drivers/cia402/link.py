@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from drivers.cia402.stamps import FrameStamps
+from drivers.cia402.trouble import Condition, condition, queue_is_full
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
@@ -36,7 +37,9 @@ class CanLink:
         self._clock = clock
         self._tap = tap
         self.handlers: dict[int, Handler] = {}
+        self._shut = ""                # why nothing is sent any more
         self.error_frames = 0
+        self.passive = 0               # how often the adapter said that it is error-passive
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
 
@@ -55,9 +58,17 @@ class CanLink:
             self._tap(RawFrame(self._clock.now_s(), True, identifier, b""))
 
     def _put(self, message: can.Message) -> None:
+        if self._shut:
+            raise CommunicationLost(
+                f"{self._shut}: nothing is sent any more",
+                where=self.name,
+                next_step="Mend the bus and start anew; the drive's own watchdog stops the shaft",
+            )
         try:
             self._bus.send(message)
         except Exception as error:  # python-can's backends raise CanError, OSError, BrokenPipeError alike
+            if queue_is_full(error):
+                self._shut_up(f"the transmit queue is full ({error})")
             raise CommunicationLost(
                 f"the bus did not take a frame: {error}",
                 where=self.name,
@@ -77,7 +88,9 @@ class CanLink:
         if message is None:
             return None
         if message.is_error_frame:
-            self.error_frames += 1
+            self._error_frame(message)
+            return -1, b""
+        if not message.is_rx:          # an echo of our own
             return -1, b""
         if not self._clock.stepped:
             self.stamps.take(message.timestamp, self._clock.now_s())
@@ -89,6 +102,26 @@ class CanLink:
         if handler is not None and not (message.is_remote_frame or message.is_extended_id):
             handler(data)
         return identifier, data
+
+    def _error_frame(self, message: can.Message) -> None:
+        """Raises CommunicationLost for a bus-off, from which the adapter may come back: not in this run."""
+        self.error_frames += 1
+        found = condition(message.arbitration_id, bytes(message.data))
+        if found is Condition.PASSIVE:
+            self.passive += 1
+        elif found is Condition.OFF and not self._shut:
+            self._shut_up("the adapter is bus-off")
+            raise CommunicationLost(
+                "the adapter went bus-off: too many errors on the bus",
+                where=self.name,
+                next_step="Check bit rate, termination and cable; the drive's own watchdog stops the shaft",
+            )
+
+    def _shut_up(self, why: str) -> None:
+        """What waits in a queue is old by the time it goes out, and so is what would be put behind it."""
+        self._shut = why
+        with contextlib.suppress(Exception):       # not every interface can
+            self._bus.flush_tx_buffer()
 
     def drain(self) -> None:
         """Handle all that has arrived, without waiting. Raises CommunicationLost if there is no end of it."""

@@ -56,16 +56,21 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         self.network = _LinkNetwork(link)
         self._link = link
         self._asked = bytes(8)
+        self._answers = 0              # to the request at hand
+        self.doubled = 0               # answers to one that was answered already
         link.handlers[self.tx_cobid] = self._take
 
     def send_request(self, request: bytes) -> None:
         self._link.drain()  # what still lies on the bus answers an older request, whose time is over
         self.responses: queue.Queue[bytes] = queue.Queue()
         self._asked = bytes(request)
+        self._answers = 0
         super().send_request(request)
 
     def _take(self, data: bytes) -> None:
         if is_answer(self._asked, data):
+            self._answers += 1
+            self.doubled += self._answers > 1
             self.responses.put(data)
 
     def read_response(self) -> Any:
@@ -86,6 +91,11 @@ class Objects:
         self._node = node
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
+
+    @property
+    def doubled(self) -> int:
+        """How many requests were answered twice."""
+        return self._client.doubled
 
     def read_bytes(self, index: int, subindex: int = 0) -> bytes:
         try:

@@ -4,6 +4,7 @@ Each kind of trouble is kept until it has been raised, once, in the order in whi
 goes on exchanging is then not disturbed by it again.
 """
 
+from collections import deque
 from collections.abc import Callable
 
 from drivers.clock import Clock
@@ -16,8 +17,14 @@ PRE_OPERATIONAL = 0x7F
 
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
+FOREIGN_FRAMES, FOREIGN_S = 3, 1.0
+"""So many frames within this time that only we send (SYNC, the drive's RPDOs, our heartbeat) are another master's."""
+
 START_GRACE_S = 0.5
 """A heartbeat that was under way when the node was started still says pre-operational."""
+
+HOST_LOST = 0x8130
+"""EMCY of a drive that lost its host: life guard or heartbeat error (CiA 301)."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -67,6 +74,7 @@ class Watch:
         self._heard_s: float | None = None
         self._troubles: list[TdhilError] = []
         self._raised: set[str] = set()
+        self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
         self.allowed_silence_s = 0.0
@@ -109,7 +117,16 @@ class Watch:
             return
         code = int.from_bytes(data[:2], "little")
         self.emcy_code = code
-        if code and self.expect_operational:
+        if code == HOST_LOST and self.expect_operational:
+            self._keep(
+                "emcy",
+                CommunicationLost(
+                    f"the drive's watchdog has acted: {emcy_text(code)}",
+                    where=f"node {self._node}",
+                    next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
+                ),
+            )
+        elif code and self.expect_operational:
             extra = data[3:].hex(" ")
             self._keep(
                 "emcy",
@@ -117,6 +134,20 @@ class Watch:
                     emcy_text(code) + (f" (manufacturer's bytes {extra})" if any(data[3:]) else ""),
                     where=f"node {self._node}",
                     next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
+                ),
+            )
+
+    def on_foreign(self, _data: bytes) -> None:
+        """A frame of the kinds that we send came in: somebody else drives this drive, or is about to."""
+        now_s = self._clock.now_s()
+        self._foreign_s.append(now_s)
+        if len(self._foreign_s) == FOREIGN_FRAMES and now_s - self._foreign_s[0] <= FOREIGN_S:
+            self._keep(
+                "master",
+                CommunicationLost(
+                    "a second master is on the bus: it sends SYNC, setpoints or a host's heartbeat of its own",
+                    where=f"node {self._node}",
+                    next_step="Take it off the bus, or give it other identifiers, and start anew",
                 ),
             )
 

@@ -119,7 +119,7 @@ class ModbusDrive:
         table, access, profile = Table(), self._access, self._profile
         table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
         found, scales, rated_nm = checks.read_only_checks(
-            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s
+            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm
         )
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):

@@ -26,12 +26,14 @@ from profiles.modbus_schema import ModbusProfile
 
 STILL_COUNTS, STILL_SHARE = 5, 0.005
 """What counts as a shaft at rest before motion: so many counts, or this share of the speed limit if that is more."""
+COARSEST_SHARE = 0.05
+"""Of a limit, that one count may be worth."""
 LOOKS_AT_MODE, LOOK_S = 20, 0.05
 
 
 def read_only_checks(
     table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float], rated_torque_nm: float | None,
-    speed_limit_rad_s: float,
+    speed_limit_rad_s: float, torque_limit_nm: float,
 ) -> tuple[Parameters, Scales | None, float]:
     """All that can be known without writing; no scales where something is refused."""
     found = read_parameters(table, access, profile, given)
@@ -46,11 +48,31 @@ def read_only_checks(
             "profile, cycle", "See the rows above",
         )
     if scales is not None:
+        check_resolution(table, profile, scales, speed_limit_rad_s, torque_limit_nm)
         check_state(table, access, profile, scales, speed_limit_rad_s)
     refused = any(check.outcome is Outcome.REFUSED for check in table.checks)
     if refused:
         table.note("settings", "nothing was written to the drive: mend the rows above first", "driver")
     return found, None if refused else scales, rated_nm or 1.0
+
+
+def check_resolution(
+    table: Table, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float, torque_limit_nm: float
+) -> None:
+    """Counts far too coarse for the limits: a parameter that scales them was read in the wrong order or place."""
+    cycle = profile.cycle
+    pairs = (
+        ("speed", cycle.speed, scales.speed, speed_limit_rad_s, "rad/s"),
+        ("torque", cycle.torque, scales.torque, torque_limit_nm, "N·m"),
+    )
+    for name, signal, count, limit, unit in pairs:
+        if count > COARSEST_SHARE * limit:
+            table.row(
+                f"{name} resolution", f"at most {COARSEST_SHARE * limit:.3g} {unit}", f"{count:.3g} {unit} a count",
+                False, register_name(signal.register_),
+                f"Is what scales it right ({signal.times or 'rated torque'}: register, word order, count), and the "
+                "limit in rig.yaml?",
+            )
 
 
 def check_state(table: Table, access: Access, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float) -> None:

@@ -18,6 +18,10 @@ from sim_bus.modbus.wrongs import Wrong
 from sim_bus.params import RigParams
 
 _BROADCAST = 0
+AT_REST_RAD_S = 0.01
+RESTING_S, LONGEST_S = 1.2, 60.0
+"""How long a shaft that the host has left must be at rest, and how long it is watched at most."""
+_LOOK_S = 0.1
 
 
 class EmbeddedModbusDrive:
@@ -31,6 +35,7 @@ class EmbeddedModbusDrive:
         self._chances = np.random.default_rng((seed, 1))
         self._free_s = 0.0              # the line has been silent long enough from here on
         self._time_s = 0.0
+        self._closed = False
 
     @property
     def time_s(self) -> float:
@@ -77,8 +82,19 @@ class EmbeddedModbusDrive:
             self._time_s = time_s
             self.machine.run_until(time_s)
 
+    def run_on(self) -> None:
+        """The host has left: the plant goes on by itself until the shaft has been at rest for a while, or for long.
+
+        What a drive does that nobody talks to any more is its watchdog's, and belongs into the trace.
+        """
+        end_s, resting_s = self._time_s + LONGEST_S, 0.0
+        while not self._closed and resting_s < RESTING_S and self._time_s < end_s:
+            self.run_until(self._time_s + _LOOK_S)
+            resting_s = resting_s + _LOOK_S if abs(self.speed_rad_s) < AT_REST_RAD_S else 0.0
+
     def close(self) -> None:
         """The trace is written; safe to repeat."""
+        self._closed = True
         self.machine.close()
 
     def __enter__(self) -> Self:

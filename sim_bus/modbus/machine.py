@@ -25,6 +25,10 @@ from sim_bus.trace import ROW_PERIOD_US, Trace
 _REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3, "ramp_stop": 3}
 """As 6007h codes them."""
 _SLOW_DOWN_RAMP = 1
+RAMP_RAD_S2 = 1.5
+"""Of a drive for speed only, whose setpoint passes a ramp generator (ATV320 ACC 9001 and DEC 9002, Delta Pr.01-12 and
+01-13, Danfoss 3-41 and 3-42, Lenze 6048h and 6049h): set short, as the profiles' hints ask. From standstill to the
+default rig's speed limit in 14 s. The profiles have no register for it; it acts, and is not told."""
 
 
 class Machine:
@@ -36,8 +40,10 @@ class Machine:
         self.parameters = Parameters(profile, params, wrongs)
         self.inverter = Inverter(self._worn(params), np.random.default_rng(seed))
         self.application = application = Application(self.inverter)
-        application.set_mode(Mode.CYCLIC_VELOCITY.value)
-        self.words = FAMILIES[profile.control.family](application, _wiring(profile))
+        wiring = _wiring(profile)
+        application.set_mode((Mode.PROFILE_VELOCITY if wiring.ramps else Mode.CYCLIC_VELOCITY).value)
+        application.settings.accel_rad_s2 = application.settings.decel_rad_s2 = RAMP_RAD_S2
+        self.words = FAMILIES[profile.control.family](application, wiring)
         self._map = Map(profile, self.parameters, self.words, wrongs, stepped=stepped)
         cycle = profile.cycle
         self._bank = Bank(self._map.slots, cycle.functions, self._written, largest_read=cycle.largest_read,
@@ -165,5 +171,6 @@ def _wiring(profile: ModbusProfile) -> Wiring:
         switch_while_enabled=profile.modes.switch_while_enabled,
         brakes_in_torque=profile.quick_stop.decelerates_in_torque_mode,
         holds_after_quick_stop=profile.quick_stop.ends == "quick_stop",
+        ramps=not profile.modes.torque,
         status_address=profile.cycle.status.register_.address,
     )

@@ -10,10 +10,10 @@ from drivers.cia402.link import CanLink
 from drivers.cia402.parameters import check_parameters
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.state import State, decode
-from drivers.table import Table
 from drivers.cia402.units import find_units
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, ObjectRefused
+from drivers.table import Table
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
 from profiles.schema import CanopenProfile
 from tdhil.commands.finding import Finding, Grade, bad, note, of_check, ok

@@ -59,6 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     simulated.add_argument("--simulate", action="store_const", const=True,
                            help="embedded simulator; the default where nobody says where the drive is")
     simulated.add_argument("--plant", metavar="plant.yaml", help="other parameters of the embedded rig")
+    simulated.add_argument("--fault", action="append", metavar="FAULT",
+                           help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' shows them all")
     simulated.add_argument("--seed", type=int, metavar="N", help="repeats a simulated run")
     simulated.add_argument("--real-time", action="store_const", const=True, help="against the wall clock")
     simulated.add_argument("--stepped", action="store_const", const=True, help="step a simulator on the bus by SYNC")
@@ -71,6 +73,7 @@ def run(namespace: argparse.Namespace) -> int:
     """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
     from tdhil.commands.connection import can_torque, connection_of
     from tdhil.commands.peer import plan_peer
+    from tdhil.commands.rehearsal import list_faults, with_faults
     from tdhil.commands.settings_said import show_settings
     from tdhil.commands.simulated_bench import suited
     from tdhil.commands.unverified import check_names
@@ -78,6 +81,8 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.report.live import stderr_console
     from tdhil.rig import load_rig
 
+    if "list" in (namespace.fault or ()):
+        return list_faults()
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
     if options["json"] is True:
@@ -94,7 +99,7 @@ def run(namespace: argparse.Namespace) -> int:
 
         simulated = bool(options["simulate"]) or not connection.configured
         return dry_run(options, rig, simulated, can_torque(connection.profile))
-    peer = plan_peer(options, connection)
+    peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer)
     return _run(namespace, options, connection, peer, suited(rig, peer.plant), console)
 

@@ -25,6 +25,7 @@ class PeerPlan:
     stepped: bool
     seed: int | None
     plant: Any
+    faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
 
     @property
     def epoch_ns(self) -> int:

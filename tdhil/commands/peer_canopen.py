@@ -63,7 +63,8 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
             worn: dict[str, Any] = {} if connection.profile.name == PLAIN else {"profile": connection.profile}
             simulator = stack.enter_context(
                 EmbeddedSimulator(
-                    plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=plan.stepped, **worn
+                    plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=plan.stepped,
+                    faults=plan.faults, **worn,
                 )
             )
             channel = can.Bus(interface="virtual", channel=simulator.channel)

@@ -102,7 +102,8 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
         rated_nm = drive.rated_torque_nm
 
     def ended() -> None:
-        drive.run_until(clock.now_s())      # the shaft's trace goes up to now
+        drive.run_until(clock.now_s())      # the shaft's trace goes up to now, and on to rest
+        drive.run_on()
         drive.close()
 
     link = EmbeddedLink(drive.serve, clock, on_close=ended)

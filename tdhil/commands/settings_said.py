@@ -30,6 +30,7 @@ def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig
         "stepped": peer.stepped,
         "seed": peer.seed,
         "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
+        "faults": [fault.text for fault in peer.faults],
         "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
@@ -42,6 +43,8 @@ def show_settings(console: Console, options: Resolved, connection: Connection, p
         clock = "stepped time" if peer.stepped else "real time"
         what = "Modbus drive and rig" if connection.drive == "modbus" else "drive and rig on a virtual bus"
         console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")
+        for fault in peer.faults:
+            console.print(f"SIMULATED: scripted fault {fault.text}", style="magenta", markup=False)
     else:
         for name, value, source in connection.rows():
             console.print(f"{_PREFIX[connection.drive]} {name:<10} {value}  ({source})", style="dim", markup=False)

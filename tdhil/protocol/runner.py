@@ -207,7 +207,10 @@ class Runner:
             if isinstance(plan, SwingPlan):
                 run_swings(bench, limits, plan, control, assumptions, announced)
             else:
-                run_acquire(bench, limits, plan, control, announced, self._enough(planned, bench))
+                run_acquire(
+                    bench, limits, plan, control, announced, self._enough(planned, bench),
+                    preflight.speed_resolution_rad_s,
+                )
 
     def _prepare(self) -> tuple[Task, Bench, Preflight]:
         identity = self._drive.connect()
@@ -365,6 +368,7 @@ class Runner:
         before = self._drive.counters
         try:
             self._display.stage_started(name, expected_s)
+            self._announce(name)
             yield
         except BaseException as error:
             try:
@@ -376,8 +380,20 @@ class Runner:
         if after.wall_jumps > before.wall_jumps:
             self._log.event(self._drive.clock.now_s(), "clock",
                             "the wall clock jumped: stamps on the bus moved, the times in this log did not")
+        if after.passive > before.passive:
+            self._tell_bus("the adapter is error-passive: check bit rate, termination and cable")
         outcome, detail = stage_quality(before, after)
         self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), outcome, detail))
+
+    def _tell_bus(self, text: str) -> None:
+        self._log.event(self._drive.clock.now_s(), "bus", text)
+        self._say(text)
+
+    def _announce(self, name: str) -> None:
+        """A drive may pass it on to a simulated peer, whose scripted faults wait for it."""
+        announce = getattr(self._drive, "announce", None)
+        if announce is not None:
+            announce(name)
 
     def _skip(self, name: str, bench: Bench, why: str) -> None:
         self._display.stage_started(name, 0.0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from drivers.drive import Command, Mode, Sample
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.control import MeanSpeedControl
+from tdhil.protocol.dither import dither, dither_peak
 from tdhil.protocol.enough import Decision, Enough
 from tdhil.protocol.excitation import Plan, PlannedSegment
 from tdhil.protocol.settings import MachineLimits
@@ -31,8 +32,16 @@ class AcquireResult:
 class Follower:
     """Follows a reference for a while, one command a cycle."""
 
-    def __init__(self, bench: Bench, limits: MachineLimits, mode: Mode, control: MeanSpeedControl | None) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        limits: MachineLimits,
+        mode: Mode,
+        control: MeanSpeedControl | None,
+        beside: Callable[[float], float] | None = None,
+    ) -> None:
         self._bench = bench
+        self._beside = beside
         self._limits = limits
         self._mode = mode
         self._control = control
@@ -63,7 +72,8 @@ class Follower:
             torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._bench.period_s)
         torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
-        wanted = max(lowest, min(limits.speed_max_rad_s, speed_rad_s))
+        setpoint = speed_rad_s + (0.0 if self._beside is None else self._beside(self.time_s))
+        wanted = max(lowest, min(limits.speed_max_rad_s, setpoint))
         self.saw(self._bench.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:
@@ -78,15 +88,18 @@ def run_acquire(
     control: MeanSpeedControl | None,
     announce: Announce,
     enough: Enough | None = None,
+    speed_resolution_rad_s: float = 0.0,
 ) -> AcquireResult:
     """Every segment of the plan, with its transitions. ``announce`` is told the excitation as it grows.
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
     ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
-    more is wanted so many periods more at its mean speed and then, settled anew, at the others.
+    more is wanted so many periods more at its mean speed and then, settled anew, at the others. In speed mode a
+    coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
     """
-    course = _Course(bench, plan, Follower(bench, limits, Mode(plan.mode), control), announce)
     begun_s = bench.now_s
+    beside = _beside(plan, speed_resolution_rad_s, begun_s)
+    course = _Course(bench, plan, Follower(bench, limits, Mode(plan.mode), control, beside), announce)
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
@@ -98,6 +111,14 @@ def run_acquire(
             course.go_to(index, more)
     announce(course.excitation)
     return AcquireResult(course.excitation)
+
+
+def _beside(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
+    peak_rad_s = dither_peak(resolution_rad_s, plan.limits.width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
+    if peak_rad_s == 0.0:
+        return None
+    period_s = plan.segments[0].reference.period_s
+    return lambda time_s: dither(time_s - begun_s, period_s, peak_rad_s)
 
 
 class _Course:

@@ -28,4 +28,9 @@ def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:
             parts.append(f"{count} of {cycles} cycles {text}")
         if count > tolerated:
             outcome = "degraded"
+    errors, passive = after.error_frames - before.error_frames, after.passive - before.passive
+    if errors:
+        parts.append(f"{errors} error frames" + (", the adapter was error-passive" if passive else ""))
+    if passive or errors > TOLERATED_LOSS * cycles:
+        outcome = "degraded"
     return outcome, ", ".join(parts)

@@ -35,6 +35,8 @@ class Wiring:
     brakes_in_torque: bool = True
     """False: a quick stop in torque mode takes the torque away."""
     holds_after_quick_stop: bool = False
+    ramps: bool = False
+    """A speed setpoint passes the drive's ramp generator."""
     status_address: int = 0
     """Some families have several status registers, of different bits."""
 
@@ -116,7 +118,8 @@ class Words:
         """Torque where everything that selects says so; no change while enabled on drives that don't allow it."""
         wiring = self.wiring
         said = [self._word_says_torque] * bool(wiring.torque_bits) + [self.register_says_torque] * wiring.mode_register
-        mode = Mode.CYCLIC_TORQUE if said and all(said) else Mode.CYCLIC_VELOCITY
+        speed = Mode.PROFILE_VELOCITY if self.wiring.ramps else Mode.CYCLIC_VELOCITY
+        mode = Mode.CYCLIC_TORQUE if said and all(said) else speed
         if mode is not self.application.mode and (wiring.switch_while_enabled or not self.application.energised):
             self.application.set_mode(mode.value)
             self.set_quick_stop()

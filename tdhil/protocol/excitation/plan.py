@@ -19,6 +19,7 @@ ExcitationKind = Literal["multisine", "sine", "step"]
 _OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
 LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
 RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
+_BACKWARDS_SHARE = 0.012  # of the greatest speed: foreseen backwards less than this, the guard's own allowance is kept
 _SETTLE_S = 10.0         # at least this long before the first period that counts
 _SINGLE_TONE_S = 100.0   # shortest useful measurement of one tone
 
@@ -200,7 +201,28 @@ class _Fit:
             ((usable + steady) / (self.torque_down * torque_factor), "torque limit"),
         ]
         candidates.append((self.ramp_room, f"the drive's speed ramp ({self.limits.acceleration_rad_s2:.3g} rad/s²)"))
-        return min(candidates, key=lambda candidate: candidate[0])
+        most = min(candidates, key=lambda candidate: candidate[0])
+        if self.mode == "speed" or self._never_backwards(offset_rad_s, most[0]):
+            return most
+        low, high = 0.0, most[0]
+        while high - low > 1e-3 * most[0]:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._never_backwards(offset_rad_s, middle) else (low, middle)
+        return low, "standstill (as far ahead as the guard looks)"
+
+    def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
+        """Would the guard see the shaft turn backwards nowhere? As `guard.predicted_speed`, with the plan's torque."""
+        foresight_s, guess = self.limits.foresight_s, self.guess
+        swung = amplitude_rad_s * self.swing
+        speed = offset_rad_s + swung * self.shape.deviation()
+        rate = swung * self.shape.steepness(self.period_s)
+        torque = guess.steady_torque_nm(offset_rad_s) + amplitude_rad_s * self.shape.torque_deviation(
+            self.period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad
+        )
+        push = torque + guess.coulomb_nm
+        passes = (speed + foresight_s * rate < 0.0) & (push < 0.0)
+        beyond = push[passes] / guess.inertia_kg_m2 * (foresight_s + speed[passes] / rate[passes])
+        return bool(np.all(beyond >= -_BACKWARDS_SHARE * self.limits.speed_high_rad_s))
 
     def segment(self, offset_rad_s: float, amplitude_rad_s: float, periods: int, settle: int) -> PlannedSegment:
         reference = PeriodicReference(

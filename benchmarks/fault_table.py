@@ -1,0 +1,82 @@
+"""Runs the fault table's own tests and writes docs/faults.md from what they saw: ``python benchmarks/fault_table.py``.
+
+Each row: the fault, what must happen, what was seen, the plant time from the fault to the last movement of the true
+shaft, the log's fate, the exit code, and the tests. `--keep FILE` keeps what was seen, `--from FILE` runs nothing.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "faults"))
+
+from rows import ROWS  # noqa: E402
+
+HEAD = """# The fifty faults, and what a run does about each
+
+Made by `python benchmarks/fault_table.py` from the tests that it names; a rehearsal of any scripted row is
+`tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault list` shows the names).
+
+**QS** the one stop sequence: quick stop, standstill seen, trapped torque down, only then disable · **WD** the drive's
+own watchdog stops the shaft · **R** refused before the shaft has moved · **M** the run goes on, and what was degraded
+is marked. *To rest* is plant time from the fault to the last movement of the simulated shaft (0.02 rad/s), from some
+4 rad/s unless the row says otherwise, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop.
+
+"""
+
+
+def run_tests(path):
+    environment = os.environ | {"TDHIL_FAULT_TABLE": str(path)}
+    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "tests/faults", "-p", "no:cacheprovider"], cwd=ROOT,
+                          env=environment, check=False)
+    return done.returncode
+
+
+def table(lines):
+    """Rows of Markdown; ``lines`` as `seen` wrote them."""
+    by_row = {}
+    for line in lines:
+        by_row.setdefault(line["row"], []).append(line)
+    out = ["| # | fault | must | seen | to rest | log | exit |", "|---|---|---|---|---|---|---|"]
+    tests = ["", "## The tests", ""]
+    for number, row in ROWS.items():
+        found = by_row.get(number, [])
+        said = "<br>".join(dict.fromkeys(_cell(line["said"]) for line in found)) or _cell(row.said)
+        rest = [line["standstill_s"] for line in found if line["standstill_s"] is not None]
+        logs = ", ".join(dict.fromkeys(line["log"] for line in found if line["log"])) or "–"
+        codes = ", ".join(str(code) for code in dict.fromkeys(line["code"] for line in found)) or row.codes
+        shown = "–" if not rest else f"{min(rest):.1f} s" if len(rest) == 1 else f"{min(rest):.1f} to {max(rest):.1f} s"
+        out.append(f"| {number} | {row.fault} | {row.expected} | {said} | {shown} | {logs} | {codes} |")
+        names = dict.fromkeys([*row.tests, *(line["test"].split("[")[0] for line in found)])
+        tests.append(f"{number}. " + ", ".join(f"`{name}`" for name in names))
+    return "\n".join([*out, *tests]) + "\n"
+
+
+def _cell(text):
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--keep", type=Path)
+    parser.add_argument("--from", dest="source", type=Path)
+    options = parser.parse_args()
+    code = 0
+    with tempfile.TemporaryDirectory() as folder:
+        path = options.source or options.keep or Path(folder) / "seen.jsonl"
+        if options.source is None:
+            path.unlink(missing_ok=True)
+            code = run_tests(path.absolute())
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    (ROOT / "docs" / "faults.md").write_text(HEAD + table(lines), encoding="utf-8")
+    print(f"docs/faults.md: {len(lines)} observations of {len({line['row'] for line in lines})} rows")
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

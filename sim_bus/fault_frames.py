@@ -1,0 +1,170 @@
+"""Faults of the bus: frames that are lost, doubled, late, old, or somebody else's."""
+
+from sim_bus.fault_hooks import Frame, Frames, Misbehaviour
+
+SYNC = 0x080
+_FIRST_TPDO, _SECOND_TPDO, _HEARTBEAT, _ANSWER, _REQUEST = 0x180, 0x280, 0x700, 0x580, 0x600
+_SWITCH_ON_DISABLED = b"\x40\x02"
+
+
+class Dead(Misbehaviour):
+    """Nothing gets through, either way: a cable that is cut, an adapter that is pulled."""
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return ()
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return ()
+
+
+class Lossy(Misbehaviour):
+    """A share of all frames is lost, either way."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return () if self.scene.rng.random() < self._share else ((can_id, data),)
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return () if self.scene.rng.random() < self._share else ((can_id, data),)
+
+
+class Without(Misbehaviour):
+    """The drive no longer sends frames of these kinds (the identifier less the node)."""
+
+    def __init__(self, *kinds: int) -> None:
+        self._kinds = kinds
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return () if can_id - self.scene.node.id in self._kinds else ((can_id, data),)
+
+
+class Doubled(Misbehaviour):
+    """A share of the TPDOs comes twice."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        twice = can_id == _FIRST_TPDO + self.scene.node.id and self.scene.rng.random() < self._share
+        return ((can_id, data),) * (1 + twice)
+
+
+class Reordered(Misbehaviour):
+    """A share of the first TPDO is held back until after that of the next SYNC."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+        self._held: list[Frame] = []
+
+    def end(self) -> None:
+        self._held.clear()
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id != _FIRST_TPDO + self.scene.node.id:
+            return ((can_id, data),)
+        if self._held:
+            held, self._held = self._held, []
+            return ((can_id, data), *held)
+        if self.scene.rng.random() < self._share:
+            self._held.append((can_id, data))
+            return ()
+        return ((can_id, data),)
+
+
+class Frozen(Misbehaviour):
+    """The TPDOs go on coming, and say what they last said: a gateway that repeats its process image."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, bytes] = {}
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id - self.scene.node.id not in (_FIRST_TPDO, _SECOND_TPDO):
+            return ((can_id, data),)
+        return ((can_id, self._kept.setdefault(can_id, data)),)
+
+
+class SecondNode(Misbehaviour):
+    """Another drive has the same node ID: it answers too, and shows itself switched off."""
+
+    def begin(self) -> None:
+        if self.scene.node.sync_seen:
+            self.scene.put(_HEARTBEAT + self.scene.node.id, b"\0")     # it has just been switched on
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        kind = can_id - self.scene.node.id
+        if kind == _FIRST_TPDO:
+            return (can_id, data), (can_id, _SWITCH_ON_DISABLED + bytes(max(0, len(data) - 2)))
+        if kind in (_ANSWER, _HEARTBEAT):
+            return (can_id, data), (can_id, data)
+        return ((can_id, data),)
+
+
+class SecondMaster(Misbehaviour):
+    """Another host runs the drive: enabled before we come; later its own SYNC and setpoints beside ours."""
+
+    def begin(self) -> None:
+        node = self.scene.node
+        if not node.sync_seen:
+            for word in (0x06, 0x07, 0x0F):
+                node.application.write_controlword(word)
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id == SYNC and node.sync_seen:
+            self.scene.put(SYNC, b"")
+            self.scene.foreign(0x200 + node.id, bytes.fromhex("0f00") + bytes(6))
+        return ((can_id, data),)
+
+
+class Answers(Misbehaviour):
+    """Base of those that meddle with SDO. ``index`` and ``sub`` name the object."""
+
+    def __init__(self, index: int, sub: int) -> None:
+        self._object = index.to_bytes(2, "little") + bytes((sub,))
+
+    def _asked(self, can_id: int, data: bytes | bytearray, *commands: int) -> bool:
+        """Is it the beginning of a transfer of the object (command specifier 1 download, 2 upload; CiA 301)?"""
+        requested = can_id == _REQUEST + self.scene.node.id and len(data) == 8
+        return requested and data[0] >> 5 in commands and bytes(data[1:4]) == self._object
+
+    def _answer(self, first: int, rest: bytes = bytes(4)) -> None:
+        self.scene.put(_ANSWER + self.scene.node.id, bytes((first,)) + self._object + rest)
+
+
+class Aborted(Answers):
+    """The drive aborts every transfer of the object: 08000020h, data can't be transferred or stored."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        if not self._asked(can_id, data, 1, 2):
+            return ((can_id, data),)
+        self._answer(0x80, (0x08000020).to_bytes(4, "little"))
+        return ()
+
+
+class Unanswered(Answers):
+    """The drive doesn't answer when it is asked for the object."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return () if self._asked(can_id, data, 1, 2) else ((can_id, data),)
+
+
+class NotKept(Answers):
+    """A write is answered as if it had been taken over; what stood there before goes on standing there."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        if not self._asked(can_id, data, 1):
+            return ((can_id, data),)
+        self._answer(0x60)
+        return ()
+
+
+class Otherwise(Answers):
+    """The object reads as something else: its lowest byte comes with one bit changed."""
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        upload = can_id == _ANSWER + self.scene.node.id and data[0] >> 5 == 2 and data[0] & 2
+        if upload and data[1:4] == self._object:
+            data = data[:4] + bytes((data[4] ^ 0x04,)) + data[5:]
+        return ((can_id, data),)

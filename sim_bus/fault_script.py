@@ -1,0 +1,107 @@
+"""When a scripted fault begins and ends, in plant time, and how that is written. Pure.
+
+::
+
+    NAME[@WHEN][=VALUE][/DURATION]      heartbeat-lost@hold+2s    frame-loss@acquire+5s=5%/20s    sto@12.5s
+    WHEN    12.5s  from power-on    STAGE or STAGE+2s  from the moment at which the host says that the stage begins
+            left out: from the start
+    DURATION  left out: for good
+"""
+
+import re
+from dataclasses import dataclass
+from math import inf
+
+from profiles.errors import TdhilError
+from profiles.marker import STAGE_NUMBERS
+
+_NUMBER = r"\d+(?:\.\d+)?"
+_FAULT = re.compile(
+    rf"(?P<name>[a-z][a-z0-9-]*)(?:@(?P<when>[^=/]+))?(?:=(?P<value>[^/]+))?(?:/(?P<duration>{_NUMBER}m?s))?"
+)
+_WHEN = re.compile(rf"(?:(?P<stage>[a-z]+)(?:\+(?P<after>{_NUMBER}m?s))?|(?P<time>{_NUMBER}m?s))")
+
+
+class FaultRefused(TdhilError):
+    """What was written is no fault that can be scripted."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class Moment:
+    """``after_s`` of plant time from the beginning of a stage (by its number), or from power-on where that is 0."""
+
+    stage: int = 0
+    after_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """One fault of a script, as it was written."""
+
+    name: str
+    at: Moment = Moment()
+    value: str = ""
+    duration_s: float = inf
+    text: str = ""
+
+
+class Schedule:
+    """Which faults begin and end at a plant time. Each begins once, the first time its moment comes."""
+
+    def __init__(self, faults: tuple[Scripted, ...]) -> None:
+        self._waiting = list(enumerate(faults))
+        self._stages_us = {0: 0}
+        self._ends_us: list[tuple[int, int]] = []
+        self._next_us = 0
+
+    def stage(self, number: int, now_us: int) -> None:
+        """A stage has begun; a second time, as after a restart of the host, changes nothing."""
+        self._stages_us.setdefault(number, now_us)
+        self._next_us = 0
+
+    def due(self, now_us: int) -> tuple[list[int], list[int]]:
+        """The numbers of the faults that begin now, and of those that end now."""
+        if now_us < self._next_us:
+            return [], []
+        begin = [(n, fault) for n, fault in self._waiting if self._begins_us(fault) <= now_us]
+        self._waiting = [pair for pair in self._waiting if pair not in begin]
+        end = [n for at_us, n in self._ends_us if at_us <= now_us]
+        self._ends_us = [pair for pair in self._ends_us if pair[0] > now_us]
+        self._ends_us += [(now_us + round(1e6 * f.duration_s), n) for n, f in begin if f.duration_s < inf]
+        times = [self._begins_us(fault) for _, fault in self._waiting] + [at_us for at_us, _ in self._ends_us]
+        self._next_us = round(min(times)) if min(times, default=inf) < inf else 1 << 62
+        return [n for n, _ in begin], end
+
+    def _begins_us(self, fault: Scripted) -> float:
+        began = self._stages_us.get(fault.at.stage)
+        return inf if began is None else began + round(1e6 * fault.at.after_s)
+
+
+def parse(text: str) -> Scripted:
+    """One fault as the user writes it; its name and value are looked up in `fault_catalogue`. Raises FaultRefused."""
+    found = _FAULT.fullmatch(text.strip())
+    if found is None:
+        raise FaultRefused(f"{text!r} is no fault", where="--fault",
+                           next_step="Write NAME[@WHEN][=VALUE][/DURATION], such as heartbeat-lost@hold+2s; "
+                                     "--fault list shows the names")
+    duration = found["duration"]
+    return Scripted(found["name"], _moment(found["when"], text), found["value"] or "",
+                    inf if duration is None else _seconds(duration), text.strip())
+
+
+def _moment(when: str | None, text: str) -> Moment:
+    if when is None:
+        return Moment()
+    found = _WHEN.fullmatch(when)
+    if found is None or found["stage"] not in {None, *STAGE_NUMBERS}:
+        raise FaultRefused(f"{when!r} is no moment", where=f"--fault {text}",
+                           next_step=f"Write 12.5s, or a stage and a time: {', '.join(STAGE_NUMBERS)}, as in hold+2s")
+    if found["time"] is not None:
+        return Moment(0, _seconds(found["time"]))
+    return Moment(STAGE_NUMBERS[str(found["stage"])], _seconds(found["after"] or "0s"))
+
+
+def _seconds(text: str) -> float:
+    return float(text[:-2]) / 1000.0 if text.endswith("ms") else float(text[:-1])

@@ -1,0 +1,104 @@
+"""A run of the whole path in one process, stepped, with a fault in it; and what its true shaft, exit and log must show.
+
+Times are the plant's own, from the simulator's trace.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from path_runs import QUICK_STOP_RAD_S2, SETTLING_S, Finished, Shaft, identify, tdhil
+
+from tdhil.record.reader import read_run
+from tdhil.report.live import LiveDisplay
+
+HELD = {"operation enabled", "quick stop active", "fault reaction active"}
+TURNING_RAD_S = 0.02
+
+
+@dataclass
+class Rehearsed:
+    """One run, over."""
+
+    done: Finished
+    shaft: Shaft
+    log: Path
+
+    @property
+    def message(self):
+        """What ended the run: one line with what, where and what next."""
+        return self.done.document["error"]["message"]
+
+    @property
+    def fault_s(self):
+        """When the first scripted fault began."""
+        return self.shaft.events("fault: ")[0]
+
+    def standstill_s(self, since_s):
+        return self.shaft.at_rest_from() - since_s
+
+    def assert_ended(self, code, *words):
+        assert self.done.code == code, self.done.err
+        for word in words:
+            assert word in self.message, self.message
+        assert "Traceback" not in self.done.err
+
+    def assert_nothing_moved(self):
+        assert abs(self.shaft.speed_rad_s).max(initial=0.0) < 0.001
+        assert "nothing has moved" in self.done.err or "shaft is at rest" in self.done.err
+
+    def assert_stopped(self, since_s, notice_s, *, held=True):
+        """Within the time to notice it, the ramp and the settling; never let go while it turned, but by the drive."""
+        shaft = self.shaft
+        after = shaft.time_s >= since_s
+        fastest = np.abs(shaft.speed_rad_s[after]).max()
+        ramp_s = fastest / QUICK_STOP_RAD_S2
+        if held:
+            assert self.standstill_s(since_s) <= notice_s + ramp_s + SETTLING_S
+            free = np.array([state not in HELD for state in shaft.state])
+            assert not np.any(np.abs(shaft.speed_rad_s[free]) > 0.05), "a turning shaft was disabled"
+        assert shaft.time_s[-1] - shaft.at_rest_from() >= 1.0
+        assert shaft.speed_rad_s.min() > -0.3                # a sign probe the wrong way round is the worst of it
+        return round(self.standstill_s(since_s), 2)
+
+    def assert_log_whole(self):
+        """Finalised: recovery has nothing to do, and the stages in it are those that were reported."""
+        run = read_run(self.log)
+        assert run.complete
+        assert tdhil("recover", self.log).code == 0
+        stages = self.done.document.get("stages")
+        assert [(stage.name, stage.outcome) for stage in run.stages] == [(s["name"], s["outcome"]) for s in stages]
+        return "whole"
+
+
+def run(folder, *arguments):
+    trace = folder / "shaft.csv"
+    # At 50 Hz a run costs a fifth of what it costs at the drive's usual rate; periods decide how long stage 5 is.
+    done = identify(folder, "--simulate", "--seed", 1, "--rate", 50, "--periods", 3, "--trace", trace, *arguments)
+    return Rehearsed(done, Shaft.read(trace) if trace.exists() else None, folder / "run.mcap")
+
+
+def at(monkeypatch, stage, after_s, act):
+    """Have ``act(sample)`` called once, so long after a stage has begun, between two cycles of the control loop.
+
+    The plant time of that goes into the list that is returned.
+    """
+    begun, acted = [], []
+    started, cycle = LiveDisplay.stage_started, LiveDisplay.cycle
+
+    def on_start(self, name, expected_s):
+        if name == stage:
+            begun.append(None)
+        started(self, name, expected_s)
+
+    def on_cycle(self, command, sample):
+        cycle(self, command, sample)
+        if begun and begun[0] is None:
+            begun[0] = sample.time_s
+        if begun and not acted and sample.time_s >= begun[0] + after_s:
+            acted.append(sample.time_s)
+            act(sample)
+
+    monkeypatch.setattr(LiveDisplay, "stage_started", on_start)
+    monkeypatch.setattr(LiveDisplay, "cycle", on_cycle)
+    return acted

@@ -1,0 +1,138 @@
+"""Rows 38 to 45 of the fault table on the whole path: a line that misbehaves, and a drive wired otherwise than said."""
+
+from functools import partial
+
+import pytest
+from rehearsal import at, run
+
+from sim_bus.modbus import embedded
+from sim_bus.modbus.wrongs import parse
+
+MODBUS = ("--drive", "modbus")
+WATCHDOG_S = 0.5
+NOTICED_S = WATCHDOG_S + 0.1
+"""By the host within half of that, by the drive's own watchdog within all of it, and five cycles."""
+
+
+class Line:
+    """Between driver and simulated drive; ``becomes(serve, unit, pdu, now_s)`` → (reply or None, when complete)."""
+
+    def __init__(self, monkeypatch):
+        self.becomes, self.left = None, 0
+        serve = embedded.EmbeddedModbusDrive.serve
+        line = self
+
+        def passing(self, unit, pdu, now_s):
+            if line.becomes is None or line.left <= 0:
+                return serve(self, unit, pdu, now_s)
+            line.left -= 1
+            return line.becomes(partial(serve, self), unit, pdu, now_s)
+
+        monkeypatch.setattr(embedded.EmbeddedModbusDrive, "serve", passing)
+
+    def begin(self, becomes, requests):
+        self.becomes, self.left = becomes, requests
+
+
+def refusing(code):
+    """The drive answers with an exception and does nothing (Modbus application protocol V1.1b3, section 7)."""
+    return lambda serve, unit, pdu, now_s: (bytes((pdu[0] | 0x80, code)), now_s + 0.001)
+
+
+def silent(serve, unit, pdu, now_s):
+    """Neither request nor reply gets through."""
+    return None, now_s
+
+
+def late(serve, unit, pdu, now_s):
+    """The drive acts, and its reply comes when nobody waits any more."""
+    reply, complete_s = serve(unit, pdu, now_s)
+    return reply, complete_s + 1.0
+
+
+def cut(serve, unit, pdu, now_s):
+    """The drive acts, and half of its reply is there."""
+    reply, complete_s = serve(unit, pdu, now_s)
+    return reply[: len(reply) // 2], complete_s
+
+
+def foreign(serve, unit, pdu, now_s):
+    """The reply to somebody else's request."""
+    reply, complete_s = serve(unit, pdu, now_s)
+    return bytes((reply[0] ^ 7,)) + reply[1:], complete_s
+
+
+@pytest.fixture
+def line(no_bus_of_the_user, monkeypatch):
+    return Line(monkeypatch)
+
+
+ENDS = [
+    (38, "exception 1", refusing(1), 1, 6, ("exception 1", "function")),
+    (38, "exception 2", refusing(2), 1, 6, ("exception 2", "address")),
+    (38, "exception 3", refusing(3), 1, 6, ("exception 3", "value")),
+    (38, "exception 4", refusing(4), 1, 6, ("exception 4", "panel")),
+    # It answers, and can't be stopped: the hard-wired stop is asked for.
+    (38, "exception 2 for good", refusing(2), 10**9, 8, ("exception 2", "address")),
+    (38, "busy for good", refusing(6), 10**9, 5, ("no ", "watchdog")),
+    (39, "silence", silent, 10**9, 5, ("no ", "watchdog")),
+    (40, "every reply late", late, 10**9, 5, ("no ", "watchdog")),
+    (42, "every reply cut short", cut, 10**9, 5, ("no ", "watchdog")),
+]
+
+
+IN_STAGES = [(*case, "speed") for case in ENDS] + [(*case, "acquire") for case in ENDS if case[1] in (
+    "exception 1", "silence", "every reply cut short")]
+
+
+@pytest.mark.parametrize(
+    ("row", "name", "becomes", "requests", "code", "words", "stage"), IN_STAGES,
+    ids=[f"{case[1]} in {case[-1]}" for case in IN_STAGES],
+)
+def test_it_ends_with_the_shaft_at_rest(
+    row, name, becomes, requests, code, words, stage, line, monkeypatch, tmp_path, seen
+):
+    acted = at(monkeypatch, stage, 8.0 if stage == "speed" else 3.0, lambda _: line.begin(becomes, requests))
+    ended = run(tmp_path, *MODBUS)
+    ended.assert_ended(code, *words)
+    standstill_s = ended.assert_stopped(acted[0], NOTICED_S)
+    assert ended.shaft.speed_at(acted[0]) > 0.3, "it was to happen in motion"
+    # What nobody can tell is said so: a drive that can't be asked is not known to be at rest.
+    assert ("NOT confirmed" in ended.done.document["stop"]) is (requests > 1)
+    seen(row, f"{name}: {ended.message}", standstill_s, ended.assert_log_whole(), ended.done.code)
+
+
+SURVIVES = [
+    (38, "busy, twice", refusing(6), 2),
+    (39, "one lost reply", silent, 1),
+    (40, "one late reply", late, 1),
+    (42, "one reply cut short", cut, 1),
+    (42, "one reply of another function", foreign, 1),
+]
+
+
+@pytest.mark.parametrize(("row", "name", "becomes", "requests"), SURVIVES, ids=[case[1] for case in SURVIVES])
+def test_it_is_survived(row, name, becomes, requests, line, monkeypatch, tmp_path, seen):
+    acted = at(monkeypatch, "acquire", 5.0, lambda _: line.begin(becomes, requests))
+    ended = run(tmp_path, *MODBUS)
+    assert acted and line.left == 0
+    assert ended.done.code in (0, 9), ended.done.err       # three periods: how well they tell J is no matter here
+    assert [outcome for _, outcome in ended.done.outcomes] == ["ok"] * 5
+    ended.shaft.assert_at_rest()
+    seen(row, name, None, ended.assert_log_whole(), ended.done.code)
+
+
+REFUSED = [
+    (44, "word_order"), (44, "scale_10"), (44, "address_off_by_one"), (44, "sign"), (44, "unsigned"),
+    (45, "write_not_applied"), (45, "reads_back_something_else:torque_limit"),
+]
+
+
+@pytest.mark.parametrize(("row", "wrong"), REFUSED, ids=[case[1] for case in REFUSED])
+def test_it_is_refused_before_motion(row, wrong, no_bus_of_the_user, monkeypatch, tmp_path, seen):
+    wired = partial(embedded.EmbeddedModbusDrive, wrongs=(parse(wrong),))
+    monkeypatch.setattr(embedded, "EmbeddedModbusDrive", wired)
+    ended = run(tmp_path, *MODBUS)
+    ended.assert_ended(4)
+    ended.assert_nothing_moved()
+    seen(row, f"{wrong}: {ended.message}", None, ended.assert_log_whole(), ended.done.code)

@@ -1,0 +1,167 @@
+"""Rows 4, 41 and 43 over TCP in real time: the host is killed, or what carries its requests misbehaves in motion.
+
+The drive is a process of its own, and so is the host; between them, where the network is at fault, a relay by hand.
+Nothing is measured in wall time: the shaft's trace is in the plant's own.
+"""
+
+import contextlib
+import json
+import re
+import select
+import socket
+import struct
+import subprocess
+import sys
+import threading
+
+import pytest
+from path_runs import SETTLING_S, Shaft, process, wait_for
+
+WATCHDOG_S = 0.5
+TURNING_RAD_S = 0.3
+QUICK_STOP_RAD_S2 = 2.0
+LATE_S = 0.3
+"""A machine that is busy with other tests looks at its watchdog late."""
+
+
+class Relay(threading.Thread):
+    """Passes everything on, until ``fault`` says otherwise: reset, half-open, or foreign (once)."""
+
+    def __init__(self, port):
+        super().__init__(daemon=True)
+        self.fault, self.connections, self.port_behind = "", 0, port
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.settimeout(0.02)
+        self.port = self.listener.getsockname()[1]
+        self.over = threading.Event()
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *error):
+        self.over.set()
+        self.join(5.0)
+        self.listener.close()
+
+    def run(self):
+        while not self.over.is_set():
+            with contextlib.suppress(OSError):
+                host, _ = self.listener.accept()
+                self.connections += 1
+                with host, socket.create_connection(("127.0.0.1", self.port_behind)) as drive:
+                    self.carry(host, drive)
+
+    def carry(self, host, drive):
+        while not self.over.is_set():
+            for one in select.select([host, drive], [], [], 0.02)[0]:
+                data = one.recv(4096)
+                if not data:
+                    return
+                if self.fault == "half-open":
+                    continue
+                if self.fault == "foreign" and one is drive:
+                    self.fault = ""
+                    number, rest = struct.unpack(">H", data[:2])[0], data[2:]
+                    data = struct.pack(">H", number ^ 0x5555) + rest
+                (drive if one is host else host).sendall(data)
+            if self.fault == "reset":
+                host.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                return
+
+
+class Bench:
+    """A simulated drive, and the command line that drives it."""
+
+    def __init__(self, folder, stack):
+        self.folder, self.trace, self.log = folder, folder / "shaft.csv", folder / "run.mcap"
+        self.stack = stack
+        drive = stack.enter_context(process(
+            sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", self.trace,
+            stdout=subprocess.PIPE,
+        ))
+        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
+        self.port = int(port)
+
+    def start(self, port):
+        self.host = self.stack.enter_context(process(
+            sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
+            "--rate", 20, "--log", self.log, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
+        ))
+
+    @property
+    def shaft(self):
+        return Shaft.read(self.trace)
+
+    def wait_until_turning(self):
+        def turning():
+            shaft = self.shaft
+            return len(shaft.time_s) > 0 and shaft.speed_rad_s[-1] > TURNING_RAD_S
+
+        assert wait_for("the shaft to turn", turning, self.host), self.host.communicate()
+        return float(self.shaft.time_s[-1])
+
+    def wait_at_rest(self, since_s):
+        def resting():
+            shaft = self.shaft
+            return shaft.time_s[-1] > max(since_s, shaft.at_rest_from()) + 1.0
+
+        wait_for("the shaft to come to rest", resting)
+        shaft = self.shaft
+        ramp_s = shaft.speed_rad_s.max() / QUICK_STOP_RAD_S2
+        standstill_s = shaft.at_rest_from() - since_s
+        assert standstill_s < WATCHDOG_S + LATE_S + ramp_s + SETTLING_S
+        shaft.assert_never_let_go()
+        return round(standstill_s, 2)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with contextlib.ExitStack() as stack:
+        yield Bench(tmp_path, stack)
+
+
+def test_a_killed_host(bench, seen):
+    bench.start(bench.port)
+    at_s = bench.wait_until_turning()
+    bench.host.kill()
+    standstill_s = bench.wait_at_rest(at_s)
+    assert bench.shaft.events("host silent")
+    seen(4, "SIGKILL over Modbus TCP: the drive's time-out stops the shaft", standstill_s)
+
+
+@pytest.mark.parametrize("fault", ["reset", "half-open"])
+def test_a_connection_that_dies(bench, fault, seen):
+    with Relay(bench.port) as relay:
+        bench.start(relay.port)
+        at_s = bench.wait_until_turning()
+        relay.fault = fault
+        out, err = bench.host.communicate(timeout=60.0)
+        connections = relay.connections
+    standstill_s = bench.wait_at_rest(at_s)
+    assert bench.host.returncode == 5, err
+    assert connections == 1, "connected anew while the drive was enabled"
+    error = json.loads(out)["error"]
+    assert error["kind"] in ("LinkLost", "CommunicationLost", "NoReply")
+    assert "127.0.0.1" in error["message"] or "no feedback" in error["message"]
+    assert "Traceback" not in err
+    assert bench.shaft.events("host silent")
+    seen(43, f"{fault}: {error['message']}", standstill_s, code=5)
+
+
+def test_a_foreign_transaction_id_costs_a_sample_and_the_connection(bench, seen):
+    with Relay(bench.port) as relay:
+        bench.start(relay.port)
+        bench.wait_until_turning()
+        relay.fault = "foreign"
+        wait_for("a new connection", lambda: relay.connections == 2, bench.host)
+        at_s = float(bench.shaft.time_s[-1])
+        wait_for("the run to go on", lambda: bench.shaft.time_s[-1] > at_s + 1.0, bench.host)
+        assert bench.host.poll() is None
+        bench.host.terminate()
+        out, err = bench.host.communicate(timeout=60.0)
+        assert relay.connections == 2
+    assert bench.host.returncode == 143, err
+    assert "at rest" in json.loads(out)["stop"]
+    bench.shaft.assert_never_let_go()
+    seen(41, "the reply is dropped, the connection renewed, the run goes on", None, code=143)

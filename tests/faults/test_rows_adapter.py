@@ -1,0 +1,121 @@
+"""Rows 12 to 16: what the host's own adapter does, by a bus of the tests' own between driver and simulator.
+
+The simulated drive's watchdog must bring the shaft to rest once nothing reaches it any more.
+"""
+
+import can
+import pytest
+from adapter import Adapter
+from rehearsal import at
+
+BUS_OFF, CONTROLLER, TX_PASSIVE = 0x40, 0x04, 0x20      # linux/can/error.h
+WATCHDOG_S = 0.6
+
+
+@pytest.fixture
+def adapter(rehearse, monkeypatch):
+    """The host's bus; the simulator opens the first one."""
+    made = []
+    plain = can.Bus
+
+    def bus(*args, **options):
+        made.append(plain(*args, **options))
+        if len(made) == 2:
+            made[-1] = Adapter(made[-1])
+        return made[-1]
+
+    monkeypatch.setattr(can, "Bus", bus)
+    return lambda: made[1]
+
+
+def run_with(rehearse, monkeypatch, after_s, act, *arguments):
+    """The simulator runs out by itself only where faults are scripted: one that never comes does it."""
+    acted = at(monkeypatch, "speed", after_s, act)
+    return rehearse("--fault", "bus-dead@9999s", *arguments), acted
+
+
+def assert_left_to_the_watchdog(run, acted, seen, row, *words):
+    run.assert_ended(5, *words)
+    standstill_s = run.assert_stopped(acted[0], WATCHDOG_S)
+    assert run.shaft.events("host heartbeat lost")
+    assert run.shaft.state[-1] == "quick stop active"
+    assert "NOT confirmed" in run.done.document["stop"]
+    seen(row, run.message, standstill_s, run.assert_log_whole(), run.done.code)
+
+
+def test_row_12_adapter_unplugged(rehearse, adapter, monkeypatch, seen):
+    def act(sample):
+        adapter().error = can.CanOperationError("adapter is gone")
+
+    run, acted = run_with(rehearse, monkeypatch, 15.0, act)
+    assert_left_to_the_watchdog(run, acted, seen, 12, "adapter is gone", "Check adapter and cable", "watchdog")
+
+
+def test_row_13_bus_off(rehearse, adapter, monkeypatch, seen):
+    """The adapter may come back by itself; nothing more is sent in this run all the same."""
+    def act(sample):
+        adapter().error_frame(BUS_OFF)
+        adapter().sent.clear()
+
+    run, acted = run_with(rehearse, monkeypatch, 15.0, act)
+    assert adapter().sent == []
+    assert_left_to_the_watchdog(run, acted, seen, 13, "bus-off", "termination", "watchdog")
+
+
+def test_row_14_error_passive(rehearse, adapter, monkeypatch, seen):
+    def act(sample):
+        adapter().error_frame(CONTROLLER, TX_PASSIVE)
+
+    run, _ = run_with(rehearse, monkeypatch, 15.0, act, "--max-time", 45)
+    stages = dict(run.done.outcomes)
+    assert stages["speed"] == "degraded"
+    assert stages["torque"] == "ok"
+    assert "error-passive: check bit rate" in run.done.err.replace("\n", " ").replace("  ", " ")
+    run.shaft.assert_at_rest()
+    seen(14, "the run goes on; warned, and the stage is degraded: the adapter was error-passive", None,
+         run.assert_log_whole(), run.done.code)
+
+
+def test_row_15_transmit_queue_full(rehearse, adapter, monkeypatch, seen):
+    def act(sample):
+        bus = adapter()
+        bus.full = True
+        bus.tried.clear()
+
+    run, acted = run_with(rehearse, monkeypatch, 15.0, act)
+    assert len(adapter().tried) == 1                  # and never again
+    assert_left_to_the_watchdog(run, acted, seen, 15, "No buffer space", "watchdog")
+
+
+def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, monkeypatch, seen):
+    """The queue took some frames before it was full. They go out when the drive has begun to stop by itself."""
+    late = []
+
+    def full(message):
+        bus = adapter()
+        if len(bus.queued or ()) >= 10:
+            bus.full = True
+
+    def act(sample):
+        bus = adapter()
+        bus.queued, bus.on_frame = [], full
+        tried = len(bus.tried)
+
+        def shut_down(plain=bus.shutdown):
+            # The run is over, the drive has stopped by itself; now the kernel's queue goes out after all.
+            assert len(bus.tried) - tried <= 12
+            late.extend(bus.deliver())
+            plain()
+
+        bus.shutdown = shut_down
+
+    run, acted = run_with(rehearse, monkeypatch, 15.0, act)
+    run.assert_ended(5)
+    assert {message.arbitration_id for message in late} >= {0x201, 0x080}
+    (lost_s,) = run.shaft.events("host heartbeat lost")
+    assert lost_s - acted[0] <= WATCHDOG_S
+    standstill_s = run.assert_stopped(acted[0], WATCHDOG_S)
+    enabled = [t for t, state in zip(run.shaft.time_s, run.shaft.state, strict=True) if state == "operation enabled"]
+    assert max(enabled) <= lost_s                    # stale words of an enabled drive enabled nothing
+    seen(16, f"{len(late)} queued frames reached the drive late: it stays in its own quick stop", standstill_s,
+         run.assert_log_whole(), run.done.code)

@@ -1,0 +1,108 @@
+"""Rows 4 and 7: a host that is killed or frozen, in a process of its own; the drive's watchdog alone stops the shaft.
+
+Stepped time, but a silent host makes the simulator run on in its own. `tests/path/test_stops.py` does the same in more
+stages, and `benchmarks/kill_at_random.py` at fifty random moments.
+"""
+
+import signal
+from pathlib import Path
+
+import pytest
+from path_runs import PLAIN, QUICK_STOP_RAD_S2, SETTLING_S, WATCHDOG_S, Shaft, host, peer, tail_time, tdhil, wait_for
+
+from tdhil.record.reader import read_run
+
+CYCLE_S = 0.04
+SOURCES = ("drivers", "tdhil")
+
+
+@pytest.fixture
+def turning(no_bus_of_the_user, tmp_path):
+    """Peer and host, in stage 2 and past its ramp."""
+    with peer(tmp_path, "--stepped", "--seed", 1, program=PLAIN) as drive, host(
+        tmp_path, *drive.options, "--stepped", "--rate", 25, "--periods", 40
+    ) as running:
+        assert running.wait_for_line("stage speed …"), running.err
+        wait_for("speed", lambda: tail_time(drive.trace) > 12.0, running.child)
+        yield drive, running
+
+
+def rests(trace):
+    shaft = Shaft.read(trace)
+    lost = shaft.events("host heartbeat lost")
+    return bool(lost) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5 and shaft.at_rest_from() >= lost[0]
+
+
+def stopped_by_its_watchdog(drive):
+    wait_for("the end of the stop", lambda: rests(drive.trace))
+    shaft = drive.shaft
+    (silent_s,), (lost_s,) = shaft.events("running on in own time"), shaft.events("host heartbeat lost")
+    assert lost_s - silent_s <= WATCHDOG_S + CYCLE_S
+    assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
+    assert shaft.state[-1] == "quick stop active"
+    shaft.assert_at_rest()
+    return round(shaft.at_rest_from() - silent_s, 2)
+
+
+def test_row_4_killed(turning, seen):
+    drive, running = turning
+    running.signal(signal.SIGKILL)
+    done = running.finish()
+    standstill_s = stopped_by_its_watchdog(drive)
+    assert tdhil("recover", done.log).code == 3
+    run = read_run(done.log)
+    assert not run.complete
+    missing_s = drive.shaft.events("running on in own time")[0] - run.recording.time_s[-1]
+    assert missing_s <= 0.5 + CYCLE_S
+    seen(4, "SIGKILL in stage 2: the drive's watchdog stops the shaft", standstill_s,
+         f"salvaged up to {missing_s:.2f} s before the end", -9)
+
+
+def test_row_7_frozen(turning, seen):
+    drive, running = turning
+    running.signal(signal.SIGSTOP)
+    standstill_s = stopped_by_its_watchdog(drive)
+    rested_s = tail_time(drive.trace)
+    running.signal(signal.SIGCONT)
+    done = running.finish()
+    shaft = drive.shaft
+    assert done.code == 5, done.err
+    awake = shaft.time_s > rested_s
+    assert abs(shaft.speed_rad_s[awake]).max() < 0.02
+    assert "operation enabled" not in {state for state, now in zip(shaft.state, awake, strict=True) if now}
+    message = done.document["error"]["message"]
+    seen(7, f"SIGSTOP: the drive's watchdog stops the shaft; on waking it stays at rest: {message}", standstill_s,
+         "whole" if read_run(done.log).complete else "salvageable", done.code)
+
+
+def test_row_7_nothing_is_sent_by_kernel_or_thread():
+    """What lives in the kernel or in another thread would feed the watchdog with a dead host's setpoints."""
+    root = Path(__file__).parents[2]
+    for path in (path for source in SOURCES for path in (root / source).rglob("*.py")):
+        code = path.read_text(encoding="utf-8")
+        assert "send_periodic(" not in code, path
+    assert "threading" not in (root / "drivers" / "cia402" / "drive.py").read_text(encoding="utf-8")
+
+
+def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):
+    """`tdhil simulate canopen --fault …` in a process of its own: it learns of the stages from the host."""
+    with peer(tmp_path, "--stepped", "--seed", 1, "--fault", "emcy@speed+15s=4310h") as drive, host(
+        tmp_path, *drive.options, "--stepped", "--rate", 25
+    ) as running:
+        done = running.finish()
+        shaft = drive.shaft
+    assert done.code == 6, done.err
+    assert "EMCY 4310h, motor temperature" in done.document["error"]["message"]
+    (begun_s,), (fault_s,) = shaft.events("stage 2"), shaft.events("fault: emcy")
+    assert fault_s - begun_s == pytest.approx(15.0, abs=0.05)
+    shaft.assert_stopped_within_settings()
+
+
+@pytest.mark.parametrize(("more", "said"), [
+    (("-i", "virtual", "-c", "x", "--fault", "sto"), "embedded simulator only"),
+    (("--simulate", "--fault", "stop"), "no fault is called 'stop'"),
+])
+def test_faults_are_for_simulated_drives(more, said, no_bus_of_the_user):
+    done = tdhil("identify", *more)
+    assert done.code == 2
+    assert said in done.err

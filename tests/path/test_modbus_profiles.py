@@ -1,0 +1,35 @@
+"""Every shipped profile through the five stages, or their speed-mode variant, against the simulator that wears it.
+
+One seed here; twenty, and how often the interval covers: `benchmarks/every_profile.py`.
+"""
+
+import pytest
+from path_runs import Shaft, identify
+
+from profiles.library import load_profile, profile_names
+from profiles.modbus_schema import ModbusProfile
+
+TRUE_KG_M2 = 104.0
+# generic/cia402 is what tests/path/test_five_stages.py runs; EPOS4 takes four times as long as any other.
+NAMES = [name for name in profile_names() if name not in ("generic/cia402", "maxon/epos4")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_inertia(name, tmp_path):
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--profile", name, "--seed", 2, "--trace", trace)
+    assert done.code == 0, done.err
+    document = done.document
+    assert document["verdict"] in ("valid", "valid_wide")
+    inertia = document["inertia_kg_m2"]
+    assert inertia["value"] == pytest.approx(TRUE_KG_M2, rel=0.02)
+    assert inertia["low"] < TRUE_KG_M2 < inertia["high"]
+    profile = load_profile(name)
+    torque = not isinstance(profile, ModbusProfile) or profile.modes.torque
+    outcomes = dict(done.outcomes)
+    assert [outcomes[stage] for stage in ("setup", "speed", "acquire")] == ["ok"] * 3
+    if torque and outcomes["torque"] == "skipped":
+        assert name == "siemens/s120-canopen"          # no torque mode on CANopen
+    elif not torque:
+        assert (outcomes["torque"], outcomes["hold"]) == ("skipped", "skipped")
+    Shaft.read(trace).assert_at_rest()

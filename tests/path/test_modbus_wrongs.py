@@ -1,0 +1,102 @@
+"""A drive wired otherwise than its profile says, on the whole path: what is refused before motion, and what can't be.
+
+A register without a twin, an echo or a name plate to compare it with says nothing of its own scale or sign. Where
+that is so, preflight notes it, and the sign probe is the first that can tell.
+"""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from path_runs import Shaft, identify
+
+from profiles.library import load_modbus_profile, load_profile, profile_names
+from profiles.modbus_schema import ModbusProfile
+from sim_bus.modbus import embedded
+from sim_bus.modbus.wrongs import parse
+
+NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]
+WRONGS = ("word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied")
+
+ONE_REGISTER = "all of its numbers take one register each: there is no order that could be wrong"
+NO_TWIN = "no second register, name plate or echo tells what a count of speed or torque is worth"
+NO_SIGN = "none of its parameters is below zero, and no echo shows a setpoint of either sign"
+MAGNITUDE = "what is written below zero reads back with the same bits, and no echo shows what the drive made of them"
+NOTHING_WRITTEN = "preflight writes no parameter of it: there is nothing that could be not applied"
+
+PLAIN_16 = ("delta/ms300", "lenze/i550", "schneider/atv320", "schneider/atv340-930", "siemens/g120",
+            "siemens/g130-s120", "yaskawa/ga700")
+UNTOLD = {
+    **{(name, "word_order"): ONE_REGISTER for name in PLAIN_16},
+    **{(name, "scale_10"): NO_TWIN for name in (
+        "abb/acs880-enhanced", "danfoss/fc302", "delta/ms300", "lenze/i550", "schneider/atv320",
+        "schneider/atv340-930", "yaskawa/ga700")},
+    **{(name, "sign"): NO_SIGN for name in (
+        "delta/ms300", "schneider/atv320", "schneider/atv340-930", "siemens/g120", "siemens/g130-s120",
+        "yaskawa/ga700")},
+    **{(name, "unsigned"): MAGNITUDE for name in NAMES if name != "generic/modbus"},
+    **{(name, "write_not_applied"): NOTHING_WRITTEN for name in ("siemens/g120", "siemens/g130-s120")},
+}
+CAUGHT = [(name, wrong) for name in NAMES for wrong in WRONGS if (name, wrong) not in UNTOLD]
+
+
+def wired(monkeypatch, *wrongs):
+    drive = partial(embedded.EmbeddedModbusDrive, wrongs=tuple(map(parse, wrongs)))
+    monkeypatch.setattr(embedded, "EmbeddedModbusDrive", drive)
+
+
+def ran(tmp_path, name):
+    trace = tmp_path / "shaft.csv"
+    done = identify(tmp_path, "--simulate", "--profile", name, "--seed", 1, "--trace", trace)
+    return done, Shaft.read(trace)
+
+
+@pytest.mark.parametrize(("name", "wrong"), CAUGHT)
+def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
+    wired(monkeypatch, wrong)
+    done, shaft = ran(tmp_path, name)
+    assert done.code == 4, done.err
+    assert done.document["error"]["message"].count(". ") >= 1       # and what to do
+    assert "Traceback" not in done.err
+    assert np.max(np.abs(shaft.speed_rad_s)) < 0.001
+    shaft.assert_enabled(False)
+
+
+@pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "sign"])
+def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch, tmp_path):
+    wired(monkeypatch, "sign")
+    done, shaft = ran(tmp_path, name)
+    assert done.code == 4, done.err
+    assert "sign probe: the shaft turned backwards" in done.document["error"]["message"]
+    assert np.max(np.abs(shaft.speed_rad_s)) < 1.0
+    assert np.trapezoid(np.abs(shaft.speed_rad_s), shaft.time_s) < 3.0       # rad: the probe's travel
+    shaft.assert_at_rest()
+
+
+@pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "scale_10"])
+def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_path):
+    """Tenfold counts: a command is a tenth of what is meant, so the shaft is slower than asked, never faster."""
+    wired(monkeypatch, "scale_10")
+    done, shaft = ran(tmp_path, name)
+    assert done.code in (4, 6, 7, 8), done.err
+    assert "Traceback" not in done.err
+    assert np.max(np.abs(shaft.speed_rad_s)) < 1.0
+    assert np.max(np.abs(shaft.speed_rad_s[-100:])) < 0.001
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
+    from drivers.clock import SteppedClock
+    from drivers.drive import Limits
+    from drivers.modbus.drive import ModbusDrive
+    from drivers.modbus.embedded import EmbeddedLink
+
+    profile = load_modbus_profile(name)
+    peer = embedded.EmbeddedModbusDrive(embedded.RigParams(), profile)
+    drive = ModbusDrive(EmbeddedLink(peer.serve, SteppedClock()), profile, unit=peer.unit, given=dict(peer.untold),
+                        rated_torque_nm=None if profile.rated_torque else peer.rated_torque_nm)
+    drive.connect()
+    found = drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
+    assert found.refused == ()
+    notes = [check for check in found.checks if "in motion only" in check.found]
+    assert bool(notes) is not bool(profile.echoes)
