@@ -104,7 +104,7 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
         shaft = drive.shaft
     assert done.code == 0, done.out
     assert "another master is there" in done.out
-    assert ended.code in (6, 8), ended.err
+    assert ended.code in (5, 6, 8), ended.err        # 5: the run saw a second master at work
     assert abs(shaft.speed_rad_s[-1]) < 0.05
     shaft.assert_never_let_go()
 

@@ -2,6 +2,8 @@
 
 from sim_bus.modbus.families.base import Words
 
+_OF_THE_MODE = 0x3000
+
 
 class Cia402Words(Words):
     """Controlword and statusword as in `sim_bus.cia402_states`; the power side speaks them by itself.
@@ -19,4 +21,5 @@ class Cia402Words(Words):
         self.application.write_controlword(word)
 
     def status(self) -> int:
-        return self.application.statusword()
+        """Without bits 12 and 13: what they mean belongs to the profile modes, and velocity mode leaves them at 0."""
+        return self.application.statusword() & ~_OF_THE_MODE
