@@ -12,7 +12,7 @@ knows of objects, registers, per-mille or rpm. A caller goes down the list once:
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from drivers.clock import Clock
 
@@ -167,6 +167,8 @@ class Drive(Protocol):
     """One drive on one bus. Every method may raise `drivers.errors.TdhilError`.
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
+
+    A drive may also be a `Looking` one.
     """
 
     @property
@@ -193,3 +195,14 @@ class Drive(Protocol):
     def disable(self) -> None: ...
 
     def close(self) -> tuple[str, ...]: ...
+
+
+@runtime_checkable
+class Looking(Protocol):
+    """A drive that can also be asked for one sample beside the cycle, while a stop gets no feedback from that.
+
+    ``look`` takes a part of the watchdog's time at most, and asks once more for what `quick_stop` or `disable` asked
+    for; it never enables. None without an answer; it may raise TdhilError, too.
+    """
+
+    def look(self) -> Sample | None: ...

@@ -1,40 +1,15 @@
-"""The faults that can be scripted: name, row of the fault table, what they do, and what their value means."""
+"""The faults that can be scripted on CANopen: name, row of the fault table, what they do, what their value means."""
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from sim_bus import fault_drive as drive
 from sim_bus import fault_frames as frames
 from sim_bus.fault_hooks import Misbehaviour
-from sim_bus.fault_script import FaultRefused, Scripted, parse
+from sim_bus.fault_kinds import Kind, factor, listing_of, make_from, parse_from, plain, share
+from sim_bus.fault_script import Scripted
 
-Make = Callable[[str], Misbehaviour]
 _OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
-
-
-@dataclass(frozen=True)
-class Kind:
-    """``value``: the default, '' where the fault takes none. ``make`` may raise ValueError."""
-
-    row: int                           # of docs/faults.md; 0: none of its own
-    summary: str
-    make: Make
-    value: str = ""
-    takes: str = ""
-
-
-def _share(text: str) -> float:
-    number = float(text[:-1]) / 100.0 if text.endswith("%") else float(text)
-    if not 0.0 <= number <= 1.0:
-        raise ValueError("a share from 0 to 1, or 0% to 100%")
-    return number
-
-
-def _factor(text: str) -> float:
-    if not 0.01 <= float(text) <= 100.0:
-        raise ValueError("a factor from 0.01 to 100")
-    return float(text)
 
 
 def _code(text: str) -> int:
@@ -50,26 +25,22 @@ def _object(text: str) -> tuple[int, int]:
     return int(found[1], 16), int(found[2] or 0)
 
 
-def _plain(make: Callable[[], Misbehaviour]) -> Make:
-    return lambda _value: make()
-
-
-KINDS: dict[str, Kind] = {
-    "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", _plain(frames.Dead)),
+KINDS: dict[str, Kind[Misbehaviour]] = {
+    "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(frames.Dead)),
     "frame-loss": Kind(17, "this share of all frames is lost, either way",
-                       lambda v: frames.Lossy(_share(v)), "5%", "SHARE"),
+                       lambda v: frames.Lossy(share(v)), "5%", "SHARE"),
     "duplicate-frames": Kind(18, "this share of the feedback comes twice",
-                             lambda v: frames.Doubled(_share(v)), "10%", "SHARE"),
+                             lambda v: frames.Doubled(share(v)), "10%", "SHARE"),
     "reordered-frames": Kind(18, "this share of the feedback comes after that of the next cycle",
-                             lambda v: frames.Reordered(_share(v)), "10%", "SHARE"),
-    "frozen-feedback": Kind(19, "the feedback repeats its last values", _plain(frames.Frozen)),
+                             lambda v: frames.Reordered(share(v)), "10%", "SHARE"),
+    "frozen-feedback": Kind(19, "the feedback repeats its last values", plain(frames.Frozen)),
     "feedback-lost": Kind(19, "no TPDO comes any more; the heartbeat goes on",
-                          _plain(lambda: frames.Without(0x180, 0x280))),
-    "heartbeat-lost": Kind(20, "the drive's heartbeat ends", _plain(lambda: frames.Without(0x700))),
+                          plain(lambda: frames.Without(0x180, 0x280))),
+    "heartbeat-lost": Kind(20, "the drive's heartbeat ends", plain(lambda: frames.Without(0x700))),
     "node-reset": Kind(21, "the drive restarts (boot-up message); its torque is off, the shaft coasts",
-                       _plain(drive.Restart)),
-    "foreign-nmt-stop": Kind(22, "a third party sends NMT stop", _plain(lambda: drive.ForeignNmt(2))),
-    "foreign-nmt-preop": Kind(22, "a third party sends NMT pre-operational", _plain(lambda: drive.ForeignNmt(128))),
+                       plain(drive.Restart)),
+    "foreign-nmt-stop": Kind(22, "a third party sends NMT stop", plain(lambda: drive.ForeignNmt(2))),
+    "foreign-nmt-preop": Kind(22, "a third party sends NMT pre-operational", plain(lambda: drive.ForeignNmt(128))),
     "emcy": Kind(23, "an emergency message, with the drive still enabled",
                  lambda v: drive.Emcy(_code(v)), "7305h", "CODE"),
     "drive-fault": Kind(23, "emergency message and fault state, after the drive's own fault reaction",
@@ -79,61 +50,41 @@ KINDS: dict[str, Kind] = {
     "sdo-timeout": Kind(25, "the drive doesn't answer when asked for an object",
                         lambda v: frames.Unanswered(*_object(v)), "6072h", "OBJECT"),
     "second-master": Kind(26, "another host: from the start the drive is enabled already; later, foreign setpoints",
-                          _plain(frames.SecondMaster)),
-    "duplicate-node": Kind(26, "a second drive answers under the same node ID", _plain(frames.SecondNode)),
+                          plain(frames.SecondMaster)),
+    "duplicate-node": Kind(26, "a second drive answers under the same node ID", plain(frames.SecondNode)),
     "wrong-identity": Kind(29, "1018h:1, the vendor, is another one",
-                           _plain(lambda: frames.Otherwise(0x1018, 1))),
+                           plain(lambda: frames.Otherwise(0x1018, 1))),
     "fault-at-start": Kind(30, "the drive is in fault when the host comes",
                            lambda v: drive.DriveFault(_code(v)), "3210h", "CODE"),
-    "stuck-state": Kind(31, "the controlword is ignored", _plain(drive.Deaf)),
-    "mode-not-followed": Kind(32, "6061h doesn't follow 6060h", _plain(drive.ModeKept)),
-    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive", _plain(drive.SafeTorqueOff)),
+    "stuck-state": Kind(31, "the controlword is ignored", plain(drive.Deaf)),
+    "mode-not-followed": Kind(32, "6061h doesn't follow 6060h", plain(drive.ModeKept)),
+    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(drive.SafeTorqueOff)),
     "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
-                           lambda v: drive.LimitedTorque(_share(v)), "10%", "SHARE"),
+                           lambda v: drive.LimitedTorque(share(v)), "10%", "SHARE"),
     "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
-                      lambda v: drive.LoadLost(max(0.001, _share(v))), "10%", "SHARE"),
-    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", _plain(lambda: drive.Reported(speed=-1.0))),
+                      lambda v: drive.LoadLost(max(0.001, share(v))), "10%", "SHARE"),
+    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: drive.Reported(speed=-1.0))),
     "write-not-kept": Kind(45, "a write to an object is answered and not kept",
                            lambda v: frames.NotKept(*_object(v)), "6080h", "OBJECT"),
     "reads-back-otherwise": Kind(45, "an object reads back as something else",
                                  lambda v: frames.Otherwise(*_object(v)), "6072h", "OBJECT"),
     "watchdog-not-armed": Kind(50, "the write to 1016h:1 is answered and not kept",
-                               _plain(lambda: frames.NotKept(0x1016, 1))),
+                               plain(lambda: frames.NotKept(0x1016, 1))),
     "torque-scale": Kind(0, "the reported torque is multiplied by this",
-                         lambda v: drive.Reported(torque=_factor(v)), "1.1", "FACTOR"),
+                         lambda v: drive.Reported(torque=factor(v)), "1.1", "FACTOR"),
 }
 
 
 def make(fault: Scripted) -> Misbehaviour:
     """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
-    kind = KINDS.get(fault.name)
-    where = f"--fault {fault.text or fault.name}"
-    if kind is None:
-        raise FaultRefused(f"no fault is called {fault.name!r}", where=where, next_step="--fault list shows them")
-    if fault.value and not kind.takes:
-        raise FaultRefused(f"{fault.name} takes no value", where=where, next_step="Leave the = out")
-    try:
-        return kind.make(fault.value or kind.value)
-    except ValueError as error:
-        raise FaultRefused(
-            f"{fault.value!r} is no value of {fault.name}", where=where,
-            next_step=f"It takes {kind.takes}, such as {kind.value} ({error})",
-        ) from None
+    return make_from(KINDS, fault)
 
 
 def parse_all(texts: Sequence[str]) -> tuple[Scripted, ...]:
     """All the faults of a command line, each checked. Raises FaultRefused."""
-    faults = tuple(parse(text) for text in texts)
-    for fault in faults:
-        make(fault)
-    return faults
+    return parse_from(KINDS, texts)
 
 
 def listing() -> str:
     """Every fault with its row and value, for people."""
-    lines = ["NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: setup, speed, torque, hold, acquire, hold+2s",
-             "", f"{'row':>3}  {'name':<30}what happens"]
-    for name, kind in sorted(KINDS.items(), key=lambda item: (item[1].row or 99, item[0])):
-        shown = f"{name}[={kind.value}]" if kind.takes else name
-        lines.append(f"{kind.row or '-':>3}  {shown:<30}{kind.summary}")
-    return "\n".join(lines)
+    return listing_of(KINDS)

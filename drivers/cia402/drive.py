@@ -20,6 +20,7 @@ from drivers.cia402 import preflight as checks
 from drivers.cia402.guarding import Guarding
 from drivers.cia402.limits import set_limits
 from drivers.cia402.link import CanLink
+from drivers.cia402.look import keep_stepping, look, push
 from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
 from drivers.cia402.parameters import check_parameters
 from drivers.cia402.sdo import Objects, name
@@ -37,7 +38,7 @@ from drivers.cia402.state import (
     power_state,
 )
 from drivers.cia402.units import find_units
-from drivers.cia402.watch import OPERATIONAL, Watch
+from drivers.cia402.watch import OPERATIONAL, STOPPED, Watch
 from drivers.clock import Clock
 from drivers.drive import (
     Command,
@@ -146,7 +147,7 @@ class Cia402Drive:
         self._state = State.NOT_READY
         self._status = 0
         self._speed_raw = 0
-        self._torque_raw = 0
+        self._torque_raw: float = 0
         self._demand_raw: int | None = None
         self._shown_code = 0
         self._sent_code = 0
@@ -342,6 +343,31 @@ class Cia402Drive:
             self._missed += 1
         self._watch.check()
         return self._sample(now_s, age_s, fresh)
+
+    def look(self) -> Sample | None:
+        """Status, speed and torque by SDO, for a stop whose cyclic feedback is not to be had; None without an answer.
+
+        Once something else than enabling was asked for, that goes out by SDO (6040h) too. Raises CommunicationLost.
+        """
+        if self._watch.nmt_state == STOPPED:
+            self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        self._feed()
+        begun_s = self.clock.now_s()
+        found = look(self._objects, self._profile, self._watchdog_s)
+        if found is None:
+            return None
+        if self.clock.stepped:
+            keep_stepping(self._objects, self._profile, self.period_s)
+        half_s = 0.5 * (self.clock.now_s() - begun_s)
+        self._status, self._speed_raw = found.status, found.speed
+        self._torque_raw = self._torque_raw if found.torque is None else found.torque
+        self._state = decode(found.status)
+        self._follow_state()
+        push(self._objects, found.status, self._wish, self._watchdog_s)
+        self._feed()
+        if not self.clock.stepped:         # time well spent: no overrun, and no loop that stood still
+            self._next_tick_s = max(self._next_tick_s, self.clock.now_s())
+        return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
 
     def _follow_state(self) -> None:
         """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.

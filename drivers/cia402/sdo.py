@@ -7,7 +7,8 @@ waiting is replaced: it pulls frames off the link instead of sleeping on a queue
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import canopen
@@ -96,6 +97,17 @@ class Objects:
     def doubled(self) -> int:
         """How many requests were answered twice."""
         return self._client.doubled
+
+    @contextmanager
+    def answered_within(self, answer_s: float) -> Iterator[None]:
+        """Ask once only, and wait no longer than ``answer_s`` of wall time: a shaft may be turning meanwhile."""
+        client = self._client
+        usual = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
+        client.RESPONSE_TIMEOUT, client.MAX_RETRIES = answer_s, 1
+        try:
+            yield
+        finally:
+            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = usual
 
     def read_bytes(self, index: int, subindex: int = 0) -> bytes:
         try:

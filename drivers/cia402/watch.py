@@ -80,6 +80,7 @@ class Watch:
         self.allowed_silence_s = 0.0
         self.expect_operational = False
         self.emcy_code = 0
+        self.nmt_state: int | None = None      # as the drive last told it; None before
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
 
     def on_heartbeat(self, data: bytes) -> None:
@@ -88,6 +89,7 @@ class Watch:
             return
         state = data[0] & 0x7F
         self._heard_s = self._clock.now_s()
+        self.nmt_state = state
         if not self.expect_operational:
             return
         if state == BOOT_UP:

@@ -92,12 +92,15 @@ class Access:
 
     def write_words(self, address: int, words: tuple[int, ...], where: str = "") -> None:
         """Neighbouring registers, in one request where the drive knows a function for that."""
+        self.ask(self.write_request(address, words), where)
+
+    def write_request(self, address: int, words: tuple[int, ...]) -> bytes:
+        """The PDU that writes neighbouring registers."""
         if len(words) == 1 and requests.WRITE_ONE in self._functions:
-            self.ask(requests.write_one(address, words[0]), where)
-        elif requests.WRITE_MANY in self._functions or requests.READ_WRITE not in self._functions:
-            self.ask(requests.write_many(address, words), where)
-        else:
-            self.ask(requests.read_write(address, len(words), address, words), where)
+            return requests.write_one(address, words[0])
+        if requests.WRITE_MANY in self._functions or requests.READ_WRITE not in self._functions:
+            return requests.write_many(address, words)
+        return requests.read_write(address, len(words), address, words)
 
     def change(self, register: Register, counts: int) -> int:
         """Write, remember what stood there before, and read back what stands there now.

@@ -25,10 +25,11 @@ from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless
 from drivers.modbus.limits import set_limits
 from drivers.modbus.link import Link, late_replies
 from drivers.modbus.parameters import find_filters
-from drivers.modbus.plan import Transaction, plan_cycle
+from drivers.modbus.plan import Transaction, only_reads, plan_cycle
 from drivers.modbus.registers import register_name
 from drivers.modbus.rounds import Round, go_round
 from drivers.modbus.scales import Scales
+from drivers.modbus.stage_marker import tell_stage
 from drivers.modbus.standstill import Standstill
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
 from drivers.modbus.ticks import Ticks
@@ -77,10 +78,12 @@ class ModbusDrive:
         self._rated_torque_nm = rated_torque_nm
         self._given = dict(given or {})
         self._plan = plan_cycle(profile)
+        self._reads = only_reads(self._plan.cycle, frozenset(profile.cycle.functions))
         self._moving = (profile.cycle.speed.register_, profile.cycle.torque.register_)
         self._codec = Codec(profile, Scales(1.0, 1.0, 1.0, 1.0, 1.0), has_demand=self._plan.has_demand)
         self._standstill = Standstill(1.0, 1.0, self.period_s)
         self._identity: Identity | None = None
+        self._stage = ""               # as announced
         self._modes: frozenset[Mode] = frozenset()
         self._watchdog_s = self._timeout_s = 0.0
         self._wish = Wish.OFF
@@ -110,7 +113,14 @@ class ModbusDrive:
         if self.clock.stepped:
             refuse_unless_stepped(marker)
         self._identity = Identity(0, 0, 0, 0, self._profile.title, marker.simulated)
+        self.announce(self._stage)
         return self._identity
+
+    def announce(self, stage: str) -> None:
+        """Tell a simulated peer that a stage of the protocol begins; a real drive is told nothing."""
+        self._stage = stage
+        if self._identity is not None and self._identity.simulated:
+            tell_stage(self._access, self._profile.cycle.functions, stage)
 
     def preflight(self, limits: Limits) -> Preflight:
         """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""
@@ -228,6 +238,35 @@ class ModbusDrive:
         self._follow_state()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def look(self) -> Sample | None:
+        """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still tell how it is.
+
+        While it shows itself enabled the quick-stop word is written by itself, once each time.
+        """
+        if not self._reads:
+            return None
+        try:
+            got = go_round(self._access, self._reads, {}, self._timeout_s, self._moving)
+        except (CommunicationLost, RegisterRefused):
+            return None
+        self._take(self._codec.feedback(got.words), self._sent_mode)
+        if self._wish is not Wish.ENABLED and power_state(self._state) is PowerState.ENABLED:
+            self._push()
+        self._ticks.done()
+        half_s = 0.5 * (got.received_s - got.sent_s)
+        return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def _push(self) -> None:
+        """The control word of a quick stop alone, in the shortest request that the drive knows."""
+        control = self._profile.cycle.control.register_
+        word = controlword_towards(
+            self._profile.control, self._state, Wish.QUICK_STOP, self._sent_mode, reverse=self._reverse
+        )
+        try:
+            self._access.once(self._access.write_request(control.address, (word,)), self._timeout_s)
+        except (CommunicationLost, RegisterRefused):
+            return                     # the next look sees what became of it
 
     def _transactions(self, mode: Mode) -> tuple[Transaction, ...]:
         """The plan's, with those that only a mode switch needs: the mode after its setpoint, then its display."""

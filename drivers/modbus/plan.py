@@ -112,6 +112,17 @@ def plan_cycle(profile: ModbusProfile) -> CyclePlan:
     )
 
 
+def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -> tuple[Transaction, ...]:
+    """What these transactions read, without any writing; () where the drive knows no function for that."""
+    found = []
+    for span in (one.read for one in transactions if one.read is not None and one.read != one.write):
+        function = requests.READ_HOLDING if span.table == "holding" else requests.READ_INPUT
+        if function not in functions:
+            return ()
+        found.append(Transaction(function, None, span))
+    return tuple(found)
+
+
 def spans(registers: Iterable[Register], gap: int, most: int) -> list[Span]:
     """Registers gathered into as few spans as possible, none cut in two. Raises PreflightRefused if one is too long."""
     found: list[Span] = []

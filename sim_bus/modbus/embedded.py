@@ -12,7 +12,11 @@ from typing import Self
 import numpy as np
 
 from profiles.modbus_schema import ModbusProfile
+from sim_bus.fault_script import Scripted
+from sim_bus.modbus.fault_catalogue import wrongs_of
+from sim_bus.modbus.faults import Faults, tells_stage
 from sim_bus.modbus.machine import Machine
+from sim_bus.modbus.reply import Reply
 from sim_bus.modbus.timing import LineTiming
 from sim_bus.modbus.wrongs import Wrong
 from sim_bus.params import RigParams
@@ -25,13 +29,19 @@ _LOOK_S = 0.1
 
 
 class EmbeddedModbusDrive:
-    """A drive that wears ``profile``, at the end of a line of ``timing`` (the profile's own unless given)."""
+    """A drive that wears ``profile``, at the end of a line of ``timing`` (the profile's own unless given).
+
+    ``script`` as `sim_bus.modbus.fault_catalogue.parse_all` gives it. TdhilError where it doesn't fit the profile.
+    """
 
     def __init__(self, params: RigParams, profile: ModbusProfile, *, unit: int = 1, seed: int = 0,
-                 trace: Path | None = None, timing: LineTiming | None = None, wrongs: tuple[Wrong, ...] = ()) -> None:
+                 trace: Path | None = None, timing: LineTiming | None = None, wrongs: tuple[Wrong, ...] = (),
+                 script: tuple[Scripted, ...] = ()) -> None:
         self.unit = unit
         self.timing = timing if timing is not None else LineTiming.of(profile.line)
+        wrongs += wrongs_of(script, [one.name for one in profile.parameters])
         self.machine = Machine(params, profile, seed=seed, trace=trace, wrongs=wrongs, stepped=True)
+        self._faults = Faults(self.machine, profile, script, seed)
         self._chances = np.random.default_rng((seed, 1))
         self._free_s = 0.0              # the line has been silent long enough from here on
         self._time_s = 0.0
@@ -62,19 +72,23 @@ class EmbeddedModbusDrive:
 
         The plant has then run up to the moment at which the drive acted. A line that isn't free yet delays the request.
         """
+        if unit == self.unit and tells_stage(pdu):     # belongs to the rehearsal: takes no time on the line
+            self.run_until(now_s)
+            return self._faults.request(pdu).pdu, now_s
         timing = self.timing
         acts_s = max(now_s, self._free_s) + timing.acts_after_s(len(pdu), self._chances.random())
         self.run_until(acts_s)
         if unit not in {self.unit, _BROADCAST}:
             self._free_s = acts_s
             return None, acts_s
-        reply = self.machine.request(pdu)
-        if unit == _BROADCAST:
+        reply = self._faults.request(pdu)
+        heard = _heard(reply)
+        if unit == _BROADCAST or heard is None:
             self._free_s = acts_s
             return None, acts_s
-        complete_s = acts_s + timing.way_s(len(reply), self._chances.random())
+        complete_s = acts_s + timing.way_s(len(heard), self._chances.random())
         self._free_s = complete_s + timing.silence_s
-        return reply, complete_s
+        return heard, complete_s + reply.late_s
 
     def run_until(self, time_s: float) -> None:
         """The plant runs on; a watchdog that is due acts on the way."""
@@ -103,3 +117,8 @@ class EmbeddedModbusDrive:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  where: TracebackType | None) -> None:
         self.close()
+
+
+def _heard(reply: Reply) -> bytes | None:
+    """What a host's receiver passes on."""
+    return None if reply.crc_bits else reply.pdu

@@ -48,9 +48,9 @@ def tcp_requests(buffer: bytearray) -> Iterator[Request]:
         yield Request(unit, pdu, transaction)
 
 
-def tcp_reply(request: Request, pdu: bytes) -> bytes:
-    """The frame that answers."""
-    return _MBAP.pack(request.transaction, 0, len(pdu) + 1, request.unit) + pdu
+def tcp_reply(request: Request, pdu: bytes, wrong_bits: int = 0) -> bytes:
+    """The frame that answers; ``wrong_bits`` of its transaction are another's."""
+    return _MBAP.pack(request.transaction ^ wrong_bits, 0, len(pdu) + 1, request.unit) + pdu
 
 
 class RtuReceiver:
@@ -92,10 +92,10 @@ class RtuReceiver:
         return length if len(buffer) >= length else 0
 
 
-def rtu_reply(request: Request, pdu: bytes) -> bytes:
-    """The frame that answers."""
+def rtu_reply(request: Request, pdu: bytes, wrong_bits: int = 0) -> bytes:
+    """The frame that answers; ``wrong_bits`` of its CRC are wrong."""
     body = bytes((request.unit,)) + pdu
-    return body + crc(body).to_bytes(2, "little")
+    return body + (crc(body) ^ wrong_bits).to_bytes(2, "little")
 
 
 def crc(data: bytes | bytearray) -> int:

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import struct
 import termios
 import time
 import tty
@@ -11,11 +12,15 @@ from typing import Protocol
 
 from profiles.errors import TdhilError
 from sim_bus.modbus.framing import NotModbus, Request, RtuReceiver, rtu_reply, tcp_reply, tcp_requests
+from sim_bus.modbus.late import Late
+from sim_bus.modbus.reply import Reply
 
 _CLIENTS = 16
 _SEND_TIMEOUT_S = 1.0
-Serve = Callable[[Request], bytes | None]
-"""A request → the reply's PDU, None for no reply."""
+_AT_ONCE = struct.pack("ii", 1, 0)
+"""SO_LINGER: closing sends a reset."""
+Serve = Callable[[Request], Reply]
+"""A request → what comes back."""
 
 
 class Listener(Protocol):
@@ -30,6 +35,9 @@ class Listener(Protocol):
 
     def ready(self, source: int, serve: Serve) -> None:
         """One of them has something."""
+
+    def send_late(self) -> None:
+        """Replies that were held back and are due."""
 
     def close(self) -> None:
         """Gives everything back; safe to repeat."""
@@ -47,6 +55,8 @@ class TcpListener:
                 next_step="Take another port (0 takes any free one), or end what listens there",
             ) from error
         self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
+        self._silent: list[socket.socket] = []     # half open: never looked at again
+        self._late: Late[socket.socket] = Late()
 
     @property
     def reached_by(self) -> str:
@@ -67,17 +77,39 @@ class TcpListener:
                 raise ConnectionResetError
             buffer += data
             for request in tcp_requests(buffer):
-                pdu = serve(request)
-                if pdu is not None:
-                    client.sendall(tcp_reply(request, pdu))
+                reply = serve(request)
+                if reply.connection:
+                    self._let_go(source, reset=reply.connection == "reset")
+                    return
+                if reply.pdu is not None and not reply.crc_bits:
+                    frame = tcp_reply(request, reply.pdu, reply.transaction_bits)
+                    if reply.late_s:
+                        self._late.put(client, frame, reply.late_s)
+                    else:
+                        client.sendall(frame)
         except (OSError, NotModbus):
             self._clients.pop(source)[0].close()
 
+    def send_late(self) -> None:
+        for client, frame in self._late.due():
+            with suppress(OSError):            # it has gone: so is the reply
+                client.sendall(frame)
+
     def close(self) -> None:
-        for client, _ in self._clients.values():
+        for client in [*self._silent, *(client for client, _ in self._clients.values())]:
             client.close()
+        self._silent.clear()
         self._clients.clear()
         self._server.close()
+
+    def _let_go(self, source: int, *, reset: bool) -> None:
+        """A connection dies: by a reset, or in silence and without an end."""
+        client, _ = self._clients.pop(source)
+        if reset:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+            client.close()
+        else:
+            self._silent.append(client)
 
     def _accept(self) -> None:
         with suppress(OSError):
@@ -112,6 +144,7 @@ class RtuListener:
             ) from error
         os.set_blocking(self._fd, False)
         self._receiver = RtuReceiver()
+        self._late: Late[int] = Late()
 
     def sources(self) -> list[int]:
         return [self._fd]
@@ -124,10 +157,17 @@ class RtuListener:
         except OSError as error:
             raise TdhilError(f"the line has gone: {error.strerror}", where=self.reached_by) from error
         for request in self._requests(data):
-            pdu = serve(request)
-            if pdu is not None:
-                with suppress(BlockingIOError):            # nobody reads: the reply is lost, as on a line
-                    os.write(source, rtu_reply(request, pdu))
+            reply = serve(request)
+            if reply.pdu is not None:
+                frame = rtu_reply(request, reply.pdu, reply.crc_bits)
+                if reply.late_s:
+                    self._late.put(source, frame, reply.late_s)
+                else:
+                    _write(source, frame)
+
+    def send_late(self) -> None:
+        for source, frame in self._late.due():
+            _write(source, frame)
 
     def close(self) -> None:
         for fd in (self._fd, self._slave):
@@ -137,6 +177,11 @@ class RtuListener:
 
     def _requests(self, data: bytes) -> Iterator[Request]:
         return self._receiver.feed(data, time.monotonic())
+
+
+def _write(fd: int, frame: bytes) -> None:
+    with suppress(BlockingIOError):            # nobody reads: the reply is lost, as on a line
+        os.write(fd, frame)
 
 
 def _set_line(fd: int, baud: int, parity: str, stop_bits: int) -> None:

@@ -4,6 +4,7 @@ Plant and control move on the drive's own grid, the control period of plant.yaml
 Owns no clock: whoever calls `run_until` says how late it is.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -44,7 +45,7 @@ class Machine:
         application.set_mode((Mode.PROFILE_VELOCITY if wiring.ramps else Mode.CYCLIC_VELOCITY).value)
         application.settings.accel_rad_s2 = application.settings.decel_rad_s2 = RAMP_RAD_S2
         self.words = FAMILIES[profile.control.family](application, wiring)
-        self._map = Map(profile, self.parameters, self.words, wrongs, stepped=stepped)
+        self._map = Map(profile, self.parameters, self.words, wrongs, stepped=stepped, on_stage=self._told_stage)
         cycle = profile.cycle
         self._bank = Bank(self._map.slots, cycle.functions, self._written, largest_read=cycle.largest_read,
                           largest_write=cycle.largest_write)
@@ -53,9 +54,13 @@ class Machine:
         self._period_s = params.drive.control_period_s
         self._steps = 0
         self._next_row_us = 0
-        application.on_event = self._note
+        self._torque_share = 1.0
+        self._was_told = False         # the request that is being answered says which stage has begun
+        self.on_time: Callable[[int], None] | None = None      # plant time in µs, after each step
+        self.on_stage: Callable[[int], None] = lambda _number: None
+        application.on_event = self.note
         self._obey_parameters()
-        self._note("power on")
+        self.note("power on")
 
     @property
     def time_s(self) -> float:
@@ -64,9 +69,21 @@ class Machine:
 
     def request(self, pdu: bytes) -> bytes:
         """A request for this drive, at the time that it is."""
+        self._was_told = False
         answer = self._bank.answer(pdu)
-        self._fed(answer)
+        if not self._was_told:          # the marker isn't the drive's: what is said there feeds no watchdog
+            self._fed(answer)
         return answer.pdu
+
+    def refuse(self, pdu: bytes, code: int) -> bytes:
+        """Scripted: a request is heard and not done; the reply is an exception of this code."""
+        self._fed(Answer(b""))
+        return bytes((pdu[0] | 0x80, code))
+
+    def leave_torque(self, share: float) -> None:
+        """Scripted: an internal limit leaves this share of the torque limits."""
+        self._torque_share = share
+        self._obey_parameters()
 
     def run_until(self, time_s: float) -> None:
         """Everything moves on, up to the last step of the grid that is not later."""
@@ -78,11 +95,19 @@ class Machine:
             self.application.step(self._period_s)
             self._row()
             self._watch()
+            if self.on_time is not None:
+                self.on_time(round(1e6 * self.time_s))
 
     def trip(self) -> None:
         """The drive finds a fault of its own."""
         self.application.fault()
-        self._note("fault")
+        self.note("fault")
+
+    def note(self, event: str) -> None:
+        """A row of the trace that says what happened; '' is a new state."""
+        state = self.application.state.value
+        self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm, state,
+                        event or f"state: {state}")
 
     def close(self) -> None:
         """The trace is written; safe to repeat."""
@@ -116,17 +141,22 @@ class Machine:
 
     def _obey_parameters(self) -> None:
         limits, parameters = self.inverter.control.limits, self.parameters
-        limits.torque_forward_nm = parameters.limit_nm("torque_limit")
-        limits.torque_reverse_nm = parameters.limit_nm("torque_limit_reverse")
+        limits.torque_forward_nm = self._torque_share * parameters.limit_nm("torque_limit")
+        limits.torque_reverse_nm = self._torque_share * parameters.limit_nm("torque_limit_reverse")
         limits.speed_rad_s = parameters.speed_limit_rad_s()
         self.application.settings.quick_stop_rad_s2 = parameters.quick_stop_rad_s2()
+
+    def _told_stage(self, number: int) -> None:
+        self._was_told = True
+        self.note(f"stage {number}")
+        self.on_stage(number)
 
     def _fed(self, answer: Answer) -> None:
         lost = self.watchdog.lost
         self.watchdog.heard(self.time_s, wrote=answer.wrote, commanded=answer.commanded)
         if lost and not self.watchdog.lost:
             self.application.warning = False
-            self._note("host is back")
+            self.note("host is back")
 
     def _watch(self) -> None:
         watchdog = self._profile.watchdog
@@ -137,7 +167,7 @@ class Machine:
 
     def _host_lost(self) -> None:
         """The profile's reaction; none where the parameter that chooses it reads something else than it should."""
-        self._note("host silent")
+        self.note("host silent")
         watchdog, settings = self._profile.watchdog, self.application.settings
         self.application.warning = True
         self.words.set_quick_stop()
@@ -156,11 +186,6 @@ class Machine:
             self._next_row_us = (time_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
             self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm,
                             self.application.state.value)
-
-    def _note(self, event: str) -> None:
-        state = self.application.state.value
-        self._trace.row(self.time_s, self.inverter.speed_rad_s, self.inverter.torque_nm, state,
-                        event or f"state: {state}")
 
 
 def _wiring(profile: ModbusProfile) -> Wiring:

@@ -26,6 +26,7 @@ class Parameters:
         self._acting: dict[str, float] = {}        # what still acts where another is stored: until a restart
         self._tenths = any(wrong.kind == "scale_10" for wrong in wrongs)
         self._other = {wrong.of for wrong in wrongs if wrong.kind == "reads_back_something_else"}
+        self.not_kept = set[str]()                 # of these no writing is
         self.keeps = not any(wrong.kind == "write_not_applied" for wrong in wrongs)
         self.rated_rpm = start(self, profile, rig)
 
@@ -54,7 +55,7 @@ class Parameters:
 
     def write(self, name: str, number: int) -> None:
         """What the host wrote there; kept unless the drive has that wrong."""
-        if not self.keeps:
+        if not self.keeps or name in self.not_kept:
             return
         if not self._by_name[name].writable_in_operation:
             self._acting.setdefault(name, self._stored[name])

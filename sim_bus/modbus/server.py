@@ -4,9 +4,11 @@ import select
 import threading
 import time
 
+from sim_bus.modbus.faults import Faults
 from sim_bus.modbus.framing import Request
 from sim_bus.modbus.lines import Listener
 from sim_bus.modbus.machine import Machine
+from sim_bus.modbus.reply import NONE, Reply
 
 _POLL_S = 0.005
 _BROADCAST = 0
@@ -15,12 +17,14 @@ _ANY_UNIT = 255
 
 
 class Server:
-    """One drive on one line; `run` is the only thread."""
+    """One drive on one line, with what happens to its requests; `run` is the only thread."""
 
-    def __init__(self, machine: Machine, unit: int, listener: Listener, *, gateway: bool) -> None:
+    def __init__(self, machine: Machine, unit: int, listener: Listener, *, gateway: bool,
+                 faults: Faults | None = None) -> None:
         self._machine = machine
         self._unit = unit
         self._listener = listener
+        self._ask = (lambda pdu: Reply(machine.request(pdu))) if faults is None else faults.request
         self._whole = (unit, _BROADCAST, _ANY_UNIT) if gateway else (unit,)
         self._began_s = time.monotonic()
 
@@ -31,16 +35,17 @@ class Server:
             ready, _, _ = select.select(self._listener.sources(), [], [], _POLL_S)
             for source in ready:
                 self._listener.ready(source, self._serve)
+            self._listener.send_late()
             self._catch_up()
             self._machine.flush()
 
-    def _serve(self, request: Request) -> bytes | None:
+    def _serve(self, request: Request) -> Reply:
         self._catch_up()
         if request.unit in self._whole:
-            return self._machine.request(request.pdu)
+            return self._ask(request.pdu)
         if request.unit == _BROADCAST:
-            self._machine.request(request.pdu)
-        return None
+            self._ask(request.pdu)
+        return NONE
 
     def _catch_up(self) -> None:
         self._machine.run_until(time.monotonic() - self._began_s)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
-from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_TEXT
+from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
 from profiles.modbus_schema import Echo, ModbusProfile, Register, Signal
 from sim_bus.cia402_application import Application
 from sim_bus.modbus.errors import DeviceFailure, IllegalValue
@@ -35,7 +35,7 @@ class Map:
     """All slots; of two on one register the first counts."""
 
     def __init__(self, profile: ModbusProfile, parameters: Parameters, words: Words, wrongs: tuple[Wrong, ...],
-                 *, stepped: bool) -> None:
+                 *, stepped: bool, on_stage: Callable[[int], None] = lambda _number: None) -> None:
         self._profile = profile
         self._parameters = parameters
         self._words = words
@@ -50,6 +50,9 @@ class Map:
         self._fill_gaps(profile.cycle.largest_gap)
         for slot in _marker(stepped):
             self._lay(slot)
+        self._stage = 0
+        self._on_stage = on_stage
+        self._lay(Slot(Layout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
 
     def act(self) -> None:
         """Setpoints take effect; where the drive isn't listening, they keep."""
@@ -145,6 +148,10 @@ class Map:
 
     def _set_torque(self, counts: int) -> None:
         self._torque_counts = counts
+
+    def _set_stage(self, number: int) -> None:
+        self._stage = number
+        self._on_stage(number)
 
     def _status(self) -> int:
         """The family's word; over it what the user has wired to it, but on ABB, whose bit 11 is the family's own."""

@@ -96,7 +96,8 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
     from drivers.modbus.embedded import EmbeddedLink
     from sim_bus.modbus.embedded import EmbeddedModbusDrive
 
-    drive = EmbeddedModbusDrive(plan.plant, profile, unit=unit, seed=plan.seed or 0, trace=trace)
+    drive = EmbeddedModbusDrive(plan.plant, profile, unit=unit, seed=plan.seed or 0, trace=trace,
+                                script=plan.faults)
     rated_nm = data.rated_torque_nm
     if rated_nm is None and profile.rated_torque is None:
         rated_nm = drive.rated_torque_nm

@@ -19,9 +19,9 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
             next_step="Add --simulate, or give --fault to tdhil simulate",
         )
     if drive == "modbus":
-        raise UsageError(
-            "faults are scripted on CANopen only", where="--fault", next_step="Leave --fault or --drive modbus out"
-        )
+        from sim_bus.modbus.fault_catalogue import parse_all as parse_modbus
+
+        return replace(plan, faults=parse_modbus(texts, "embedded"))
     from sim_bus.fault_catalogue import parse_all
 
     return replace(plan, faults=parse_all(texts))
@@ -30,6 +30,7 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
 def list_faults() -> int:
     """Prints what there is; the exit code."""
     from sim_bus.fault_catalogue import listing
+    from sim_bus.modbus.fault_catalogue import listing as listing_of_modbus
 
-    print(listing())  # noqa: T201
+    print(f"--drive canopen\n\n{listing()}\n\n--drive modbus\n\n{listing_of_modbus()}")  # noqa: T201
     return 0

@@ -14,6 +14,10 @@
 What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been
 quiet for half a swing (`let_go.QUIET_S`); its motor does not follow, since its friction holds.
 
+Where the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the drive is
+looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
+has had its time, and a look contradicts it (`stop_looks`).
+
 A turning shaft is never disabled from here. If the drive can't be reached, its own watchdog must act, and that
 is what the report says. Nothing that is raised on the way, an interrupt included, skips any of it.
 """
@@ -30,6 +34,7 @@ from drivers.errors import StopNotConfirmed
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.let_go import MEAN_S, LetGo, LetGoLimits
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
+from tdhil.protocol.stop_looks import Looks, Slowing
 from tdhil.protocol.stop_patience import Patience
 
 AT_REST_SHARE = 0.005
@@ -100,6 +105,8 @@ class StopSequence:
         self._held: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
         self._trapped_nm = 0.0
         self._trouble: list[str] = []
+        self._looks = Looks(bench.drive, bench.period_s)
+        self._slowing = Slowing(self._at_rest_rad_s)
         self._silent = 0
         self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
         self._running = False
@@ -202,18 +209,26 @@ class StopSequence:
                 if sample is not None and sample.mode is Mode.SPEED:
                     break
         asked = self._ask(self._bench.drive.quick_stop)
+        at_rest_s = self._see_rest(asked)
+        if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
+            at_rest_s = self._see_rest(asked)
+        return at_rest_s
+
+    def _see_rest(self, asked: bool) -> float | None:
         patience = Patience(self._enough_s, self._at_rest_rad_s)
         quiet_since_s: float | None = None
         heard_s = 0.0
         while not patience.over:
             asked = asked or self._ask(self._bench.drive.quick_stop)
-            sample = self._exchange(_REST)
+            sample = self._exchange(_REST, or_look=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     self._trouble.append("no feedback from the drive any more")
                     return None
                 patience.wait(self._bench.period_s)
                 continue
+            if not self._gets_slower(sample):
+                return None
             patience.see(sample.speed_rad_s, self._bench.period_s)
             # Single lost frames don't unsay what the others showed; a longer gap does.
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
@@ -230,7 +245,7 @@ class StopSequence:
         asked = self._ask(self._bench.drive.disable)
         for _ in range(self._bench.cycles(3.0)):
             asked = asked or self._ask(self._bench.drive.disable)
-            sample = self._exchange(_REST)
+            sample = self._exchange(_REST, or_look=True)
             if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
             if self._silent >= self._enough_silent:
@@ -240,15 +255,18 @@ class StopSequence:
 
     def _stays_at_rest(self) -> bool:
         """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
-        quiet_s, told = 0.0, False
+        quiet_s, told, heard_s = 0.0, False, self._bench.now_s
         for _ in range(self._bench.cycles(REST_AFTER_S)):
-            sample = self._exchange(_REST)
+            sample = self._exchange(_REST, or_look=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     self._trouble.append("nothing was heard of the drive once it was disabled")
                     return True
                 continue
-            quiet_s += self._bench.period_s
+            # Looks are further apart than cycles are; a longer gap shows nothing.
+            apart_s = sample.time_s - heard_s if self._looks.standing else 0.0
+            quiet_s += max(self._bench.period_s, min(LONGEST_GAP_S, apart_s))
+            heard_s = sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
                 quiet_s = 0.0
                 if not told:
@@ -274,20 +292,69 @@ class StopSequence:
         if len(self._trouble) < 20:
             self._trouble.append(str(error) or type(error).__name__)
 
-    def _exchange(self, command: Command) -> Sample | None:
+    def _exchange(self, command: Command, *, or_look: bool = False) -> Sample | None:
+        """One cycle's feedback; where there is none, a look's, if that may be taken and one is due."""
+        sample: Sample | None = None
         try:
             sample = self._bench.stop_cycle(command)
         except BaseException as error:  # whatever it is, the stop goes on
-            self._silent += 1
             self._note(error)
-            return None
-        if not sample.fresh:
+        if sample is None or not sample.fresh or (or_look and self._looks.only):
+            sample = self._look() if or_look else None
+        else:
+            self._looks.heard()
+            self._slowing.reset()
+        if sample is None:
             self._silent += 1
             return None
         self._silent = 0
         self._bench.last = sample
         self._held.append(sample.torque_nm)
         return sample
+
+
+    # -- looks beside the cycle --------------------------------------------------------------------------------
+
+    def _look(self) -> Sample | None:
+        try:
+            sample = self._looks.missed()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return None
+        if sample is not None and self._looks.answered == 1:
+            self._held.clear()             # what was held before the gap tells nothing of now
+            self._trouble.append("the cycle brings no feedback: the drive was asked one question at a time instead")
+        return sample
+
+    def _contradicted(self) -> bool:
+        """Does a look show another drive than the cycle's feedback does? Then only looks are believed from now on."""
+        told = self._bench.last
+        try:
+            sample = self._looks.ask()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return False
+        if sample is None or told is None:
+            return False
+        rest = self._at_rest_rad_s
+        self._looks.only = abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest
+        if self._looks.only:
+            self._held.clear()
+            self._trouble.append(
+                f"the cycle's feedback tells of {told.speed_rad_s:.3f} rad/s, and a look at the drive of"
+                f" {sample.speed_rad_s:.3f} rad/s: the cycle's is not believed any more"
+            )
+        return self._looks.only
+
+    def _gets_slower(self, sample: Sample) -> bool:
+        """A shaft that looks alone show, and that goes on turning, is left to the drive's own watchdog."""
+        if not self._looks.standing or self._slowing.see(sample.time_s, sample.speed_rad_s):
+            return True
+        self._trouble.append(
+            f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s without feedback of the cycle: the drive is"
+            " left alone, so that its own watchdog acts"
+        )
+        return False
 
 
 def not_confirmed(report: StopReport) -> StopNotConfirmed:

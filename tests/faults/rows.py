@@ -82,7 +82,7 @@ ROWS = {
                   f"{GUARD}test_row_19_no_feedback_any_more",
                   f"{GUARD}test_row_19_the_same_feedback_again_and_again"),
     20: _scripted("drive heartbeat lost", "QS attempt", "5", f"{GUARD}test_rows_20_to_23_what_the_driver_raises"),
-    21: _scripted("unexpected boot-up (node reset)", "abort, never enabled again", "6, 8",
+    21: _scripted("unexpected boot-up (node reset)", "abort, never enabled again", "6",
                   "tests/drivers/test_drive_faults.py::test_a_third_party_resets_the_drive"),
     22: _scripted("a third party's NMT stop or pre-operational", "abort", "5",
                   "tests/drivers/test_drive_faults.py::test_a_third_party_puts_the_drive_into_pre_operational"),

@@ -1,0 +1,118 @@
+"""`tdhil identify --drive modbus --simulate --fault …`, and `simulate modbus --fault …`: rehearsed end to end.
+
+What each row must look like is `test_modbus_rows`' concern, with faults made by the test; here the same is asked for on
+the command line.
+"""
+
+import contextlib
+import json
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import pytest
+from path_runs import Shaft, process, tdhil, wait_for
+
+from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON
+
+IN_MOTION = "@speed+15s"       # at 4 rad/s
+NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
+
+
+@dataclass(frozen=True)
+class Case:
+    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go)."""
+
+    row: int
+    fault: str
+    code: int
+    words: tuple[str, ...]
+    ends: str = "held"
+    notice_s: float = NOTICED_S
+
+
+CASES = (
+    Case(19, "frozen-feedback@acquire+2s", 5, ("frozen", "gateway"), notice_s=2.0),
+    Case(23, "drive-fault@torque+3s", 6, ("fault", "--reset-fault")),
+    Case(30, "fault-at-start", 4, ("fault", "--reset-fault"), "refused"),
+    Case(31, "stuck-state@setup", 6, ("within 3 s of enabling",), "refused"),
+    Case(32, "mode-not-followed@torque", 6, ("torque mode", "--mode speed")),
+    Case(33, "sto" + IN_MOTION, 6, ("STO",), "coasts"),
+    Case(33, "internal-limit@torque+3s", 7, ("internal limit",), notice_s=4.5),
+    Case(34, "load-lost@torque+3s", 7, ("internal limit",), notice_s=2.0),
+    Case(35, "torque-scale" + IN_MOTION + "=5", 7, ("beyond the limit of 400 N·m",)),
+    Case(36, "encoder-inverted", 4, ("turned backwards", "encoder wiring"), notice_s=7.0),
+    Case(38, "exception" + IN_MOTION + "=2/100ms", 6, ("exception 2", "address")),
+    Case(39, "no-reply" + IN_MOTION, 5, ("no good reply", "watchdog")),
+    Case(40, "late-reply@acquire+2s", 5, ("no good reply", "watchdog")),
+    Case(42, "short-reply@hold+2s", 5, ("watchdog",)),
+    Case(42, "bad-crc" + IN_MOTION, 5, ("no good reply", "watchdog")),
+    Case(44, "word-order", 4, ("register 42", "12345678h"), "refused"),
+    Case(45, "reads-back-otherwise", 4, ("register 38", "wanted 0.4"), "refused"),
+    Case(50, "watchdog-not-armed", 4, ("register 40", "wanted 0.5 s, found 0 s"), "refused"),
+)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.row}-{case.fault}")
+def test_row(case, rehearse):
+    run = rehearse("--drive", "modbus", "--fault", case.fault)
+    run.assert_ended(case.code, *case.words)
+    assert f"scripted fault {case.fault}" in " ".join(run.done.err.split())
+    if case.ends == "refused":
+        run.assert_nothing_moved()
+    else:
+        run.assert_stopped(run.fault_s, case.notice_s, held=case.ends == "held")
+    run.assert_log_whole()
+
+
+def test_replies_that_are_lost_now_and_then(rehearse):
+    """Seeded, in stepped time: the run goes on, and again the same way."""
+    first, second = (rehearse("--drive", "modbus", "--fault", "bad-crc@speed+15s=20%/2s") for _ in range(2))
+    assert first.done.code in (0, 9), first.done.err
+    assert {outcome for _, outcome in first.done.outcomes} <= {"ok", "degraded"}
+    assert (first.shaft.speed_rad_s == second.shaft.speed_rad_s).all()
+    first.shaft.assert_at_rest()
+
+
+@pytest.mark.parametrize("name", ["reset", "half-open", "wrong-transaction-id"])
+def test_what_only_tcp_has_is_refused_here(name, no_bus_of_the_user):
+    done = tdhil("identify", "--simulate", "--drive", "modbus", "--fault", name)
+    assert done.code == 2
+    assert "simulate modbus --tcp" in " ".join(done.err.split())
+    assert "tcp" in ONLY_ON[name]
+
+
+def test_the_list_names_those_of_both_buses():
+    done = tdhil("identify", "--fault", "list")
+    assert done.code == 0
+    assert all(name in done.out for name in (*KINDS, "heartbeat-lost", "--drive canopen", "--drive modbus"))
+
+
+def test_a_connection_that_is_reset_in_motion(tmp_path):
+    """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
+    trace = tmp_path / "shaft.csv"
+    with contextlib.ExitStack() as stack:
+        drive = stack.enter_context(process(
+            sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", trace,
+            "--fault", "reset@speed+2s", stdout=subprocess.PIPE,
+        ))
+        (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
+        host = stack.enter_context(process(
+            sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
+            "--rate", 20, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path,
+        ))
+        out, err = host.communicate(timeout=60.0)
+
+        def resting():
+            shaft = Shaft.read(trace)
+            return shaft.time_s[-1] > shaft.at_rest_from() + 1.0
+
+        wait_for("the shaft to come to rest", resting)
+        shaft = Shaft.read(trace)
+    assert host.returncode == 5, err
+    assert "connection" in json.loads(out)["error"]["message"] and "Traceback" not in err
+    (at_s,) = shaft.events("fault: ")
+    assert shaft.speed_at(at_s) > 0.1
+    assert shaft.events("host silent")[0] > at_s and not shaft.events("host is back")
+    shaft.assert_never_let_go()

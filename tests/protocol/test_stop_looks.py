@@ -1,0 +1,169 @@
+"""A stop without the cycle's feedback: single looks tell of rest, and never lead to a turning shaft being let go."""
+
+from dataclasses import dataclass
+
+import pytest
+from fake_drive import PERIOD_S, FakeDrive
+
+from drivers.drive import Mode
+from drivers.errors import CommunicationLost
+from tdhil.protocol.settings import ControlAssumptions
+from tdhil.protocol.stop import REST_AFTER_S, SILENT_S
+from tdhil.protocol.stop_looks import AFTER_S, EVERY_S, SLOWING_S, Looks, Slowing
+
+SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
+
+
+@dataclass
+class LookedAt(FakeDrive):
+    """Can be looked at; ``gone``: what became of the cycle's feedback."""
+
+    looks: int = 0
+    answers: bool = True
+    raises: BaseException | None = None
+    gone: str = ""
+
+    def __post_init__(self):
+        self.misbehave = self._report
+        self._frozen = None
+
+    def _report(self, drive, sample):
+        if self.gone == "missing":
+            return sample._replace(fresh=False)
+        if self.gone == "error":
+            raise CommunicationLost("no statusword")
+        if self.gone == "frozen":
+            self._frozen = self._frozen or sample
+            return self._frozen._replace(time_s=sample.time_s)
+        return sample
+
+    def look(self):
+        self.looks += 1
+        if self.raises is not None:
+            raise self.raises
+        return self.report() if self.answers else None
+
+
+def stopped(world, gone, speed=5.0, **options):
+    here = world(LookedAt(**options))
+    here.turn(speed)
+    here.drive.gone = gone
+    return here, here.stop_sequence().run()
+
+
+@pytest.mark.parametrize("gone", ["missing", "error"])
+@pytest.mark.parametrize("speed", [0.0, 5.0])
+def test_without_feedback_looks_confirm_it(world, gone, speed):
+    here, report = stopped(world, gone, speed)
+    assert report.confirmed and report.disabled
+    assert here.drive.disabled_at == [0.0]
+    assert any("one question at a time" in line for line in report.trouble)
+    # Ramp, settling, disabling and settling again, and the looks no closer together than said.
+    took_s = speed / 2.0 + 2.0 * SETTLE_S
+    assert here.drive.looks <= took_s / EVERY_S + 10
+
+
+def test_what_is_heard_of_the_cycle_is_enough(world):
+    here = world(LookedAt(misbehave=None))
+    here.turn(5.0)
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.looks == 0
+
+
+@pytest.mark.parametrize("options", [
+    {"answers": False}, {"raises": CommunicationLost("gone")}, {"raises": RuntimeError("what?")},
+    {"raises": KeyboardInterrupt()},
+])
+@pytest.mark.parametrize("gone", ["missing", "error"])
+def test_looks_that_bring_nothing_take_no_longer_than_none(world, gone, options):
+    here = world(LookedAt(**options))
+    here.turn(5.0)
+    here.drive.gone = gone
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None
+    assert "disable" not in here.drive.calls
+    assert here.bench.now_s - begun_s <= SILENT_S + 2 * PERIOD_S
+    assert 1 <= here.drive.looks <= 5
+
+
+def test_a_shaft_that_looks_show_turning_is_left_to_the_watchdog_soon(world):
+    here = world(LookedAt(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "missing"
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "own watchdog" in report.trouble[-1]
+    assert "disable" not in here.drive.calls and here.drive.disabled_at == []
+    assert here.bench.now_s - begun_s <= AFTER_S + SLOWING_S + 3.0 * EVERY_S
+
+
+def test_one_that_coasts_to_rest_is_waited_for(world):
+    here = world(LookedAt(brakes=False))
+    here.turn(5.0)
+    here.drive.gone = "missing"
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+
+
+def test_frozen_feedback_is_not_believed_against_a_look(world):
+    here, report = stopped(world, "frozen")
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+    assert any("not believed any more" in line for line in report.trouble)
+
+
+@pytest.mark.parametrize("options", [{"brakes": False}, {"answers": False}, {"raises": CommunicationLost("gone")}])
+def test_frozen_feedback_that_no_look_contradicts_is_never_rest(world, options):
+    here = world(LookedAt(**options))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "frozen"
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+
+
+def test_feedback_that_goes_after_rest_was_seen(world):
+    """Disabling, and staying at rest, are told by looks alone."""
+    here = world(LookedAt())
+    here.turn(2.0)
+    disable = here.drive.disable
+
+    def gone_by_now():
+        here.drive.gone = "missing"
+        disable()
+
+    here.drive.disable = gone_by_now
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.bench.now_s - begun_s < 1.0 + SETTLE_S + REST_AFTER_S
+    assert here.drive.looks >= SETTLE_S / EVERY_S - 2
+
+
+@pytest.mark.parametrize("period_s", [0.004, 0.02, 0.2])
+def test_looks_are_due_by_time(period_s):
+    drive = LookedAt()
+    drive.mode = Mode.SPEED
+    looks = Looks(drive, period_s)
+    for _ in range(round(2.0 / period_s)):
+        looks.missed()
+    assert drive.looks <= (2.0 - AFTER_S) / max(EVERY_S, period_s) + 2
+    assert drive.looks >= (2.0 - AFTER_S) / max(EVERY_S, period_s) - 2
+    looks.heard()
+    assert not looks.standing
+    assert looks.missed() is None or period_s >= AFTER_S
+
+
+def test_slowing():
+    slowing = Slowing(0.05)
+    assert all(slowing.see(0.1 * k, 5.0 * 0.97 ** (0.1 * k)) for k in range(100))
+    assert all(slowing.see(10.0 + 0.1 * k, 0.04 * (-1) ** k) for k in range(100))
+    assert not all(slowing.see(30.0 + 0.1 * k, 2.0) for k in range(12))
+    slowing.reset()
+    assert slowing.see(40.0, 9.0)
+    assert not slowing.see(41.0, float("nan"))
