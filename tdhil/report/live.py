@@ -91,6 +91,7 @@ class LiveDisplay:
 
     def __exit__(self, *exc: object) -> None:
         self.pause()
+        self._painter.end()
         sys.setswitchinterval(self._usual_s)
 
     def pause(self) -> None:

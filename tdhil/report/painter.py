@@ -27,6 +27,7 @@ class Painter:
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
         self._gone = False             # the terminal
+        self._ending = False
 
     def line(self, job: Job) -> None:
         """Do this after what was asked for before. Raises what failed earlier."""
@@ -49,7 +50,13 @@ class Painter:
         self._wake.set()
         return done.wait(timeout_s)
 
+    def end(self) -> None:
+        """Let the thread go once all is done; whatever is asked for afterwards begins a new one."""
+        self._ending = True
+        self._wake.set()
+
     def _begin(self) -> None:
+        self._ending = False
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="display", daemon=True)
             self._thread.start()
@@ -74,6 +81,9 @@ class Painter:
                     self._do(picture)
             for done in waiting:
                 done.set()
+            if self._ending and not self._lines:
+                self._thread = None
+                return
 
     def _do(self, job: Job) -> None:
         if self._gone:

@@ -129,6 +129,19 @@ def test_lines_come_in_order_and_before_it_is_left():
     ]
 
 
+def test_its_thread_ends_with_it():
+    import io
+
+    before = set(threading.enumerate())
+    with LiveDisplay(Console(file=io.StringIO(), width=100), show_preflight=False) as display:
+        whole_run(display, cycles=3)
+        threads = [one for one in set(threading.enumerate()) - before if one.name == "display"]
+    for thread in threads:
+        thread.join(10.0)
+    assert threads
+    assert not any(thread.is_alive() for thread in threads)
+
+
 def test_on_a_terminal_the_last_picture_is_that_of_the_end():
     import io
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +17,9 @@ from typing import NoReturn
 
 import can
 import pytest
+
+# For the helpers, here and in the rooms whose tests run here too: tests are imported by path, not as a package.
+sys.path[:0] = [str(Path(__file__).parents[1] / room) for room in ("vcan", "path", "drivers")]
 
 ARPHRD_CAN = 280  # linux/if_arp.h
 IFF_UP = 1  # linux/if.h
@@ -91,3 +95,12 @@ def tool() -> Callable[[str], str]:
         return shutil.which(name) or give_up(f"{name} is not on PATH (apt-get install can-utils)")
 
     return find
+
+
+@pytest.fixture
+def ip() -> str:
+    """ip(8), where links may be changed: in the guest we are root, elsewhere perhaps not."""
+    command = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    if command is None or os.geteuid() != 0:
+        give_up("links can only be changed by root, with ip (apt-get install iproute2)")
+    return command

@@ -91,6 +91,14 @@ def test_own_frames_come_back_only_when_asked(open_bus: Open) -> None:
     assert not own.is_rx
 
 
+def test_is_rx_does_not_tell_our_own_frames(open_bus: Open) -> None:
+    """It says whether a frame was made on this host (MSG_DONTROUTE): another program's on it was too."""
+    one, other = open_bus(), open_bus()
+    one.send(frame(0x181, b"\x01"))
+    (got,) = receive(other, 1)
+    assert not got.is_rx
+
+
 def test_filters_act_in_the_kernel(open_bus: Open) -> None:
     one = open_bus()
     narrow = open_bus(can_filters=[{"can_id": 0x185, "can_mask": 0x7FF, "extended": False}])

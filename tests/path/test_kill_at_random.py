@@ -1,0 +1,18 @@
+"""SIGKILL at a few of the fifty random moments; all of them: `python benchmarks/kill_at_random.py`."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from kill_at_random import plan_of, row, trial
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])       # planned in setup, speed and torque
+def test_a_killed_host_leaves_a_shaft_at_rest_and_a_log(tmp_path, number):
+    plan = replace(plan_of(number, seed=1, real_time=False), rate_hz=50.0)      # the quickest
+    found = trial(plan, tmp_path)
+    assert not found.wrong, row(found)

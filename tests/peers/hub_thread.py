@@ -1,0 +1,25 @@
+"""A socketcand hub with nobody of ours on it, in a thread of the test."""
+
+import contextlib
+import threading
+
+from sim_bus.hub import Hub
+
+
+@contextlib.contextmanager
+def open_hub():
+    """The hub, polled until the end of the block; ``port`` says where."""
+    hub, ended = Hub(), threading.Event()
+
+    def poll():
+        while not ended.is_set():
+            hub.poll(0.05)
+
+    thread = threading.Thread(target=poll, daemon=True)
+    thread.start()
+    try:
+        yield hub
+    finally:
+        ended.set()
+        thread.join()
+        hub.close()

@@ -1,0 +1,82 @@
+"""A host that is frozen, seen from outside: candump shows that nothing of it goes on, and what comes when it wakes.
+
+What would go on behind a frozen process is what the kernel sends for it (python-can's send_periodic on SocketCAN) or
+another process of its own. Real time, slow cycles and a long watchdog, for a loaded machine: what is asserted is order
+and content; wall times stand in bounds that only a lost frame or a wrong clock would break.
+"""
+
+from __future__ import annotations
+
+import signal
+import statistics
+import time
+
+import pytest
+from candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
+from path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
+from vcan_runs import TURNING_RAD_S, assert_safe, simulated
+
+from tdhil.record.reader import read_frames
+
+RATE_HZ, WATCHDOG_S = 20.0, 2.0
+RIG = f"""\
+rate_hz: {RATE_HZ}
+limits: {{speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,
+  quick_stop_rad_s2: {QUICK_STOP_RAD_S2}, watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}
+"""
+STAMP_S = 0.05
+"""How far the log's time of a sent frame may lie from the kernel's stamp of it, all but one in twenty: one cycle."""
+
+
+@pytest.fixture(autouse=True)
+def no_bus_of_the_user(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+
+
+def lost(drive):
+    return drive.shaft.events("host heartbeat lost")
+
+
+def test_a_frozen_host_is_silent_and_wakes_with_nothing_stale(tmp_path, vcan, tool):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG)
+    on = ("-i", "socketcan", "-c", vcan)
+    with watching(tool("candump"), tmp_path / "candump.log", vcan) as candump:
+        with simulated(tmp_path, vcan, stepped=False) as drive, host(tmp_path, *on, "--rig", rig) as running:
+            moves = wait_for("motion", lambda: drive.simulator.speed_rad_s > TURNING_RAD_S, running.child)
+            assert moves, running.err
+            running.signal(signal.SIGSTOP)
+            time.sleep(0.1)                    # its last frame is then on the bus
+            frozen_s = time.time()
+            wait_for("the end of the stop", lambda: lost(drive) and drive.rests())
+            woken_s = time.time()
+            running.signal(signal.SIGCONT)
+            done = running.finish()
+            shaft = assert_safe(drive)
+        seen = candump.frames
+
+    before = {frame.identifier for frame in seen if frame.stamp_s < frozen_s}
+    assert {SYNC, RPDO1, HOST_BEAT} <= before
+    frozen = [frame for frame in seen if frozen_s < frame.stamp_s < woken_s]
+    assert {frame.identifier for frame in frozen} <= DRIVES      # no heartbeat, no SYNC, no RPDO, no SDO of the host's
+    assert frozen                                                # candump saw the drive all the while
+    (lost_s,) = shaft.events("host heartbeat lost")
+    assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
+
+    awake = [frame for frame in seen if frame.stamp_s > woken_s]
+    assert {frame.identifier for frame in awake} & HOSTS         # it did wake
+    assert not any(enables(frame) for frame in awake)
+    assert done.code == 5, done.err
+    assert done.document["error"]["kind"] == "CommunicationLost"
+    assert "Traceback" not in done.err
+    assert tdhil("replay", done.log).code in (3, 9)
+
+    # Control time on the log's frames against the kernel's wall clock on the same ones, but for the constant between.
+    logged = [frame for frame in read_frames(done.log) if frame.outgoing]
+    sent = [frame for frame in seen if frame.identifier in HOSTS]
+    assert [(frame.identifier, frame.data) for frame in logged] == [(frame.identifier, frame.data) for frame in sent]
+    offsets = [frame.stamp_s - line.time_s for frame, line in zip(sent, logged, strict=True)]
+    middle_s = statistics.median(offsets)
+    off = sorted(abs(offset - middle_s) for offset in offsets)
+    assert off[int(0.95 * len(off))] <= STAMP_S

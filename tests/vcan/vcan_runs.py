@@ -1,0 +1,110 @@
+"""Runs on a real interface, host and simulated drive in this process: a guest starts programs slowly."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+from path_runs import HANGS_S, INERTIA, TORQUE_NM, Finished, Shaft, identify, wait_for
+
+from sim_bus.params import RigParams
+from sim_bus.simulator import Simulator
+
+RATE_HZ = 25.0
+"""A guest takes milliseconds for a cycle; plant time is the same at any rate."""
+TURNING_RAD_S = 1.0
+FASTEST_RAD_S = 10.0                      # the simulated rig's speed window
+NOTICED_S = 30.0
+"""Of plant time: whatever the host has not noticed by then it does not notice."""
+
+
+def run(*command: object) -> None:
+    """A tool of the system's; its complaint is the test's."""
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=HANGS_S)
+    assert done.returncode == 0, f"{command}: {done.stderr or done.stdout}"
+
+
+@dataclass
+class Drive:
+    """A simulated drive in a thread of the test."""
+
+    simulator: Simulator
+    trace: Path
+
+    @property
+    def shaft(self) -> Shaft:
+        return Shaft.read(self.trace)
+
+    def rests(self) -> bool:
+        """It has been brought to rest, and has stood for more than a second of plant time."""
+        shaft = self.shaft
+        return bool(len(shaft.time_s)) and shaft.time_s[-1] > shaft.at_rest_from() + 1.5
+
+
+@contextmanager
+def simulated(folder: Path, interface: str, *, stepped: bool = True) -> Iterator[Drive]:
+    """Stepped, a host that is silent for a second of wall time counts as gone."""
+    trace, ended = folder / "shaft.csv", threading.Event()
+    with can.Bus(interface="socketcan", channel=interface) as bus:
+        simulator = Simulator(bus, RigParams(), seed=1, trace=trace, stepped=stepped)
+        thread = threading.Thread(target=simulator.run, args=(ended,), daemon=True)
+        thread.start()
+        try:
+            wait_for("its boot-up", lambda: trace.exists() and b"power on" in trace.read_bytes())
+            yield Drive(simulator, trace)
+        finally:
+            ended.set()
+            thread.join()
+
+
+def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface: str) -> tuple[Finished, bool]:
+    """`tdhil identify`, with trouble as soon as the shaft turns; how it ended, and whether by itself or by Ctrl-C."""
+    over = threading.Event()
+    found: dict[str, bool | BaseException] = {"by itself": True}
+
+    def meddle() -> None:
+        try:
+            wait_for("motion", lambda: drive.simulator.speed_rad_s > TURNING_RAD_S or over.is_set())
+            if over.is_set():
+                return
+            trouble()
+            due_s = drive.simulator.time_s + NOTICED_S
+            wait_for("the end", lambda: over.is_set() or drive.simulator.time_s > due_s)
+        except BaseException as error:         # raised in the test's own thread
+            found["failure"] = error
+        if not over.is_set():
+            found["by itself"] = False
+            os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=meddle, daemon=True)
+    thread.start()
+    try:
+        done = identify(folder, "-i", "socketcan", "-c", interface, "--stepped", "--rate", RATE_HZ, "--periods", 40)
+    finally:
+        over.set()
+        thread.join()
+    if "failure" in found:
+        raise AssertionError(done.err) from found["failure"]     # type: ignore[misc]
+    return done, bool(found["by itself"])
+
+
+def assert_safe(drive: Drive) -> Shaft:
+    """Whatever was done to the bus: at rest, never let go while turning, never backwards, never beyond the window."""
+    drive.shaft.assert_enabled(True)
+    end_s = time.monotonic() + HANGS_S
+    while not drive.rests():
+        assert time.monotonic() < end_s, "the shaft does not come to rest"
+        time.sleep(0.1)
+    shaft = drive.shaft
+    shaft.assert_at_rest()
+    assert shaft.speed_rad_s.max() < FASTEST_RAD_S + 0.5 * TORQUE_NM / INERTIA
+    assert shaft.speed_rad_s.min() > -0.05
+    return shaft
