@@ -17,7 +17,12 @@ import threading
 import pytest
 from path_runs import SETTLING_S, Shaft, process, wait_for
 
-WATCHDOG_S = 0.5
+WATCHDOG_S = 2.0
+"""Long, since in real time a busy machine must not be taken for a fault."""
+RIG = (
+    "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
+    f" watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}\n"
+)
 TURNING_RAD_S = 0.3
 QUICK_STOP_RAD_S2 = 2.0
 LATE_S = 0.3
@@ -84,9 +89,11 @@ class Bench:
         self.port = int(port)
 
     def start(self, port):
+        (self.folder / "rig.yaml").write_text(RIG)
         self.host = self.stack.enter_context(process(
             sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 20, "--log", self.log, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
+            "--rate", 20, "--rig", self.folder / "rig.yaml", "--log", self.log,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
         ))
 
     @property
