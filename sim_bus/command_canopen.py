@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from sim_bus.command_common import (
     EXIT_OK,
     Unusable,
+    add_fault_argument,
     add_rig_arguments,
     host_and_port,
     number_from,
@@ -34,8 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--profile", metavar="NAME",
                        help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
     add_rig_arguments(group)
-    group.add_argument("--fault", metavar="FAULT", action="append", default=[],
-                       help="a scripted fault, such as heartbeat-lost@hold+2s; repeatable; 'list' shows them all")
+    add_fault_argument(group, "heartbeat-lost@hold+2s")
     group.add_argument("--stepped", action="store_true", help="plant time moves with SYNC, by the period of 1006h")
 
 

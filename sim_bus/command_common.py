@@ -26,6 +26,12 @@ def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--trace", metavar="FILE", type=Path, help="write what the true shaft does to this CSV file")
 
 
+def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
+    """Scripted misbehaviour; which faults there are is the bus's own."""
+    group.add_argument("--fault", metavar="FAULT", action="append", default=[],
+                       help=f"a scripted fault, such as {such_as}; repeatable; 'list' shows them all")
+
+
 def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
     """Runs ``simulate`` until SIGINT or SIGTERM; the exit code. What the user can cause ends with one line."""
     stop = threading.Event()

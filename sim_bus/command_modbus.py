@@ -6,6 +6,7 @@ import threading
 from sim_bus.command_common import (
     EXIT_OK,
     Unusable,
+    add_fault_argument,
     add_rig_arguments,
     host_and_port,
     number_from,
@@ -33,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--wrong", metavar="NAME", action="append", default=[],
                        help="be wired otherwise than the profile says: word_order, scale_10, address_off_by_one, sign, "
                        "unsigned, write_not_applied, reads_back_something_else:PARAMETER; may be given again")
-    group.add_argument("--fault", metavar="FAULT", action="append", default=[],
-                       help="a scripted fault, such as no-reply@hold+2s; repeatable; 'list' shows them all")
+    add_fault_argument(group, "no-reply@hold+2s")
 
 
 def run(namespace: argparse.Namespace) -> int:

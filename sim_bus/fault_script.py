@@ -9,8 +9,10 @@
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
+from typing import Generic, Protocol, TypeVar
 
 from profiles.errors import TdhilError
 from profiles.marker import STAGE_NUMBERS
@@ -77,6 +79,44 @@ class Schedule:
     def _begins_us(self, fault: Scripted) -> float:
         began = self._stages_us.get(fault.at.stage)
         return inf if began is None else began + round(1e6 * fault.at.after_s)
+
+
+class Passing(Protocol):
+    """A fault that starts and is over."""
+
+    def begin(self) -> None: ...
+
+    def end(self) -> None: ...
+
+
+F = TypeVar("F", bound=Passing)
+
+
+class Cast(Generic[F]):
+    """The faults of a script, in its order, and those that are going on; ``note`` is told of each change."""
+
+    def __init__(self, script: tuple[Scripted, ...], make: Callable[[Scripted], F]) -> None:
+        self._script = script
+        self._schedule = Schedule(script)
+        self.all = [make(fault) for fault in script]
+        self.active: list[F] = []
+
+    def stage(self, number: int, now_us: int) -> None:
+        """A stage has begun."""
+        self._schedule.stage(number, now_us)
+
+    def moved(self, now_us: int, note: Callable[[str], None]) -> bool:
+        """Begins and ends what is due; whether anything was."""
+        begin, end = self._schedule.due(now_us)
+        for number in begin:
+            note(f"fault: {self._script[number].text}")
+            self.active.append(self.all[number])
+            self.all[number].begin()
+        for number in end:
+            note(f"fault over: {self._script[number].text}")
+            self.active.remove(self.all[number])
+            self.all[number].end()
+        return bool(begin or end)
 
 
 def parse(text: str) -> Scripted:

@@ -14,7 +14,7 @@ from sim_bus.cia402_node import SYNC, Cia402Node
 from sim_bus.fault_catalogue import make
 from sim_bus.fault_frames import Dead
 from sim_bus.fault_hooks import Frame, Misbehaviour, Scene
-from sim_bus.fault_script import Schedule, Scripted
+from sim_bus.fault_script import Cast, Scripted
 from sim_bus.link import Sender
 
 _SEED = 0xFA17
@@ -24,10 +24,7 @@ class Faults:
     """The script of one drive. `attach` makes it act; frames then come in by `came`."""
 
     def __init__(self, script: tuple[Scripted, ...], seed: int = 0) -> None:
-        self._script = script
-        self._schedule = Schedule(script)
-        self._all = [make(fault) for fault in script]
-        self._active: list[Misbehaviour] = []
+        self._cast: Cast[Misbehaviour] = Cast(script, make)
         self._rng = np.random.default_rng((seed, _SEED))
         self._ends_cycles = False          # and the host knows
 
@@ -36,7 +33,7 @@ class Faults:
         self._node = node
         self._put: Callable[[int, bytes], None] = sender.put
         scene = Scene(node, sender.put, self._rng)
-        for fault in self._all:
+        for fault in self._cast.all:
             fault.scene = scene
         sender.script = self._outgoing
         node.on_time = self.moved
@@ -44,16 +41,8 @@ class Faults:
 
     def moved(self, now_us: int) -> None:
         """Plant time has come so far."""
-        begin, end = self._schedule.due(now_us)
-        for number in begin:
-            self._node.note(f"fault: {self._script[number].text}")
-            self._active.append(self._all[number])
-            self._all[number].begin()
-        for number in end:
-            self._node.note(f"fault over: {self._script[number].text}")
-            self._active.remove(self._all[number])
-            self._all[number].end()
-        if self._active and self._node.stepped and not self._dead and not self._ends_cycles:
+        self._cast.moved(now_us, self._node.note)
+        if self._cast.active and self._node.stepped and not self._dead and not self._ends_cycles:
             self._ends_cycles = True
             self._put(CYCLE_ID, CYCLES_END)
 
@@ -61,7 +50,7 @@ class Faults:
         """A frame from the bus, on its way to the node."""
         node, told = self._node, self._ends_cycles
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._active):
+        for fault in tuple(self._cast.active):
             frames = [after for before in frames for after in fault.incoming(*before)]
         for frame in frames:
             node.on_frame(*frame)
@@ -70,19 +59,19 @@ class Faults:
         if not any(one == SYNC for one, _ in frames):
             node.pass_cycle()
         if told and not self._dead:
-            self._ends_cycles = bool(self._active)
-            self._put(CYCLE_ID, CYCLE_OVER if self._active else LAST_CYCLE_OVER)
+            self._ends_cycles = bool(self._cast.active)
+            self._put(CYCLE_ID, CYCLE_OVER if self._cast.active else LAST_CYCLE_OVER)
 
     @property
     def _dead(self) -> bool:
-        return any(isinstance(fault, Dead) for fault in self._active)
+        return any(isinstance(fault, Dead) for fault in self._cast.active)
 
     def _on_stage(self, number: int) -> None:
-        self._schedule.stage(number, self._node.time_us)
+        self._cast.stage(number, self._node.time_us)
         self.moved(self._node.time_us)
 
     def _outgoing(self, can_id: int, data: bytes) -> list[Frame]:
         frames: list[Frame] = [(can_id, data)]
-        for fault in tuple(self._active):
+        for fault in tuple(self._cast.active):
             frames = [after for one, body in frames for after in fault.outgoing(one, bytes(body))]
         return frames

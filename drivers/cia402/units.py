@@ -7,6 +7,7 @@ from drivers.cia402.parameters import Settings
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.values import decode_value
 from drivers.errors import ObjectRefused
+from drivers.rated_torque import agreed_rated_torque
 from drivers.table import Table
 from profiles.schema import CanopenProfile
 
@@ -17,34 +18,15 @@ def find_units(
     table: Table, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
 ) -> tuple[Units, float]:
     """Scaling of speed and torque; and the rated torque, N·m."""
-    rated_nm = _rated_torque(table, objects, profile, rated_torque_nm)
+    where = name(profile.torque.rated.index, profile.torque.rated.sub)
+    agreed_nm = agreed_rated_torque(table, _told(objects, profile), rated_torque_nm, where)
+    rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused, and the rows after it still want a scale
     speed = _speed_unit(table, objects, profile)
     target = profile.torque.rated_per_lsb * rated_nm
     actual = profile.torque.actual
     if actual is None:
         return Units(speed, target), rated_nm
     return Units(speed, actual.per_lsb * (rated_nm if actual.unit == "rated" else 1.0), target), rated_nm
-
-
-def _rated_torque(table: Table, objects: Objects, profile: CanopenProfile, rig_nm: float | None) -> float:
-    from_drive = _told(objects, profile)
-    rated_nm = rig_nm if rig_nm is not None else from_drive
-    where = name(profile.torque.rated.index, profile.torque.rated.sub)
-    if rated_nm is None:
-        table.row(
-            "rated torque", "known", "the drive does not tell", False, where,
-            "Give drive_data.rated_torque_nm in rig.yaml (motor name plate)",
-        )
-        return 1.0
-    if from_drive is None:
-        table.note("rated torque", f"{rated_nm:g} N·m, from the rig", where)
-    else:
-        agree = abs(from_drive - rated_nm) <= 0.001 * rated_nm
-        table.row(
-            "rated torque", f"{rated_nm:g} N·m", f"{from_drive:g} N·m", agree, where,
-            "rig.yaml and the drive disagree, and every torque is scaled by it: find out which is right",
-        )
-    return rated_nm
 
 
 def _told(objects: Objects, profile: CanopenProfile) -> float | None:

@@ -120,7 +120,7 @@ class ModbusDrive:
         """Tell a simulated peer that a stage of the protocol begins; a real drive is told nothing."""
         self._stage = stage
         if self._identity is not None and self._identity.simulated:
-            tell_stage(self._access, self._profile.cycle.functions, stage)
+            tell_stage(self._access, stage)
 
     def preflight(self, limits: Limits) -> Preflight:
         """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""

@@ -14,6 +14,7 @@ from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.registers import RANGES, register_name
 from drivers.modbus.scales import RPM, per_count, settle
+from drivers.rated_torque import agreed_rated_torque
 from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
 from profiles.requirement import Require
@@ -103,7 +104,7 @@ def satisfied(require: Require, value: float, lsb: float) -> bool:
 def find_rated_torque(
     table: Table, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
 ) -> float | None:
-    """N·m that are 100 %, from the drive where it tells, else from rig.yaml; None where neither does."""
+    """N·m that are 100 %: rig.yaml's, which the drive must not contradict, else its own; None where neither tells."""
     name = profile.rated_torque
     from_drive = found.values.get(name) if name is not None else None
     where = "profile, rated_torque" if name is None else where_of(profile.parameter(name))
@@ -112,21 +113,7 @@ def find_rated_torque(
         step = "Set the motor's data at the drive, or check the register in the profile"
         table.row("rated torque", "above 0 N·m", f"{from_drive:g} N·m", good, where, step)
         return from_drive if good else None
-    if rated_torque_nm is None:
-        table.row(
-            "rated torque", "known", "the drive does not tell", False, where,
-            "Give drive_data.rated_torque_nm in rig.yaml (motor name plate)",
-        )
-        return None
-    if from_drive is None:
-        table.note("rated torque", f"{rated_torque_nm:g} N·m, from the rig", where)
-    else:
-        agree = abs(from_drive - rated_torque_nm) <= 0.001 * rated_torque_nm
-        table.row(
-            "rated torque", f"{rated_torque_nm:g} N·m", f"{from_drive:g} N·m", agree, where,
-            "rig.yaml and the drive disagree, and every torque is scaled by it: find out which is right",
-        )
-    return rated_torque_nm
+    return agreed_rated_torque(table, from_drive, rated_torque_nm, where)
 
 
 def check_name_plate(table: Table, profile: ModbusProfile, found: Parameters, rated_nm: float) -> None:

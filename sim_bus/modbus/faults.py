@@ -10,7 +10,7 @@ import numpy as np
 
 from profiles.marker import MARKER_STAGE_REGISTER
 from profiles.modbus_schema import ModbusProfile
-from sim_bus.fault_script import Schedule, Scripted
+from sim_bus.fault_script import Cast, Scripted
 from sim_bus.modbus.fault_catalogue import make
 from sim_bus.modbus.fault_hooks import Ask, Misbehaviour, Scene
 from sim_bus.modbus.machine import Machine
@@ -32,12 +32,9 @@ class Faults:
     def __init__(self, machine: Machine, profile: ModbusProfile, script: tuple[Scripted, ...] = (),
                  seed: int = 0) -> None:
         self._machine = machine
-        self._script = script
-        self._schedule = Schedule(script)
-        self._all = [make(fault) for fault in script]
-        self._active: list[Misbehaviour] = []
+        self._cast: Cast[Misbehaviour] = Cast(script, make)
         scene = Scene(machine, profile, np.random.default_rng((seed, _SEED)))
-        for fault in self._all:
+        for fault in self._cast.all:
             fault.scene = scene
         if script:
             machine.on_time = self.moved
@@ -46,16 +43,7 @@ class Faults:
 
     def moved(self, now_us: int) -> None:
         """Plant time has come so far."""
-        begin, end = self._schedule.due(now_us)
-        for number in begin:
-            self._machine.note(f"fault: {self._script[number].text}")
-            self._active.append(self._all[number])
-            self._all[number].begin()
-        for number in end:
-            self._machine.note(f"fault over: {self._script[number].text}")
-            self._active.remove(self._all[number])
-            self._all[number].end()
-        if begin or end:
+        if self._cast.moved(now_us, self._machine.note):
             self._machine.application.regulate()
 
     def request(self, pdu: bytes) -> Reply:
@@ -63,7 +51,7 @@ class Faults:
         ask: Ask = self._ask
         if tells_stage(pdu):
             return ask(pdu)
-        for fault in self._active:
+        for fault in self._cast.active:
             ask = partial(fault.asked, ask=ask)
         return ask(pdu)
 
@@ -72,5 +60,5 @@ class Faults:
 
     def _on_stage(self, number: int) -> None:
         now_us = round(1e6 * self._machine.time_s)
-        self._schedule.stage(number, now_us)
+        self._cast.stage(number, now_us)
         self.moved(now_us)
