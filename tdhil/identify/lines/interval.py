@@ -8,13 +8,11 @@ one standard deviation 4 %, and the value is never at the interval's edge.)
 
 import math
 
-import numpy as np
-
 from tdhil.identify.identification import Estimate
 from tdhil.identify.lines.descent import Fit
 from tdhil.identify.lines.fit import Held, minimise
 from tdhil.identify.lines.profile import profile_edge, standard_deviation, student_quantile
-from tdhil.identify.lines.structure import Fitted, unit
+from tdhil.identify.lines.structure import Fitted, excess_rise, unit
 from tdhil.record.recording import FloatArray
 
 
@@ -22,17 +20,14 @@ def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
     """The root of how far −2 ln L may rise: Student's quantile, enlarged for what is fitted besides.
 
     Its degrees of freedom are those of the first-order fit (the whole family's would be spread over directions that the
-    data hardly speak of). Student's quantile allows for the weights' own uncertainty if nothing else is fitted; p
-    parameters that are refitted all along the profile lean on those lines whose scatter came out small by chance. That
-    costs a share of about p/(4ν) of the rise, ν complex degrees of freedom of a weight: measured, on first-order and on
-    other plants alike (without it 7 to 8 % of the intervals missed instead of 5 %).
+    data hardly speak of). Student's quantile allows for the weights' own uncertainty if nothing else is fitted; what is
+    refitted all along the profile is allowed for by `excess_rise`.
     """
     free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held]
     if index not in free:
         free = fitted.free
     _, dof = standard_deviation(fitted.problem, fitted.simple.theta, index, free)
-    nu = float(np.median(fitted.problem.nu))
-    return student_quantile(confidence, dof) * math.sqrt(1.0 + len(fitted.free) / (4.0 * max(nu, 1.0)))
+    return student_quantile(confidence, dof) * math.sqrt(excess_rise(fitted.problem, len(fitted.free)))
 
 
 def estimate(fitted: Fitted, index: int, confidence: float) -> Estimate:

@@ -4,8 +4,9 @@ The reports' family (reports.py) is fitted twice: with first-order lags alone, a
 it is true and biased where it isn't; the second is right in both cases and less sharp. Its three parameters more must
 lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be preferred; about there, both count:
 
-    weight of the first-order fit = 1/(1 + e^((D − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0.
+    weight of the first-order fit = 1/(1 + e^((D/r − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0,
 
+and r the share by which −2 ln L rises and falls too much, since its weights are estimates themselves (`excess_rise`).
 That is for the value. An interval rests on the whole family always, whatever the weight.
 
 The descents of the whole family begin near the first-order fit. Lower minima far from it exist now and then, in corners
@@ -92,9 +93,20 @@ def fit_model(
     from_simple = minimise(problem, limits, simple.theta, held)
     whole = from_simple if from_simple.objective < whole.objective else whole
     numbers = 2.0 * len(problem.owner) + len(problem.priors) + (problem.tie is not None)
-    excess = simple.objective - whole.objective - len(open_structure) * math.log(numbers)
+    gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(held))
+    excess = gain - len(open_structure) * math.log(numbers)
     weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
     return Fitted(problem, limits, held, simple, whole, weight, others)
+
+
+def excess_rise(problem: Likelihood, fitted: int) -> float:
+    """How much more than by χ² −2 ln L changes: 1 + p/(4ν), p parameters ``fitted``, ν complex d.o.f. of a weight.
+
+    Parameters that are fitted lean on those lines whose scatter came out small by chance. The factor was measured, on
+    first-order and on other plants alike: without it 7 to 8 % of the intervals miss instead of 5 %.
+    """
+    nu = float(np.median(problem.nu))
+    return 1.0 + fitted / (4.0 * max(nu, 1.0))
 
 
 def unit(fitted: Fitted, index: int) -> FloatArray:
