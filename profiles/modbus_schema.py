@@ -164,10 +164,10 @@ class Parameter(Entry):
         default=None, description="preflight refuses anything else; set by hand at the drive, this program never does"
     )
     set_to: Literal["speed_limit", "speed_limit_reverse", "torque_limit", "torque_limit_reverse", "watchdog",
-                    "quick_stop_time", "quick_stop_deceleration"] | None = Field(
+                    "quick_stop_time", "quick_stop_deceleration", "ramp_up_time"] | None = Field(
         default=None,
         description="limit of rig.yaml written here in preflight and read back; quick_stop_time: s from the speed "
-        "that 'times' names down to zero",
+        "that 'times' names down to zero; ramp_up_time: s from rest up to it, as steep as the quick stop",
     )
     writable_in_operation: bool = Field(default=True, description="false: takes effect after a restart only")
     advice: str | None = Field(default=None, description="what to do at the drive where it reads wrong")
@@ -223,7 +223,10 @@ class NamePlate(Entry):
 
 
 class Echo(Entry):
-    """A register of the drive's own in which a setpoint shows up again, written at standstill, disabled."""
+    """A register of the drive's own in which a setpoint shows up again, written at standstill, disabled.
+
+    Worth most where it has a unit and a scale of its own: one that shares them with the setpoint can't tell them wrong.
+    """
 
     setpoint: Literal["speed", "torque"]
     register_: Register = Field(alias="register")
@@ -309,6 +312,12 @@ class ModbusProfile(DataModel):
         findings += [(at, f"no parameter '{name}'") for at, name in wanted if name is not None and name not in known]
         if self.modes.torque and self.cycle.torque_setpoint is None:
             findings.append(("cycle.torque_setpoint", "needed where modes.torque is true"))
+        for number, one in enumerate(self.echoes):
+            setpoint = self.cycle.speed_setpoint if one.setpoint == "speed" else self.cycle.torque_setpoint
+            if setpoint is None:
+                findings.append((f"echoes.{number}.setpoint", f"this profile has no {one.setpoint} setpoint"))
+            elif setpoint.register_.type[0] == "i" and one.register_.type[0] == "u":
+                findings.append((f"echoes.{number}.register", "has no sign, and the setpoint that it shows has one"))
         refuse_if(findings)
         return self
 

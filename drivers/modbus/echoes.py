@@ -18,6 +18,8 @@ from profiles.modbus_schema import Echo, ModbusProfile, Signal
 
 SHARES = (0.25, -0.5, 0.75, -1.0 / 3.0)
 """Of the limit: of both signs, none a multiple of another's wrong scale, and each with two different halves."""
+LOOKS, LOOK_S = 12, 0.05
+"""At an echo: drives renew what they display every few ten milliseconds, field bus adapters more slowly still."""
 
 
 def clear_setpoints(table: Table, access: Access, profile: ModbusProfile, off: int) -> bool:
@@ -69,16 +71,23 @@ def _check_one(
     seen_lsb = lsb if echo is None else si_per_count(echo, values, rated_nm)
     title = f"{name} setpoint " + ("reads back" if echo is None else "as the drive understood it")
     where = f"{register_name(register)} → {register_name(seen_in)}"
+    # Half a count of the echo for its rounding, and one more: a drive may cut off instead.
+    slack = 0.0 if echo is None else 1.5 * seen_lsb
+    if slack > 0.5 * max(map(abs, tests)):
+        table.note(f"{title}, how finely", f"{seen_lsb:.3g} {unit} a count: too coarse for these limits to tell", where)
 
     def work() -> tuple[str, bool]:
         try:
             for value in tests:
                 counts = to_counts(value, lsb, register, where)
-                access.write(register, counts)
-                # Half a count of the echo for its rounding, and one more: a drive may cut off instead.
-                slack = 0.0 if echo is None else 1.5 * seen_lsb
-                found = access.read(seen_in) * seen_lsb
-                if not math.isclose(found, counts * lsb, rel_tol=1e-9, abs_tol=slack):
+                for look in range(1 if echo is None else LOOKS):
+                    if look:
+                        access.clock.wait_until(access.clock.now_s() + LOOK_S)
+                    access.write(register, counts)      # each time: a watchdog may be on already
+                    found = access.read(seen_in) * seen_lsb
+                    if good := math.isclose(found, counts * lsb, rel_tol=1e-9, abs_tol=slack):
+                        break
+                if not good:
                     return f"{found:.6g} {unit} for {counts * lsb:.6g} {unit}", False
         finally:
             access.write(register, 0)
@@ -91,7 +100,7 @@ def _check_one(
         except PreflightRefused as error:
             table.note(title, f"can't be read: {error.what}", where)
             return
-    table.attempt(
-        title, wanted, where, work,
-        "Word order, scale, sign or address of it is wrong in the profile, or the drive doesn't take it over",
-    )
+    mend = "Word order, scale, sign or address of it is wrong in the profile, or the drive doesn't take it over"
+    if echo is not None:
+        mend += ". Does it take its reference from this bus, in both directions? See the profile's source for the echo"
+    table.attempt(title, wanted, where, work, mend)

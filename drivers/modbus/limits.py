@@ -1,6 +1,8 @@
 """Limits of rig.yaml written into the drive's own parameters (`set_to`), and read back.
 
-Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down.
+Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down. A ramp up is
+set as steep as the quick stop and no steeper, for it stays in the drive where a run dies; ramps down are left alone,
+since a drive's own stops rest on them.
 """
 
 from __future__ import annotations
@@ -89,12 +91,12 @@ def wanted_setting(parameter: Parameter, limits: Limits, rated_nm: float, values
         rounding = math.floor
     elif kind == "quick_stop_deceleration":
         value = limits.quick_stop_rad_s2 / _unit(parameter, {"rpm_s": RPM})
-    elif kind == "quick_stop_time":
+    elif kind in ("quick_stop_time", "ramp_up_time"):
         from_rpm = values.get(parameter.times) if parameter.times is not None else limits.speed_rad_s / RPM
         if from_rpm is None:
             raise CommandRejected(f"the speed '{parameter.times}' that it counts from is unknown", where=where)
         value = abs(from_rpm) * RPM / limits.quick_stop_rad_s2 / _unit(parameter, {"s": 1.0})
-        rounding = math.floor
+        rounding = math.floor if kind == "quick_stop_time" else math.ceil
     else:
         value = limits.watchdog_s / _unit(parameter, {"s": 1.0})
         rounding = math.floor

@@ -32,9 +32,9 @@ class Parameters:
 
     # -- counts and values ---------------------------------------------------------------------------------
 
-    def scale(self, per_lsb: float, unit: str, times: str | None) -> float:
-        """Units for one count of a register."""
-        tenth = 0.1 if self._tenths and unit != "none" else 1.0
+    def scale(self, per_lsb: float, unit: str, times: str | None, *, echo: bool = False) -> float:
+        """Units for one count of a register; what echoes a setpoint counts in units of its own, right or not there."""
+        tenth = 0.1 if self._tenths and unit != "none" and not echo else 1.0
         return per_lsb * tenth * (self.value(times) if times is not None else 1.0)
 
     def value(self, name: str) -> float:
@@ -71,8 +71,8 @@ class Parameters:
             self._stored[name] = Layout(0, parameter.register_.type).saturated(counts)
 
     def _scale_of(self, parameter: Parameter) -> float:
-        # A quick-stop time names the speed that it starts from, which doesn't multiply it.
-        times = None if parameter.set_to == "quick_stop_time" else parameter.times
+        # The time of a ramp names the speed at its upper end, which doesn't multiply it.
+        times = None if parameter.set_to in {"quick_stop_time", "ramp_up_time"} else parameter.times
         return self.scale(parameter.per_lsb, parameter.unit, times)
 
     # -- what they mean ------------------------------------------------------------------------------------

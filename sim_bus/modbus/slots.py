@@ -103,6 +103,7 @@ class Map:
         return slots
 
     def _echoes(self) -> list[Slot]:
+        """What the drive has made of a setpoint, in SI, told once more: not the register that the host wrote."""
         application = self._application
         targets: dict[str, Callable[[], float]] = {
             "speed": lambda: application.target_speed_rad_s, "torque": lambda: application.target_torque_nm,
@@ -127,11 +128,12 @@ class Map:
     # -- helpers -------------------------------------------------------------------------------------------
 
     def _reported(self, signal: Signal | Echo, quantity: Callable[[], float]) -> Slot:
-        layout = self._layout(signal.register_)
+        echo = isinstance(signal, Echo)
+        layout = self._layout(signal.register_, echo=echo)
         parameters = self._parameters
 
         def read() -> int:
-            scale = parameters.scale(signal.per_lsb, signal.unit, signal.times)
+            scale = parameters.scale(signal.per_lsb, signal.unit, signal.times, echo=echo)
             return self._signed(layout, layout.saturated(parameters.in_unit(quantity(), signal.unit) / scale))
 
         return Slot(layout, read)
@@ -174,8 +176,9 @@ class Map:
             return layout.saturated(-number)
         return number
 
-    def _layout(self, register: Register) -> Layout:
-        kind = register.type.replace("i", "u") if "unsigned" in self._wrongs else register.type
+    def _layout(self, register: Register, *, echo: bool = False) -> Layout:
+        signless = "unsigned" in self._wrongs and not echo
+        kind = register.type.replace("i", "u") if signless else register.type
         high_first = self._profile.line.word_order == "high_first"
         return Layout(register.address, kind, register.table, high_first is not ("word_order" in self._wrongs))
 

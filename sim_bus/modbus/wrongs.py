@@ -9,6 +9,9 @@ unsigned                  signed registers have no sign: set below zero they rea
 write_not_applied         parameters are written without an error, and keep what they had
 reads_back_something_else `:NAME` the parameter NAME reads half as large again, and one more
 ========================  ==========================================================================================
+
+A register that echoes a setpoint is another one, with a count and a type of its own: scale_10 and unsigned leave it as
+it is, and what the drive has made of the setpoint shows there.
 """
 
 from collections.abc import Iterable

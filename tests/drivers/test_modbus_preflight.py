@@ -6,7 +6,7 @@ import pytest
 from modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Limits, Mode, Outcome
+from drivers.drive import Command, Limits, Mode, Outcome
 from drivers.errors import PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
@@ -378,3 +378,40 @@ def test_a_speed_only_drive(bank, generic):
     assert all(address + len(words) <= 3 or address > 4 for address, words in bank.writes)
     with pytest.raises(PreflightRefused, match="torque"):
         drive.enable(Mode.TORQUE)
+
+
+@pytest.mark.parametrize("late", [3, 1000])
+def test_an_echo_may_be_late_but_not_stay_away(bank, generic, late):
+    """Drives renew what they display at their leisure; one that never shows it is refused, in bounded time."""
+    clock = SteppedClock()
+    shown, since = (0, 0), 0
+
+    def show_late(words):
+        nonlocal shown, since
+        since += 1
+        if since > late:
+            shown, since = (words[48], words[49]), 0
+        words[48], words[49] = shown
+
+    bank.on_show = show_late
+    drive = drive_on(bank, generic, clock)
+    drive.connect()
+    found = drive.preflight(LIMITS).refused
+    assert [check.name for check in found] == ["speed setpoint as the drive understood it"] * (late == 1000)
+    assert all("Does it take its reference from this bus" in check.next_step for check in found)
+    assert clock.now_s() < 5.0
+    assert bank.words[SPEED_SETPOINT] == bank.words[SPEED_SETPOINT + 1] == 0
+
+
+def test_a_ramp_up_is_as_steep_as_the_quick_stop_and_no_steeper(bank, generic):
+    """1 rad/s² up to 3000 rpm is 314.16 s, in counts of 0.1 s and not shorter; given back afterwards."""
+    profile = changed(generic, quick_stop_deceleration={"set_to": "ramp_up_time", "unit": "s", "times": "top"},
+                      rated_speed={"name": "top"}, name_plate=None)
+    bank.words |= {35: 30000, 39: 30}
+    drive = drive_on(bank, profile)
+    drive.connect()
+    assert drive.preflight(LIMITS).refused == ()
+    assert bank.words[39] == 3142
+    drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    drive.close()
+    assert bank.words[39] == 30

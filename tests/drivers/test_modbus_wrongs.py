@@ -1,4 +1,8 @@
-"""Driver and simulator, each with its own arithmetic: whatever is wired wrong is caught before the shaft could move."""
+"""Driver and simulator, each with its own arithmetic: whatever is wired wrong is caught before the shaft could move.
+
+Once the drive is wrong and the profile right, and once the other way: the simulated drive then wears the profile that
+ships, and the driver reads one with a mistake in it.
+"""
 
 import pytest
 
@@ -7,7 +11,8 @@ from drivers.drive import Limits
 from drivers.errors import PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
-from profiles.library import load_modbus_profile
+from profiles.library import load_modbus_profile, load_profile, profile_names
+from profiles.modbus_schema import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.wrongs import parse
 from sim_bus.params import RigParams
@@ -20,13 +25,21 @@ READ_BACK = [f"reads_back_something_else:{name}" for name in (
 )]
 
 
-def refused(*wrongs):
-    simulated = EmbeddedModbusDrive(RigParams(), PROFILE, wrongs=tuple(map(parse, wrongs)))
-    clock = SteppedClock()
-    drive = ModbusDrive(EmbeddedLink(simulated.serve, clock), PROFILE, unit=1)
+SHOWN = [(name, echo.setpoint) for name in profile_names()
+         if isinstance(profile := load_profile(name), ModbusProfile) for echo in profile.echoes]
+
+
+def refused(*wrongs, worn=PROFILE, read=PROFILE):
+    simulated = EmbeddedModbusDrive(RigParams(), worn, wrongs=tuple(map(parse, wrongs)))
+    drive = ModbusDrive(
+        EmbeddedLink(simulated.serve, SteppedClock()), read, unit=1, given=dict(simulated.untold),
+        rated_torque_nm=None if worn.rated_torque else simulated.rated_torque_nm,
+    )
     try:
         drive.connect()
-        return drive.preflight(LIMITS).refused
+        found = drive.preflight(LIMITS)
+        assert all(check.next_step and check.where for check in found.refused)
+        return found.refused
     except PreflightRefused as error:
         return (error,)
     finally:
@@ -43,3 +56,43 @@ def test_none_where_nothing_is_wrong():
 ])
 def test_each_wrong_is_refused(wrong):
     assert refused(wrong)
+
+
+def mistaken(profile, setpoint, change):
+    """The profile with one number of one setpoint changed."""
+    signal = getattr(profile.cycle, f"{setpoint}_setpoint").model_copy(update=change)
+    cycle = profile.cycle.model_copy(update={f"{setpoint}_setpoint": signal})
+    return profile.model_copy(update={"cycle": cycle})
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2.0, 10.0])
+@pytest.mark.parametrize(("name", "setpoint"), SHOWN)
+def test_a_profile_that_mistakes_what_a_count_of_a_setpoint_is(name, setpoint, factor):
+    profile = load_modbus_profile(name)
+    entry = getattr(profile.cycle, f"{setpoint}_setpoint")
+    wrong = mistaken(profile, setpoint, {"per_lsb": factor * entry.per_lsb})
+    names = {check.name for check in refused(worn=profile, read=wrong)}
+    assert f"{setpoint} setpoint as the drive understood it" in names
+
+
+@pytest.mark.parametrize("name", sorted({name for name, _ in SHOWN}))
+def test_a_profile_that_mixes_up_what_an_echo_shows(name):
+    """The mistake may as well be in the echo: the two have to agree."""
+    profile = load_modbus_profile(name)
+    echoes = tuple(echo.model_copy(update={"per_lsb": 10.0 * echo.per_lsb}) for echo in profile.echoes)
+    names = [check.name for check in refused(worn=profile, read=profile.model_copy(update={"echoes": echoes}))]
+    assert names == [f"{echo.setpoint} setpoint as the drive understood it" for echo in echoes]
+    assert refused(worn=profile, read=profile) == ()
+
+
+@pytest.mark.parametrize(("speed_rad_s", "coarse"), [(4.0, True), (6.0, False)])
+def test_an_echo_too_coarse_for_the_limits_says_so(speed_rad_s, coarse):
+    """0.1 % of 10000 rpm is 1.05 rad/s: one and a half of it against half of three quarters of the limit."""
+    profile = load_modbus_profile("danfoss/fc302")
+    simulated = EmbeddedModbusDrive(RigParams(), profile)
+    simulated.machine.parameters.put("maximum_reference", 10_000.0)
+    drive = ModbusDrive(EmbeddedLink(simulated.serve, SteppedClock()), profile, unit=1, rated_torque_nm=1000.0)
+    drive.connect()
+    limits = Limits(speed_rad_s=speed_rad_s, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+    notes = [check.name for check in drive.preflight(limits).checks if "too coarse" in check.found]
+    assert notes == ["speed setpoint as the drive understood it, how finely"] * coarse

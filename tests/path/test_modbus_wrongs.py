@@ -1,7 +1,8 @@
 """A drive wired otherwise than its profile says, on the whole path: what is refused before motion, and what can't be.
 
 A register without a twin, an echo or a name plate to compare it with says nothing of its own scale or sign. Where
-that is so, preflight notes it, and the sign probe is the first that can tell.
+that is so, preflight notes it, and the first that can tell is the sign probe, which pushes forward at walking pace, or
+for what is read without a sign the braking probe, which brakes once at low speed before torque mode goes on.
 """
 
 from functools import partial
@@ -19,23 +20,19 @@ NAMES = [name for name in profile_names() if isinstance(load_profile(name), Modb
 WRONGS = ("word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied")
 
 ONE_REGISTER = "all of its numbers take one register each: there is no order that could be wrong"
-NO_TWIN = "no second register, name plate or echo tells what a count of speed or torque is worth"
-NO_SIGN = "none of its parameters is below zero, and no echo shows a setpoint of either sign"
-MAGNITUDE = "what is written below zero reads back with the same bits, and no echo shows what the drive made of them"
-NOTHING_WRITTEN = "preflight writes no parameter of it: there is nothing that could be not applied"
+NO_TWIN = "the documents at hand name no register in which the setpoint shows before the ramp lets it through"
+NO_SIGN = "nothing that it has or shows at rest is below zero: the speed words have no sign, the direction is a bit"
+NO_SIGNED_TWIN = "its speed words have no sign, and nothing shows a torque setpoint before the drive regulates torque"
+"""Not on delta/ms300, which has no torque setpoint: there only what is reported could be without its sign."""
 
 PLAIN_16 = ("delta/ms300", "lenze/i550", "schneider/atv320", "schneider/atv340-930", "siemens/g120",
             "siemens/g130-s120", "yaskawa/ga700")
 UNTOLD = {
     **{(name, "word_order"): ONE_REGISTER for name in PLAIN_16},
-    **{(name, "scale_10"): NO_TWIN for name in (
-        "abb/acs880-enhanced", "danfoss/fc302", "delta/ms300", "lenze/i550", "schneider/atv320",
-        "schneider/atv340-930", "yaskawa/ga700")},
-    **{(name, "sign"): NO_SIGN for name in (
-        "delta/ms300", "schneider/atv320", "schneider/atv340-930", "siemens/g120", "siemens/g130-s120",
-        "yaskawa/ga700")},
-    **{(name, "unsigned"): MAGNITUDE for name in NAMES if name != "generic/modbus"},
-    **{(name, "write_not_applied"): NOTHING_WRITTEN for name in ("siemens/g120", "siemens/g130-s120")},
+    ("lenze/i550", "scale_10"): NO_TWIN,
+    **{(name, "sign"): NO_SIGN for name in ("delta/ms300", "yaskawa/ga700")},
+    ("lenze/i550", "unsigned"): NO_TWIN,
+    **{(name, "unsigned"): NO_SIGNED_TWIN for name in ("delta/ms300", "yaskawa/ga700")},
 }
 CAUGHT = [(name, wrong) for name in NAMES for wrong in WRONGS if (name, wrong) not in UNTOLD]
 
@@ -73,6 +70,23 @@ def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch,
     shaft.assert_at_rest()
 
 
+@pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "unsigned"])
+def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, monkeypatch, tmp_path):
+    """All drives with a torque mode, whatever preflight sees: test_braking_probe. Without one there is no torque to
+    set, and what is reported of it fits no shaft."""
+    wired(monkeypatch, "unsigned")
+    done, shaft = ran(tmp_path, name)
+    if load_modbus_profile(name).modes.torque:
+        assert done.code == 4, done.err
+        assert "braking probe, register" in done.document["error"]["message"]
+        assert np.max(shaft.speed_rad_s) < 7.5          # stage 2, in speed mode; the limit is 10
+    else:
+        assert done.code == 9, done.err
+        assert done.document["inertia_kg_m2"] is None
+        assert np.max(shaft.speed_rad_s) < 10.0
+    shaft.assert_at_rest()
+
+
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "scale_10"])
 def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_path):
     """Tenfold counts: a command is a tenth of what is meant, so the shaft is slower than asked, never faster."""
@@ -98,5 +112,7 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     drive.connect()
     found = drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
     assert found.refused == ()
-    notes = [check for check in found.checks if "in motion only" in check.found]
-    assert bool(notes) is not bool(profile.echoes)
+    notes = [check.name for check in found.checks if "in motion only" in check.found]
+    setpoints = {"speed", "torque"} if profile.modes.torque else {"speed"}
+    unseen = sorted(setpoints - {echo.setpoint for echo in profile.echoes})
+    assert notes == [f"{name} setpoint as the drive understood it" for name in unseen]

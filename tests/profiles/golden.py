@@ -29,6 +29,7 @@ Kinds of ``means``, one or more keys of one line:
 ``wish``, ``seen``, ``mode``, ``reverse``     the control word in the request, and the status that it answers to
 ``write: speed | torque`` with ``speed_rad_s`` or ``torque_nm``      a setpoint in the request
 ``read: speed | torque`` with ``speed_rad_s`` or ``torque_nm``       feedback in the reply
+``echo: speed | torque`` with ``speed_rad_s`` or ``torque_nm``       a setpoint as the drive shows it, in the reply
 ``parameter``, ``value``           a parameter in the reply, in the profile's unit
 ``set``, ``value``                 a limit of rig.yaml written into that parameter
 ``choose: speed | torque``         the mode register in the request
@@ -68,6 +69,7 @@ class Means(DataModel):
     reverse: bool = False
     write: ModeName | None = None
     read: ModeName | None = None
+    echo: ModeName | None = None
     speed_rad_s: float | None = None
     torque_nm: float | None = None
     parameter: str | None = None

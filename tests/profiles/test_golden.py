@@ -21,7 +21,7 @@ from drivers.modbus.limits import wanted_setting
 from drivers.modbus.link import Reply
 from drivers.modbus.parameters import Parameters, find_filters
 from drivers.modbus.plan import plan_cycle
-from drivers.modbus.scales import find_scales, settle
+from drivers.modbus.scales import find_scales, settle, si_per_count
 from drivers.modbus.states import Wish, controlword_towards, decode, seen
 from drivers.table import Table
 from profiles.library import load_modbus_profile, load_profile, profile_names
@@ -112,6 +112,10 @@ def test_the_driver_sends_and_understands(name: str, number: int) -> None:
         entry = {"speed": cycle.speed, "torque": cycle.torque}[means.read]
         value = access.read(entry.register_) * getattr(host.codec.scales, means.read)
         assert value == approximately({"speed": means.speed_rad_s, "torque": means.torque_nm}[means.read])
+    elif means.echo is not None:
+        echo = next(one for one in profile.echoes if one.setpoint == means.echo)
+        value = access.read(echo.register_) * si_per_count(echo, told, host.golden.rated_torque_nm)
+        assert value == approximately({"speed": means.speed_rad_s, "torque": means.torque_nm}[means.echo])
     elif means.parameter is not None:
         counts = access.read(profile.parameter(means.parameter).register_)
         others = {key: value for key, value in told.items() if key != means.parameter}
@@ -241,6 +245,10 @@ def test_they_cover_what_a_profile_says(name: str) -> None:
     signed = profile.cycle.speed_setpoint.register_.type[0] == "i" or profile.control.reverse_bits is not None
     wanted = {("speed", False)} | ({("speed", True)} if signed else set())
     assert wanted | ({("torque", False), ("torque", True)} if profile.modes.torque else set()) <= writes
+    echoes = {(means.echo, (means.speed_rad_s or means.torque_nm or 0.0) < 0.0) for means in all_of if means.echo}
+    assert echoes == {
+        (one.setpoint, below) for one in profile.echoes for below in (False, True)[: 1 + (one.register_.type[0] == "i")]
+    }
     assert {means.set for means in all_of if means.set} == {one.name for one in profile.parameters if one.set_to}
     told = {one.name for one in profile.parameters if one.register_ is not None and one.set_to is None}
     assert {means.parameter for means in all_of if means.parameter} >= told

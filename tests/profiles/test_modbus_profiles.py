@@ -152,6 +152,7 @@ def test_the_file_begins_with_what_is_special(name: str) -> None:
         ("functions: [3, 6, 16]", "functions: [3, 5]", "functions"),
         ("    documented_s: 0.0\n", "", "give this or documented_s"),
         ("- name: speed_source", "- name: torque_source", "stands there twice"),
+        ("register: {address: 113, ", "register: {address: 113, type: u16, ", "has no sign, and the setpoint"),
     ],
 )
 def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -164,6 +165,13 @@ def test_wrong_profiles_are_told_with_file_and_line(tmp_path: Path, old: str, ne
     assert words in str(caught.value)
     assert all(problem.line and problem.file == str(path) for problem in caught.value.problems)
     assert all("\n" not in str(problem) for problem in caught.value.problems)
+
+
+def test_an_echo_of_a_setpoint_that_is_not_there(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text_of("delta/ms300").replace("- setpoint: speed", "- setpoint: torque"), encoding="utf-8")
+    with pytest.raises(DataFileError, match="this profile has no torque setpoint"):
+        load_modbus_profile(str(path))
 
 
 def test_a_canopen_profile_is_not_taken_for_one() -> None:

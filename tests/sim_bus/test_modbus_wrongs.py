@@ -2,6 +2,7 @@
 
 import struct
 import sys
+from math import pi
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,10 @@ def test_scale_10() -> None:
     for address, kind in ((32, "I"), (34, "H"), (35, "H"), (38, "H"), (45, "H")):
         assert wrong.number(address, kind) == pytest.approx(10 * right.number(address, kind), abs=5)
     assert wrong.number(42, "I") == 0x12345678 and wrong.number(44) == -12345     # no scale
+    wrong.write(1, struct.unpack(">3H", struct.pack(">ih", 2000, 100)))
+    assert wrong.drive.machine.application.target_speed_rad_s == pytest.approx(2.0 * pi / 30)     # 20 rpm was meant
+    assert wrong.number(48, "i") == 2000                                          # 0.001 rpm, a count of its own
+    assert wrong.number(50, "i") == pytest.approx(1000, abs=1)                    # 0.01 N·m; 100 were meant
     for one in (right, wrong):
         one.enable(20.0)
         one.cycles(8.0, rpm=20.0)
@@ -59,6 +64,7 @@ def test_unsigned() -> None:
     assert wrong.number(44) == 12345
     wrong.write_one(3, 0x10000 - 100)
     assert wrong.drive.machine.application.target_torque_nm == pytest.approx(65436)
+    assert wrong.number(50, "i") == pytest.approx(6_543_600)                      # shows what was made of it
 
 
 def test_write_not_applied() -> None:
