@@ -97,6 +97,7 @@ class Limits:
     torque_nm: float
     quick_stop_rad_s2: float
     watchdog_s: float
+    accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
 
 
 @dataclass(frozen=True)
@@ -140,9 +141,14 @@ class Preflight:
     rated_torque_nm: float
     torque_resolution_nm: float
     speed_resolution_rad_s: float
-    watchdog_s: float
+    watchdog_s: float                  # 0: none is armed
     safe_action: str                   # what the drive does by itself when the host falls silent
     filters: ReportingFilters = ReportingFilters()
+
+    @property
+    def watched(self) -> bool:
+        """Does the drive stop by itself when the host falls silent? If not, it was refused, or accepted by name."""
+        return self.watchdog_s > 0.0
 
     @property
     def refused(self) -> tuple[Check, ...]:

@@ -18,6 +18,12 @@ def _code(text: str) -> int:
     return int(text.removeprefix("0x").removesuffix("h"), 16)
 
 
+def _frames(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= 100):
+        raise ValueError("a number of frames, 1 to 100")
+    return int(text)
+
+
 def _object(text: str) -> tuple[int, int]:
     found = _OBJECT.fullmatch(text)
     if found is None or int(found[2] or 0) > 255:
@@ -52,6 +58,8 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
     "second-master": Kind(26, "another host: from the start the drive is enabled already; later, foreign setpoints",
                           plain(frames.SecondMaster)),
     "duplicate-node": Kind(26, "a second drive answers under the same node ID", plain(frames.SecondNode)),
+    "replayed-feedback": Kind(26, "so many frames of a recording, taken at rest, go before each of the drive's own",
+                              lambda v: frames.Replayed(_frames(v)), "1", "FRAMES"),
     "wrong-identity": Kind(29, "1018h:1, the vendor, is another one",
                            plain(lambda: frames.Otherwise(0x1018, 1))),
     "fault-at-start": Kind(30, "the drive is in fault when the host comes",

@@ -5,6 +5,7 @@ from sim_bus.fault_hooks import Frame, Frames, Misbehaviour
 SYNC = 0x080
 _FIRST_TPDO, _SECOND_TPDO, _HEARTBEAT, _ANSWER, _REQUEST = 0x180, 0x280, 0x700, 0x580, 0x600
 _SWITCH_ON_DISABLED = b"\x40\x02"
+_AT_REST = b"\x37\x16"        # operation enabled, target reached, speed zero
 
 
 class Dead(Misbehaviour):
@@ -83,6 +84,19 @@ class Frozen(Misbehaviour):
         if can_id - self.scene.node.id not in (_FIRST_TPDO, _SECOND_TPDO):
             return ((can_id, data),)
         return ((can_id, self._kept.setdefault(can_id, data)),)
+
+
+class Replayed(Misbehaviour):
+    """Somebody plays a recording of this drive, enabled and at rest: old TPDOs go before each of the drive's own."""
+
+    def __init__(self, before: int) -> None:
+        self._before = before
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id != _FIRST_TPDO + self.scene.node.id:
+            return ((can_id, data),)
+        old = _AT_REST + bytes(max(0, len(data) - 2))
+        return (*((can_id, old),) * self._before, (can_id, data))
 
 
 class SecondNode(Misbehaviour):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 
 from drivers.cia402.mapping import layout, write_pdo, written
 from drivers.cia402.objects import consumer_heartbeat
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.shape import Shape
 from drivers.errors import ObjectRefused, PreflightRefused
+from drivers.no_watchdog import DIES, settle
 from drivers.table import Table
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile, Watchdog
@@ -74,17 +76,18 @@ def arm_watchdog(
     period_s: float,
     beat: Callable[[], None],
     answered: Callable[[], bool],
+    accept_none: bool,
 ) -> float:
     """The drive's watchdog and its reaction, written and read back; how often the host must feed it, in seconds.
 
     Supervision begins with the first ``beat`` (heartbeat, or question of the node guarding), so one is sent before the
-    read-back; ``answered`` waits for the drive's answer to a question. 0 where nothing could be armed.
+    read-back; ``answered`` waits for the drive's answer to a question. 0 where it is not armed: refused, unless
+    ``accept_none`` and it is known to be off.
     """
+    tried = Table()
     if entry.kind == "none":
-        table.row(
-            "watchdog", "armed", "this drive has none", False, "profile",
-            "A host that dies would leave the shaft turning: this drive can't be used",
-        )
+        tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
+        settle(table, tried, accept_none, lambda: True)
         return 0.0
     index, sub, wanted = entry.reaction_index, entry.reaction_sub, entry.reaction_value
     if index is not None and wanted is not None:
@@ -93,16 +96,26 @@ def arm_watchdog(
             found = objects.change(index, sub, wanted, 16)
             return str(found), found == wanted
 
-        table.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
+        tried.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
     time_ms = round(watchdog_s * 1000)
     if not 1 <= time_ms <= 0xFFFF or watchdog_s < LEAST_CYCLES * period_s:
+        table.checks += tried.checks
         table.row(
             "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
             f"Give it at least {LEAST_CYCLES * period_s:g} s, or a higher rate",
         )
         return 0.0
     if entry.kind == "node_guarding":
-        return _arm_guarding(table, objects, time_ms, entry.life_time_factor, beat, answered)
+        feed_s = _arm_guarding(tried, objects, time_ms, entry.life_time_factor, beat, answered)
+    else:
+        feed_s = _arm_heartbeat(tried, objects, entry, host_node, time_ms, beat)
+    return feed_s if settle(table, tried, accept_none, lambda: _is_off(objects, entry)) else 0.0
+
+
+def _arm_heartbeat(
+    table: Table, objects: Objects, entry: Watchdog, host_node: int, time_ms: int, beat: Callable[[], None]
+) -> float:
+    """The consumer heartbeat time, 1016h in the standard: the drive acts where the host's heartbeat isn't heard."""
     value = consumer_heartbeat(host_node, time_ms)
 
     def arm() -> tuple[str, bool]:
@@ -112,10 +125,9 @@ def arm_watchdog(
         return f"node {found >> 16 & 0x7F}, {found & 0xFFFF} ms", found == value
 
     table.attempt(
-        "watchdog", f"node {host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm,
-        "Without it a host that dies would leave the shaft turning",
+        "watchdog", f"node {host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm, DIES,
     )
-    return watchdog_s / 5.0
+    return time_ms / 5000.0
 
 
 def _arm_guarding(
@@ -138,7 +150,21 @@ def _arm_guarding(
 
     table.attempt(
         "watchdog", f"{guard_ms} ms x {factor}", f"{name(GUARD_TIME)}, {name(LIFE_TIME_FACTOR)}", arm,
-        "Without it a host that dies would leave the shaft turning. Node guarding needs remote frames: python-can's "
-        "socketcand and some gateways don't carry them; use the adapter's own interface",
+        f"{DIES}. Node guarding needs remote frames: python-can's socketcand and some gateways don't carry them; use "
+        "the adapter's own interface",
     )
     return guard_ms / 1000.0
+
+
+def _is_off(objects: Objects, entry: Watchdog) -> bool:
+    """Does the drive supervise nobody? So where the object isn't there, or a node or time of 0 in it (CiA 301).
+
+    A guard time that was written although no question gets through would stop the shaft some time later: it is taken
+    back first.
+    """
+    if entry.kind == "node_guarding":
+        with suppress(ObjectRefused):
+            objects.change(GUARD_TIME, 0, 0, 16)
+        return not (objects.read_if_there(GUARD_TIME) and objects.read_if_there(LIFE_TIME_FACTOR))
+    value = objects.read_if_there(entry.consumer_index, entry.consumer_sub) or 0
+    return not (value >> 16 & 0x7F and value & 0xFFFF)

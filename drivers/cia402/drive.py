@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from drivers.cia402 import arming
 from drivers.cia402 import preflight as checks
+from drivers.cia402.feedback import Feedback
 from drivers.cia402.guarding import Guarding
 from drivers.cia402.limits import set_limits
 from drivers.cia402.link import CanLink
@@ -53,10 +54,9 @@ from drivers.drive import (
 )
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.table import Table
+from drivers.ticks import Ticks
 from profiles.marker import (
     CYCLE_ID,
-    CYCLES_END,
-    LAST_CYCLE_OVER,
     MARKER_INDEX,
     MARKER_STAGE,
     MARKER_TEXT,
@@ -83,6 +83,7 @@ STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
 """Wall time that feedback may take in stepped time, and after a cycle that brought none."""
 _NO_WORD = b""
 _PROFILE_VELOCITY = 3
+_OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
 
@@ -121,12 +122,10 @@ class Cia402Drive:
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
-        self._link.handlers[self._tpdo1_id] = self._on_feedback
         self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
-        for identifier in (SYNC, self._rpdo1_id, self._rpdo2_id, 0x700 + host_node):
+        self._link.handlers[SYNC] = self._on_foreign_sync
+        for identifier in (self._rpdo1_id, self._rpdo2_id, 0x700 + host_node):
             self._link.handlers[identifier] = self._watch.on_foreign
-        if clock.stepped:
-            self._link.handlers[CYCLE_ID] = self._on_cycle_end
         self._identity: Identity | None = None
         self._stage = ""               # as announced
         self._taken = False
@@ -135,11 +134,13 @@ class Cia402Drive:
         self._modes: dict[int, Mode] = {}
         self._shape = shape_of(profile)
         self._layout = self._shape.feedback
-        self._data_size = self._shape.data_size()
         self._wide = self._shape.wide
+        self._feedback = Feedback(self._shape)
+        self._link.handlers[self._tpdo1_id] = self._feedback.on_tpdo1
+        if clock.stepped:
+            self._link.handlers[CYCLE_ID] = self._feedback.on_cycle_end
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
-        self._data_half = self._status_half = _NO_WORD
         self._watchdog_s = 0.0
         self._heartbeat_every_s = HEARTBEAT_S
         self._wish = Wish.OFF
@@ -152,19 +153,18 @@ class Cia402Drive:
         self._shown_code = 0
         self._sent_code = 0
         self._since_mode_sent = 0
-        self._feedback = _NO_WORD
-        self._ends_cycles = self._over = False     # a simulated peer says where a cycle ends, and this one is over
+        self._contradictions = 0
         self._heard = True
-        self._next_tick_s = 0.0
+        self._ticks = Ticks(clock, self.period_s)
         self._next_heartbeat_s = 0.0
-        self._cycles = self._missed = self._late = self._overruns = 0
+        self._cycles = self._missed = self._late = 0
 
     @property
     def counters(self) -> Counters:
         """What went wrong on the bus so far."""
         stamps = self._link.stamps
         return Counters(
-            self._cycles, self._missed, self._late, self._overruns,
+            self._cycles, self._missed, self._late + self._feedback.second, self._ticks.overruns,
             error_frames=self._link.error_frames, passive=self._link.passive,
             wall_offset_s=stamps.offset_s, wall_jumps=stamps.jumps,
         )
@@ -241,10 +241,14 @@ class Cia402Drive:
             period_s=self.period_s,
             beat=self._feed,
             answered=self._answered,
+            accept_none=limits.accept_no_watchdog,
         )
+        if not feed_s:                 # nobody is asked who may not hear it: not every adapter carries remote frames
+            self._feed = self._send_heartbeat
         self._heartbeat_every_s = min(HEARTBEAT_S, feed_s or HEARTBEAT_S)
         found = checks.report(
-            table, self._identity, self._profile, objects, self._units, rated_nm, self._codes, self._watchdog_s
+            table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
+            limits.watchdog_s if feed_s else 0.0,
         )
         guarded = self._guarding is not None and feed_s > 0.0
         self._start(limits.watchdog_s if guarded else DRIVE_SILENT_S if heard else 0.0)
@@ -268,8 +272,7 @@ class Cia402Drive:
             raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
-        now_s = self.clock.now_s()
-        self._next_tick_s = now_s + self.period_s
+        self._ticks = Ticks(self.clock, self.period_s, 0.5 * self._watchdog_s)
         self._watch.start(allowed_silence_s)
 
     def _pause(self) -> None:
@@ -311,7 +314,7 @@ class Cia402Drive:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
         speed_raw = encode_speed(command.speed_rad_s, self._units)
         torque_raw = encode_torque(command.torque_nm, self._units)
-        self._wait_for_tick()
+        self._ticks.wait(self._listen_until)
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
         self._watch.check()
         now_s = self.clock.now_s()
@@ -328,19 +331,24 @@ class Cia402Drive:
             self._rpdo1_id,
             RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
         )
-        self._feedback = self._data_half = self._status_half = _NO_WORD
-        self._over = False
+        feedback = self._feedback
+        feedback.begin()
         self._link.send(SYNC, _NO_WORD)
         age_s = self._await_feedback(now_s)
         self._cycles += 1
-        fresh = bool(self._feedback)
-        self._heard = fresh or self._over
+        fresh = bool(feedback.data)
+        self._heard = fresh or feedback.over
+        if not fresh:
+            self._missed += 1
+        if feedback.doubted() and self._wish is not Wish.ENABLED:
+            fresh = False
         if fresh:
-            self._status, self._torque_raw, self._speed_raw = self._layout.unpack(self._feedback)
+            self._status, self._torque_raw, self._speed_raw = self._layout.unpack(feedback.data)
             self._state = decode(self._status)
             self._follow_state()
-        else:
-            self._missed += 1
+        while self._contradictions < feedback.contradictions:
+            self._contradictions += 1
+            self._watch.on_contradiction()
         self._watch.check()
         return self._sample(now_s, age_s, fresh)
 
@@ -365,53 +373,34 @@ class Cia402Drive:
         self._follow_state()
         push(self._objects, found.status, self._wish, self._watchdog_s)
         self._feed()
-        if not self.clock.stepped:         # time well spent: no overrun, and no loop that stood still
-            self._next_tick_s = max(self._next_tick_s, self.clock.now_s())
+        self._ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
 
     def _follow_state(self) -> None:
         """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.
 
         Some drives leave by fault, some by quick stop, and some are simply found switched off, once their own watchdog
-        has brought the shaft to rest.
+        has brought the shaft to rest. Quick stop keeps each of them where it is, and does no harm to one that is still
+        in operation because the frame that said otherwise wasn't its own.
         """
         if self._wish is not Wish.ENABLED:
             return
         if self._state is State.OPERATION_ENABLED:
             self._in_operation = True
-        elif self._state is State.QUICK_STOP_ACTIVE:
+        elif self._in_operation or self._state in _OUT_OF_OPERATION:
             self._wish = Wish.QUICK_STOP
-        elif self._in_operation or self._state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-            self._wish = Wish.OFF
 
-    def _wait_for_tick(self) -> None:
-        clock = self.clock
-        before = self._feedback
+    def _listen_until(self, tick_s: float) -> None:
+        """Wait for the next tick, and take what comes meanwhile; feedback among it is late."""
+        clock, before = self.clock, self._feedback.arrived
         if clock.stepped:
-            clock.wait_until(self._next_tick_s)
-            self._next_tick_s += self.period_s
-            self._link.drain()
+            clock.wait_until(tick_s)
         else:
-            while (left_s := self._next_tick_s - clock.now_s()) > 0.0:
+            while (left_s := tick_s - clock.now_s()) > 0.0:
                 if self._link.receive(left_s) is None:
                     break
-            self._link.drain()
-        if self._feedback is not before:
-            self._late += 1
-        if clock.stepped:
-            return
-        behind_s = clock.now_s() - self._next_tick_s
-        if behind_s > 0.5 * self.period_s:
-            self._overruns += 1
-        # A tick that was overslept is not caught up with: two SYNCs in a row would be one instant measured twice.
-        self._next_tick_s = max(self._next_tick_s + self.period_s, clock.now_s() + 0.5 * self.period_s)
-        if self._watchdog_s and behind_s > 0.5 * self._watchdog_s:
-            self._next_tick_s = clock.now_s() + self.period_s
-            raise CommunicationLost(
-                f"the control loop stood still for {behind_s:.2f} s; the setpoint it had in hand was not sent",
-                where="host",
-                next_step="Was the laptop asleep, the process frozen? The drive's watchdog may have stopped the shaft",
-            )
+        self._link.drain()
+        self._late += self._feedback.arrived > before
 
     def _await_feedback(self, sync_s: float) -> float:
         """Take frames until TPDO1 is there; its age in seconds of control time."""
@@ -420,11 +409,11 @@ class Cia402Drive:
         if clock.stepped:
             # In stepped time nothing is late, it is lost; a peer that has fallen silent must not hold the host up.
             deadline_s = time.monotonic() + (STEPPED_WAIT_S if self._heard else STEPPED_WAIT_SILENT_S)
-            while not self._cycle_done and (left_s := deadline_s - time.monotonic()) > 0.0:
+            while not self._feedback.done and (left_s := deadline_s - time.monotonic()) > 0.0:
                 link.receive(left_s)
             return 0.0
         deadline_s = sync_s + 0.8 * self.period_s
-        while not self._feedback and (left_s := deadline_s - clock.now_s()) > 0.0:
+        while not self._feedback.data and (left_s := deadline_s - clock.now_s()) > 0.0:
             link.receive(left_s)
         return clock.now_s() - sync_s
 
@@ -446,40 +435,14 @@ class Cia402Drive:
         self._guarding.feed()
         self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
 
-    def _on_feedback(self, data: bytes) -> None:
-        if len(data) == self._data_size:
-            if self._wide:
-                self._data_half = data
-                self._join()
-            else:
-                self._take(data)
-
-    def _take(self, feedback: bytes) -> None:
-        """The first of a cycle counts. A second one is seen here only while a peer says where the cycle ends."""
-        if self._ends_cycles and self._feedback:
-            self._late += 1
-        else:
-            self._feedback = feedback
-
-    def _on_cycle_end(self, data: bytes) -> None:
-        """Of a simulated peer with scripted faults, in stepped time (`profiles.marker.CYCLE_ID`)."""
-        self._ends_cycles = data != LAST_CYCLE_OVER
-        self._over = data != CYCLES_END
-
-    @property
-    def _cycle_done(self) -> bool:
-        """In stepped time: nothing more is waited for."""
-        return self._over or (bool(self._feedback) and not self._ends_cycles)
-
-    def _join(self) -> None:
-        """A wide drive's two TPDOs of one SYNC, in whichever order they came."""
-        if self._data_half and self._status_half:
-            self._take(self._status_half + self._data_half)
+    def _on_foreign_sync(self, data: bytes) -> None:
+        self._feedback.on_foreign_sync()
+        self._watch.on_foreign(data)
 
     def _on_slow_feedback(self, data: bytes) -> None:
         if self._wide and len(data) == 2 + self._slow_layout.size:
-            self._status_half, data = data[:2], data[2:]
-            self._join()
+            self._feedback.on_status(data[:2])
+            data = data[2:]
         if len(data) == self._slow_layout.size:
             values = self._slow_layout.unpack(data)
             self._shown_code = values[0]

@@ -141,6 +141,6 @@ def report(
         torque_resolution_nm=units.torque_nm_per_lsb,
         speed_resolution_rad_s=units.speed_rad_s_per_lsb,
         watchdog_s=watchdog_s,
-        safe_action=profile.watchdog.reaction,
+        safe_action=profile.watchdog.reaction if watchdog_s else "none",
         filters=filters,
     )

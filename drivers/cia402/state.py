@@ -107,11 +107,12 @@ def controlword_towards(state: State, wish: Wish) -> int:
 
     A fault is never reset here, and a quick stop never ended by enabling again: both must be asked for, and
     until then the word is the harmless one.
+
+    Quick stop is the same word in every state: where the drive is not in operation it switches off or does nothing
+    (transitions 7 and 10), and where it is after all, since the state shown is old or another node's, the shaft stops.
     """
     if wish is Wish.ENABLED:
         return _TOWARDS_ENABLED.get(state, QUICK_STOP if state is State.QUICK_STOP_ACTIVE else DISABLE_VOLTAGE)
     if wish is Wish.QUICK_STOP:
-        if state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE):
-            return QUICK_STOP
-        return DISABLE_VOLTAGE
+        return QUICK_STOP
     return _TOWARDS_OFF.get(state, DISABLE_VOLTAGE)

@@ -18,7 +18,8 @@ PRE_OPERATIONAL = 0x7F
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
 FOREIGN_FRAMES, FOREIGN_S = 3, 1.0
-"""So many frames within this time that only we send (SYNC, the drive's RPDOs, our heartbeat) are another master's."""
+"""So many frames within this time that only we send (SYNC, the drive's RPDOs, our heartbeat) are another master's; and
+so many that only the drive sends, besides its own, another drive's."""
 
 START_GRACE_S = 0.5
 """A heartbeat that was under way when the node was started still says pre-operational."""
@@ -75,6 +76,7 @@ class Watch:
         self._troubles: list[TdhilError] = []
         self._raised: set[str] = set()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
+        self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
         self.allowed_silence_s = 0.0
@@ -150,6 +152,20 @@ class Watch:
                     "a second master is on the bus: it sends SYNC, setpoints or a host's heartbeat of its own",
                     where=f"node {self._node}",
                     next_step="Take it off the bus, or give it other identifiers, and start anew",
+                ),
+            )
+
+    def on_contradiction(self) -> None:
+        """A frame of feedback that the drive can't have sent, if it sent the one before it for the same SYNC."""
+        now_s = self._clock.now_s()
+        self._contradicted_s.append(now_s)
+        if len(self._contradicted_s) == FOREIGN_FRAMES and now_s - self._contradicted_s[0] <= FOREIGN_S:
+            self._keep(
+                "feedback",
+                CommunicationLost(
+                    "feedback comes more than once for a SYNC, and says different things: somebody else sends it too",
+                    where=f"node {self._node}, TPDO1 ({0x180 + self._node:03X}h)",
+                    next_step="Is the node-ID given twice, or a recording being played back? Mend it and start anew",
                 ),
             )
 

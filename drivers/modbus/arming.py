@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from drivers.drive import Limits
-from drivers.errors import CommunicationLost
+from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.limits import write_setting
 from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.rounds import Round
+from drivers.no_watchdog import DIES, settle
 from drivers.table import Table
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus_schema import ModbusProfile, Parameter
 
 LEAST_CYCLES = 5
 """The watchdog must not bite on account of a lost reply or two."""
@@ -72,49 +73,74 @@ def measure_pace(
 def arm_watchdog(
     table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float, found: Parameters,
     period_s: float, feed: Callable[[], object],
-) -> None:
-    """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back."""
-    entry = profile.watchdog
+) -> bool:
+    """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back.
+
+    Whether it is armed. If not, that is refused, unless the operator accepts it and it is known to be off.
+    """
+    entry, accepted, tried = profile.watchdog, limits.accept_no_watchdog, Table()
     if entry.kind == "none":
-        table.row(
-            "watchdog", "armed", "this drive has none", False, "profile",
-            "A host that dies would leave the shaft turning: this drive can't be used",
-        )
-        return
+        tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
+        return settle(table, tried, accepted, lambda: True)
     table.note("watchdog reaction", entry.reaction.replace("_", " "), "profile, watchdog.reaction")
     if limits.watchdog_s < LEAST_CYCLES * period_s:
         table.row(
             "watchdog time", f"at least {LEAST_CYCLES} cycles", f"{limits.watchdog_s:g} s", False, "limits.watchdog_s",
             f"Give it at least {LEAST_CYCLES * period_s:.2g} s, or a faster line",
         )
-        return
+        return False
     if entry.parameter is None:
-        table.row(
+        tried.row(
             "watchdog", "armed and read back", "this profile doesn't say where its time stands", False, "profile",
             "Name its parameter in the profile (watchdog.parameter): what can't be read back isn't known to be armed",
         )
-        return
+        return settle(table, tried, accepted, lambda: True)
     parameter = profile.parameter(entry.parameter)
-    where = where_of(parameter)
-    mend = parameter.advice or "Without it a host that dies would leave the shaft turning"
-    if parameter.set_to == "watchdog":
-        if not write_setting(table, access, parameter, limits, rated_nm, found.values):
-            return
-        register = parameter.register_
-        assert register is not None
-        counts = access.read(register)
-
-        def fed() -> tuple[str, bool]:
-            feed()
-            back = access.read(register)
-            return f"{back} counts", back == counts and back > 0
-
-        table.attempt("watchdog", f"{counts} counts, once it was fed", where, fed, mend)
-        return
     value = found.values.get(parameter.name)
+    if value is None and not accepted:
+        return False        # refused already, where it was read
     if value is None:
-        return              # refused already, where it was read
-    feed()
-    good = LEAST_CYCLES * period_s <= value <= limits.watchdog_s * (1.0 + 1e-9)
-    wanted = f"{LEAST_CYCLES * period_s:.2g} to {limits.watchdog_s:g} s"
-    table.row("watchdog", wanted, show(value, parameter), good, where, mend)
+        tried.row("watchdog", "armed and read back", "it can't be read", False, where_of(parameter))
+    elif parameter.set_to == "watchdog":
+        _write(tried, access, parameter, limits, rated_nm, found, feed)
+    else:
+        feed()
+        good = LEAST_CYCLES * period_s <= value <= limits.watchdog_s * (1.0 + 1e-9)
+        wanted = f"{LEAST_CYCLES * period_s:.2g} to {limits.watchdog_s:g} s"
+        tried.row("watchdog", wanted, show(value, parameter), good, where_of(parameter), parameter.advice or DIES)
+    return settle(table, tried, accepted, lambda: is_off(access, parameter, found.values))
+
+
+def _write(
+    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, found: Parameters,
+    feed: Callable[[], object],
+) -> None:
+    if not write_setting(table, access, parameter, limits, rated_nm, found.values):
+        return
+    register = parameter.register_
+    assert register is not None
+    counts = access.read(register)
+
+    def fed() -> tuple[str, bool]:
+        feed()
+        back = access.read(register)
+        return f"{back} counts", back == counts and back > 0
+
+    wanted = f"{counts} counts, once it was fed"
+    table.attempt("watchdog", wanted, where_of(parameter), fed, parameter.advice or DIES)
+
+
+def is_off(access: Access, parameter: Parameter, told: Mapping[str, float]) -> bool:
+    """Does the time-out stand at 0, which switches it off, or does the drive refuse to tell it at all?
+
+    ``told``: values by name, for a time-out that has no register: a 0 that somebody has stated.
+    """
+    return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
+
+
+def counts_of(access: Access, parameter: Parameter) -> int | None:
+    """What stands in its register; None without one, or where the drive refuses to tell."""
+    try:
+        return None if parameter.register_ is None else access.read(parameter.register_)
+    except PreflightRefused:
+        return None

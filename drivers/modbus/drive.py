@@ -32,8 +32,8 @@ from drivers.modbus.scales import Scales
 from drivers.modbus.stage_marker import tell_stage
 from drivers.modbus.standstill import Standstill
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
-from drivers.modbus.ticks import Ticks
 from drivers.table import Table
+from drivers.ticks import Ticks
 from profiles.modbus_schema import ModbusProfile, StatusState
 
 REPEAT_MODE_CYCLES = 25
@@ -129,8 +129,10 @@ class ModbusDrive:
         table, access, profile = Table(), self._access, self._profile
         table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
         found, scales, rated_nm = checks.read_only_checks(
-            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm
+            table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm,
+            limits.accept_no_watchdog,
         )
+        watched = True
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
@@ -142,7 +144,9 @@ class ModbusDrive:
                 "; ".join(map(str, self._plan.cycle)), self._idle_round, self.clock.now_s,
             )
             self.period_s, self._timeout_s = pace.period_s, pace.timeout_s
-            arm_watchdog(table, access, profile, limits, rated_nm, found, self.period_s, self._idle_round)
+            watched = arm_watchdog(
+                table, access, profile, limits, rated_nm, found, self.period_s, self._idle_round
+            )
             self._watchdog_s = limits.watchdog_s
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
@@ -158,8 +162,8 @@ class ModbusDrive:
             rated_torque_nm=rated_nm,
             torque_resolution_nm=scales.torque,
             speed_resolution_rad_s=scales.speed,
-            watchdog_s=limits.watchdog_s,
-            safe_action=profile.watchdog.reaction,
+            watchdog_s=limits.watchdog_s if watched else 0.0,
+            safe_action=profile.watchdog.reaction if watched else "none",
             filters=filters,
         )
 

@@ -6,7 +6,7 @@ Nothing is written here: what is wrong with addresses, word order, sign or scale
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from drivers.drive import ReportingFilters
@@ -14,6 +14,7 @@ from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.registers import RANGES, register_name
 from drivers.modbus.scales import RPM, per_count, settle
+from drivers.no_watchdog import spare
 from drivers.rated_torque import agreed_rated_torque
 from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
@@ -30,8 +31,14 @@ class Parameters:
     values: Mapping[str, float]
 
 
-def read_parameters(table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float]) -> Parameters:
-    """Read every parameter that has a register; what is needed and can't be told is a refused row."""
+def read_parameters(
+    table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float],
+    spared: Collection[str] = (),
+) -> Parameters:
+    """Read every parameter that has a register; what is needed and can't be told is a refused row.
+
+    ``spared``: the watchdog's own, where it is off and the operator has accepted that.
+    """
     counts: dict[str, int] = {}
     for parameter in profile.parameters:
         if parameter.register_ is None:
@@ -40,13 +47,17 @@ def read_parameters(table: Table, access: Access, profile: ModbusProfile, given:
             counts[parameter.name] = access.read(parameter.register_)
         except PreflightRefused as error:
             where = register_name(parameter.register_)
-            if needed(profile, parameter):
+            if parameter.name in spared:
+                spare(table, parameter.title, "readable", error.what, where)
+            elif needed(profile, parameter):
                 table.row(parameter.title, "readable", error.what, False, where, error.next_step)
             else:
                 table.note(parameter.title, f"not told: {error.what}", where)
     values = settle(profile, counts, given)
     for parameter in profile.parameters:
-        if parameter.name not in values and parameter.register_ is None and needed(profile, parameter):
+        if parameter.name not in values and parameter.register_ is None and parameter.name in spared:
+            spare(table, parameter.title, "known", "can't be read over the bus", parameter.name)
+        elif parameter.name not in values and parameter.register_ is None and needed(profile, parameter):
             table.row(
                 parameter.title, "known", "can't be read over the bus", False, parameter.name,
                 f"Give drive_data.parameters.{parameter.name} in rig.yaml, as it stands on the drive's panel",
@@ -75,7 +86,9 @@ def needed(profile: ModbusProfile, parameter: Parameter) -> bool:
     return parameter.name in used
 
 
-def check_required(table: Table, profile: ModbusProfile, found: Parameters) -> None:
+def check_required(
+    table: Table, profile: ModbusProfile, found: Parameters, spared: Collection[str] = ()
+) -> None:
     """The checklist: parameters that must stand as the profile says; they are set at the drive, never from here."""
     for parameter in profile.parameters:
         require, value = parameter.require, found.values.get(parameter.name)
@@ -84,6 +97,9 @@ def check_required(table: Table, profile: ModbusProfile, found: Parameters) -> N
         if value is None:
             continue        # refused already, where it was read
         good = satisfied(require, value, _lsb(parameter, found.values))
+        if not good and parameter.name in spared:
+            spare(table, parameter.title, wanted_text(require, parameter), show(value, parameter), where_of(parameter))
+            continue
         advice = parameter.advice or f"Set '{parameter.title}' at the drive to {wanted_text(require, parameter)}"
         table.row(
             parameter.title, wanted_text(require, parameter), show(value, parameter), good, where_of(parameter), advice

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 from drivers.drive import Mode, Outcome, PowerState
 from drivers.modbus.access import Access
+from drivers.modbus.arming import counts_of, is_off
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.parameters import (
     Parameters,
@@ -33,12 +34,13 @@ LOOKS_AT_MODE, LOOK_S = 20, 0.05
 
 def read_only_checks(
     table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float], rated_torque_nm: float | None,
-    speed_limit_rad_s: float, torque_limit_nm: float,
+    speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False,
 ) -> tuple[Parameters, Scales | None, float]:
     """All that can be known without writing; no scales where something is refused."""
-    found = read_parameters(table, access, profile, given)
+    spared = watchdogs_own(access, profile, given) if accept_no_watchdog else frozenset()
+    found = read_parameters(table, access, profile, given, spared)
     rated_nm = find_rated_torque(table, profile, found, rated_torque_nm)
-    check_required(table, profile, found)
+    check_required(table, profile, found, spared)
     if rated_nm is not None:
         check_name_plate(table, profile, found, rated_nm)
     scales = find_scales(profile, found.values, rated_nm) if rated_nm is not None else None
@@ -54,6 +56,22 @@ def read_only_checks(
     if refused:
         table.note("settings", "nothing was written to the drive: mend the rows above first", "driver")
     return found, None if refused else scales, rated_nm or 1.0
+
+
+def watchdogs_own(access: Access, profile: ModbusProfile, given: Mapping[str, float]) -> frozenset[str]:
+    """Parameters that don't matter where the operator accepts a drive without a watchdog, and this one's is off.
+
+    None where it can be armed from here: that is tried, and what it needs must be right.
+    """
+    entry = profile.watchdog
+    if entry.kind == "none" or entry.parameter is None:
+        return frozenset()
+    parameter = profile.parameter(entry.parameter)
+    if not is_off(access, parameter, given):
+        return frozenset()
+    if parameter.set_to == "watchdog" and counts_of(access, parameter) is not None:
+        return frozenset()
+    return frozenset(name for name in (entry.parameter, entry.reaction_parameter) if name is not None)
 
 
 def check_resolution(

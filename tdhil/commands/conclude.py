@@ -24,6 +24,7 @@ def conclude(
     from tdhil.identify import identify
     from tdhil.identify.identification import Verdict
     from tdhil.identify.options import Options
+    from tdhil.protocol import no_watchdog
     from tdhil.report.document import result_document
 
     asked = run.get("identify", {})
@@ -31,8 +32,9 @@ def conclude(
     options = Options(**known)
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
-    if warnings is not None:
-        identification = replace(identification, warnings=(*warnings, *identification.warnings))
+    said = (*(warnings or ()), *no_watchdog.warnings(run))
+    if said:
+        identification = replace(identification, warnings=(*said, *identification.warnings))
     stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     return result_document(identification, recording, run, log), ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
 

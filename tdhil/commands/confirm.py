@@ -11,11 +11,13 @@ from rich.console import Console
 
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
+from drivers.no_watchdog import ACCEPTED_BY, NOTHING_STOPS_IT
 from tdhil.protocol.runner import Idle, Task
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.report.numbers import minutes
 
 WORD = "MOVE"
+_UNWATCHED = "  [ ] somebody stands at that stop for the whole run: nothing else stops the shaft if this host fails\n"
 
 
 def confirm_motion(
@@ -54,7 +56,8 @@ def summary(
     preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
 ) -> str:
     """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
-    silent = preflight.safe_action.replace("_", " ")
+    silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
+    watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
     return (
         f"\nThis run will move {preflight.identity.name}:\n"
         f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
@@ -62,12 +65,13 @@ def summary(
         f"  peak torque     {limits.torque_nm:g} N·m\n"
         f"  excitation      {request.kind}\n"
         f"  duration        at most {minutes(limits.time_s)}\n"
-        f"  watchdog        {preflight.watchdog_s:g} s in the drive, then {silent}\n"
+        f"  watchdog        {watchdog}\n"
         f"{_taken(unverified)}"
         "Before you confirm:\n"
         "  [ ] brake released\n"
         "  [ ] pipe handler and people clear of the shaft\n"
         "  [ ] hard-wired emergency stop tested and within reach (Ctrl-C stops, but is no emergency stop)\n"
+        f"{seen_to}"
     )
 
 

@@ -13,6 +13,7 @@ from drivers.cia402.state import State, decode
 from drivers.cia402.units import find_units
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, ObjectRefused
+from drivers.no_watchdog import FLAG
 from drivers.table import Table
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
 from profiles.schema import CanopenProfile
@@ -111,7 +112,7 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
     dog = profile.watchdog
     if dog.kind == "none":
         yield bad("watchdog", f"profile {profile.name} knows none",
-                  "A host that dies would leave the shaft turning: this drive can't be used so")
+                  f"A host that dies would leave the shaft turning: identify takes it by name only, {FLAG}")
         return
     wanted = [(0x100C, 0), (0x100D, 0)] if dog.kind == "node_guarding" else [(dog.consumer_index, dog.consumer_sub)]
     if dog.reaction_index is not None:
@@ -121,7 +122,7 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
             value = objects.read_bytes(*at)
             yield ok("watchdog", f"{name(*at)} is there and reads {int.from_bytes(value, 'little'):X}h")
         except ObjectRefused:
-            step = "Choose the drive's own profile: without a watchdog nothing is moved"
+            step = f"Choose the drive's own profile: without a watchdog nothing is moved, or by name only, {FLAG}"
             yield bad("watchdog", f"the drive has no {name(*at)}", step)
 
 

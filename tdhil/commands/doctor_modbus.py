@@ -19,6 +19,7 @@ from drivers.modbus.parameters import (
 )
 from drivers.modbus.scales import settle
 from drivers.modbus.states import decode, power_state, seen
+from drivers.no_watchdog import FLAG
 from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
 from tdhil.commands.finding import Finding, bad, note, of_check, ok
@@ -134,7 +135,7 @@ def _watchdog(profile: ModbusProfile, values: Mapping[str, float]) -> Finding:
     dog = profile.watchdog
     if dog.kind == "none":
         return bad("watchdog", f"profile {profile.name} knows none",
-                   "A host that dies would leave the shaft turning: this drive can't be used so")
+                   f"A host that dies would leave the shaft turning: identify takes it by name only, {FLAG}")
     parameter: Parameter | None = profile.parameter(dog.parameter) if dog.parameter is not None else None
     if parameter is None:
         return note("watchdog", watchdog_text(profile))

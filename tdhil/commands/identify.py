@@ -35,6 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     drive.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="cycles a second (default: profile's)")
     drive.add_argument("--accept-unverified", action="append", metavar="NAME",
                        help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
+    drive.add_argument("--accept-no-watchdog", action="store_true",
+                       help="take a drive whose watchdog can't be armed: it won't stop by itself if this host dies")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
@@ -139,7 +141,7 @@ def _run(
         ) as drive, LiveDisplay(console, show_preflight=False) as display:
             outcome = Runner(
                 drive,
-                partial(_task, options, connection.profile, rig, log, say),
+                partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog),
                 log,
                 stop_request,
                 display,
@@ -169,7 +171,13 @@ def _run(
 
 
 def _task(
-    options: Resolved, profile: Profile, rig: Rig | None, log: RunLog, say: Callable[[str], None], identity: Identity
+    options: Resolved,
+    profile: Profile,
+    rig: Rig | None,
+    log: RunLog,
+    say: Callable[[str], None],
+    accept_no_watchdog: bool,
+    identity: Identity,
 ) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
     from tdhil.commands.unverified import accepted_lines, note, require_accepted
@@ -182,7 +190,8 @@ def _task(
         log.configure(unverified=list(accepted_lines(profile, options["accept_unverified"])))
     elif text := note(profile):
         say(text)
-    return Task(machine_limits(bench), excitation_request(options), facts(bench))
+    limits = machine_limits(bench, accept_no_watchdog=accept_no_watchdog)
+    return Task(limits, excitation_request(options), facts(bench))
 
 
 def _finish(
@@ -225,7 +234,8 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         console.print(f"tdhil: {loud}", style="bold white on red", markup=False, soft_wrap=True)
         said = str(loud)
         # Without a bus nothing can be confirmed: then the lost communication is the cause and the watchdog acts.
-        if not isinstance(cause, CommunicationLost):
+        watched = outcome.preflight is None or outcome.preflight.watched
+        if not (isinstance(cause, CommunicationLost) and watched):
             code = ExitCode.STOP_NOT_CONFIRMED
     if stop is None or stop.confirmed:
         console.print(f"tdhil: {said}", markup=False, soft_wrap=True)

@@ -29,8 +29,11 @@ def bench_of(identity: Identity, rig: Rig | None) -> Rig:
     return rig
 
 
-def machine_limits(bench: Rig) -> MachineLimits:
-    """The guard's limits. Raises PreflightRefused where the rig has none."""
+def machine_limits(bench: Rig, *, accept_no_watchdog: bool = False) -> MachineLimits:
+    """The guard's limits. Raises PreflightRefused where the rig has none.
+
+    ``accept_no_watchdog`` is a run's, on its own command line: no file of the bench says it.
+    """
     limits = require_limits(bench)
     return MachineLimits(
         speed_min_rad_s=limits.speed_min_rad_s,
@@ -44,6 +47,7 @@ def machine_limits(bench: Rig) -> MachineLimits:
         allow_reverse=bench.allow_reverse,
         load=bench.load,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
+        accept_no_watchdog=accept_no_watchdog,
     )
 
 

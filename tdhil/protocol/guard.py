@@ -39,7 +39,7 @@ PACE_S, LATE_SHARE = 2.0, 0.2
 
 
 class Guard:
-    """Holds the machine's limits over one run. ``model`` and ``expected`` are set by the stages as they learn."""
+    """Holds the machine's limits over one run. ``model``, ``expected``, ``no_braking`` are set as the stages learn."""
 
     def __init__(
         self,
@@ -68,15 +68,25 @@ class Guard:
         self._started_s: float | None = None
         self.expected: PowerState | None = None
         self.model: RigGuess | None = None
+        self.no_braking = ""
+        """Why no torque below zero may be commanded in torque mode; empty: it may. Set by whoever runs the stages."""
+        self.to_brake = ""
+        """What would change that."""
 
     def check_command(self, command: Command) -> None:
-        """Raise CommandRejected for a setpoint that must not reach the bus."""
+        """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""
         speed, torque = command.speed_rad_s, command.torque_nm
         if not (math.isfinite(speed) and math.isfinite(torque)):
             raise CommandRejected(f"setpoint is not finite (speed {speed}, torque {torque})", where="guard")
         if abs(torque) > self._limits.torque_nm * (1.0 + 1e-9):
             raise CommandRejected(
                 f"torque setpoint {torque:.1f} N·m is beyond the limit of {self._limits.torque_nm:g} N·m", where="guard"
+            )
+        if self.no_braking and command.mode is Mode.TORQUE and torque < 0.0:
+            raise LimitHit(
+                f"a braking torque of {-torque:.1f} N·m is held back: {self.no_braking}",
+                where="guard",
+                next_step=self.to_brake,
             )
         lowest = -self._limits.speed_max_rad_s if self._limits.allow_reverse else 0.0
         if not lowest <= speed <= self._limits.speed_max_rad_s:

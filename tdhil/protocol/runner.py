@@ -14,8 +14,9 @@ from typing import Any, Protocol
 from drivers.drive import Command, Drive, Identity, Limits, Mode, Outcome, Preflight, ReportingFilters, Sample
 from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
-from tdhil.protocol import excitation
+from tdhil.protocol import excitation, no_watchdog
 from tdhil.protocol.bench import Bench
+from tdhil.protocol.braking_probe import NOT_YET, slow_down, torque_setpoint
 from tdhil.protocol.control import MeanSpeedControl
 from tdhil.protocol.design import Knowledge, assumed_noise, measured_noise
 from tdhil.protocol.enough import Decision, Enough
@@ -171,6 +172,7 @@ class Runner:
                 assumptions,
                 torque_resolution_nm=preflight.torque_resolution_nm,
                 torque_offset_nm=torque_offset,
+                watched=preflight.watched,
             )
             bench.guard.start_clock(bench.now_s)
             breakaway = probe_sign(bench, limits, mode, preflight.speed_resolution_rad_s)
@@ -181,11 +183,17 @@ class Runner:
             self._log.motion(None, speed.levels, (speed.ramp,))
             self._note_rough(bench, speed)
             self._note_timing(bench, speed)
+            resolution = preflight.speed_resolution_rad_s
+            slow: tuple[Sample, ...] = ()
+            if mode is Mode.TORQUE:
+                slow = slow_down(bench, limits, speed.model, assumptions, speed.high.speed_rad_s, resolution)
         ramps: tuple[Ramp, ...] = (speed.ramp,)
         drifted: TorqueResult | None = None
         if mode is Mode.TORQUE:
             with self._stage("torque", 15.0):
-                drifted = run_torque(bench, limits, speed, torque_offset)
+                drifted = run_torque(
+                    bench, limits, assumptions, speed, slow, torque_offset, resolution, torque_setpoint(preflight)
+                )
                 ramps = (speed.ramp, drifted.ramp)
                 self._log.motion(None, speed.levels, ramps)
         else:
@@ -222,7 +230,10 @@ class Runner:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
             self._drive.reset_fault()
         preflight = self._preflight = self._drive.preflight(
-            Limits(limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s)
+            Limits(
+                limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
+                limits.accept_no_watchdog,
+            )
         )
         self._display.preflight(preflight)
         for check in preflight.checks:
@@ -232,6 +243,10 @@ class Runner:
         if preflight.refused:
             raise _refusal(preflight)
         refuse_with_string(limits, task.request, preflight)
+        if not preflight.watched:
+            self._log.configure(**no_watchdog.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID)
+            self._say(no_watchdog.SAID)
         # What the line carries is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s
         task = replace(task, assumptions=task.assumptions.at_period(period_s))
@@ -252,6 +267,7 @@ class Runner:
             preflight.torque_resolution_nm,
             task.assumptions,
         )
+        guard.no_braking = NOT_YET
         return task, Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle), preflight
 
     def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
@@ -290,6 +306,12 @@ class Runner:
                 str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
             ) from error
         plan = planned.plan
+        if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and bench.guard.no_braking:
+            raise PreflightRefused(
+                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {bench.guard.no_braking}",
+                where="plan of stage 5",
+                next_step=bench.guard.to_brake,
+            )
         if course is not None:
             self._note_following(bench, plan)
         self._display.planned(plan)
@@ -371,6 +393,7 @@ class Runner:
             self._announce(name)
             yield
         except BaseException as error:
+            no_watchdog.correct(error, self._preflight)
             try:
                 self._end_stage(Stage(name, start_s, self._drive.clock.now_s(), "aborted", _short(error)))
             except Exception as also:  # the first cause stays the cause

@@ -19,6 +19,7 @@ class MachineLimits:
     allow_reverse: bool = False
     load: str = "none"                 # none, string
     torque_ramp_nm_s: float = 0.0      # with a string: how fast trapped torque is brought down
+    accept_no_watchdog: bool = False   # the operator takes a drive that won't stop by itself (--accept-no-watchdog)
 
 
 @dataclass(frozen=True)

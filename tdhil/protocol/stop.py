@@ -40,8 +40,8 @@ from tdhil.protocol.stop_patience import Patience
 AT_REST_SHARE = 0.005
 """Standstill is a speed below this share of the speed limit, or three quanta if that is more."""
 
-LONGEST_GAP_S = 0.2
-"""Standstill must have been watched without a longer gap in the feedback."""
+LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
+"""Standstill must have been watched without a longer gap in the feedback than both; on a slow line a frame may go."""
 
 SILENT_S, SILENT_CYCLES = 1.0, 25
 """After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
@@ -71,7 +71,7 @@ class StopReport:
 
 
 class StopSequence:
-    """Runs once; a second call gives the first one's report."""
+    """Runs once; a second call gives the first one's report. ``watched``: the drive's own watchdog is armed."""
 
     def __init__(
         self,
@@ -83,16 +83,19 @@ class StopSequence:
         *,
         torque_resolution_nm: float = 0.0,
         torque_offset_nm: float = 0.0,
+        watched: bool = True,
     ) -> None:
         assumptions = assumptions or ControlAssumptions()
         self._bench = bench
         self._limits = limits
         self._at_rest_rad_s = max(3.0 * speed_resolution_rad_s, AT_REST_SHARE * limits.speed_max_rad_s)
+        self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * bench.period_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
         # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
         ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
         self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
+        self._watched = watched
         self._string = None
         if limits.load == "string":
             self._string = LetGoLimits(
@@ -234,7 +237,7 @@ class StopSequence:
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
                 quiet_since_s = None
-            elif quiet_since_s is None or unheard_s > LONGEST_GAP_S:
+            elif quiet_since_s is None or unheard_s > self._longest_gap_s:
                 quiet_since_s = sample.time_s
             elif sample.time_s - quiet_since_s >= self._settle_s and (sample.standstill or sample.state in _NO_TORQUE):
                 return sample.time_s
@@ -265,7 +268,7 @@ class StopSequence:
                 continue
             # Looks are further apart than cycles are; a longer gap shows nothing.
             apart_s = sample.time_s - heard_s if self._looks.standing else 0.0
-            quiet_s += max(self._bench.period_s, min(LONGEST_GAP_S, apart_s))
+            quiet_s += max(self._bench.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
                 quiet_s = 0.0
@@ -312,7 +315,6 @@ class StopSequence:
         self._held.append(sample.torque_nm)
         return sample
 
-
     # -- looks beside the cycle --------------------------------------------------------------------------------
 
     def _look(self) -> Sample | None:
@@ -347,8 +349,8 @@ class StopSequence:
         return self._looks.only
 
     def _gets_slower(self, sample: Sample) -> bool:
-        """A shaft that looks alone show, and that goes on turning, is left to the drive's own watchdog."""
-        if not self._looks.standing or self._slowing.see(sample.time_s, sample.speed_rad_s):
+        """A shaft that looks alone show, and that goes on turning, is left to the drive's own watchdog, if armed."""
+        if not (self._watched and self._looks.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
             return True
         self._trouble.append(
             f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s without feedback of the cycle: the drive is"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
+from drivers.no_watchdog import FLAG
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 
 _LETS_GO = ("coast", "none")
@@ -29,6 +30,12 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
             "a drill string hangs on the shaft, and nothing says how fast its trapped torque is let go",
             where="torque_ramp_nm_s",
             next_step="Give torque_ramp_nm_s in rig.yaml, such as 50",
+        )
+    if not preflight.watched:
+        raise PreflightRefused(
+            f"a drill string hangs on the shaft, and no watchdog is armed in the drive: {FLAG} is not for strings",
+            where="load in rig.yaml",
+            next_step="Only the drive's own stop is left for a wound-up string when the host fails: arm its watchdog",
         )
     if preflight.safe_action in _LETS_GO:
         raise PreflightRefused(

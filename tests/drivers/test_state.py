@@ -58,14 +58,14 @@ def test_what_callers_see(state, seen):
 # 6040h by state and wish, as the manual of any CiA 402 drive has them.
 WORDS = {
     #                          off   enabled  quick stop
-    State.NOT_READY:             (0x00, 0x00, 0x00),
-    State.SWITCH_ON_DISABLED:    (0x00, 0x06, 0x00),
-    State.READY_TO_SWITCH_ON:    (0x00, 0x07, 0x00),
-    State.SWITCHED_ON:           (0x00, 0x0F, 0x00),
+    State.NOT_READY:             (0x00, 0x00, 0x02),
+    State.SWITCH_ON_DISABLED:    (0x00, 0x06, 0x02),
+    State.READY_TO_SWITCH_ON:    (0x00, 0x07, 0x02),
+    State.SWITCHED_ON:           (0x00, 0x0F, 0x02),
     State.OPERATION_ENABLED:     (0x07, 0x0F, 0x02),
     State.QUICK_STOP_ACTIVE:     (0x00, 0x02, 0x02),
-    State.FAULT_REACTION_ACTIVE: (0x00, 0x00, 0x00),
-    State.FAULT:                 (0x00, 0x00, 0x00),
+    State.FAULT_REACTION_ACTIVE: (0x00, 0x00, 0x02),
+    State.FAULT:                 (0x00, 0x00, 0x02),
 }
 
 

@@ -12,6 +12,7 @@ SCRIPTED, ADAPTER, HOST, PROCESS, MODBUS = (
     f"{HERE}test_rows_process.py::", f"{HERE}test_modbus_rows.py::",
 )
 GUARD = f"{HERE}test_guard_rows.py::"
+NO_WATCHDOG = f"{HERE}test_rows_no_watchdog.py::"
 
 
 @dataclass(frozen=True)
@@ -154,6 +155,15 @@ ROWS = {
     49: Row("aborted protocol", "resumed at a stage boundary only, after a new preflight", "-",
             (f"{HOST}test_row_49_an_aborted_run_begins_anew",
              "tests/protocol/test_no_resume.py::test_after_an_abort_in_any_stage_a_run_begins_anew")),
-    50: _scripted("watchdog not armed, or cannot be", "R", "4",
-                  "tests/drivers/test_preflight.py::test_a_watchdog_that_cannot_be_armed"),
+    50: _scripted("watchdog not armed, or cannot be", "R, unless the operator accepts it by name",
+                  "4; accepted: as any run, but 8 where the line is lost in motion",
+                  f"{HERE}test_modbus_scripted.py::test_row", f"{NO_WATCHDOG}test_no_other_switch_takes_it",
+                  f"{NO_WATCHDOG}test_taken_by_name_the_host_still_stops_the_shaft",
+                  f"{NO_WATCHDOG}test_taken_by_name_and_the_line_is_gone",
+                  f"{NO_WATCHDOG}test_set_otherwise_is_refused_by_name_too", f"{NO_WATCHDOG}test_never_with_a_string",
+                  f"{NO_WATCHDOG}test_the_result_says_so_live_and_replayed",
+                  "tests/drivers/test_preflight.py::test_a_watchdog_that_cannot_be_armed",
+                  "tests/drivers/test_no_watchdog.py::test_a_consumer_heartbeat_that_cannot_be_armed",
+                  "tests/drivers/test_no_watchdog.py::test_node_guarding_that_does_not_work",
+                  "tests/drivers/test_no_watchdog.py::test_a_time_out_that_cannot_be_set"),
 }

@@ -49,6 +49,7 @@ CASES = (
     Case(26, "second-master" + IN_MOTION, 5, ("second master", "Take it off"), confirmed=False),
     Case(26, "duplicate-node", 4, ("node 1", "answered twice", "node-ID of its own"), "refused"),
     Case(26, "duplicate-node" + IN_MOTION, 6, ("boot-up",)),
+    Case(26, "replayed-feedback" + IN_MOTION, 5, ("TPDO1", "somebody else")),
     Case(29, "wrong-identity", 4, ("1018h", "--profile"), "refused", more=("--profile", "maxon/epos4")),
     Case(30, "fault-at-start", 4, ("6041h", "3210h", "--reset-fault"), "refused"),
     Case(31, "stuck-state@setup", 6, ("within 3 s of enabling", "statusword", "enable input"), "refused"),

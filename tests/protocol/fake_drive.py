@@ -246,8 +246,10 @@ class World:
         self.guard = Guard(limits, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION)
         self.bench = Bench(self.drive, self.guard, self.log, self.stop_request, watch or self.display.cycle)
 
-    def stop_sequence(self) -> StopSequence:
-        return StopSequence(self.bench, self.limits, SPEED_RESOLUTION, self.drive.quick_stop_in_torque_mode)
+    def stop_sequence(self, **options) -> StopSequence:
+        return StopSequence(
+            self.bench, self.limits, SPEED_RESOLUTION, self.drive.quick_stop_in_torque_mode, **options
+        )
 
     def turn(self, speed: float = 5.0, mode: Mode = Mode.SPEED) -> None:
         """Enabled and turning."""

@@ -48,6 +48,17 @@ def test_a_setpoint_outside_the_limits_is_rejected(speed, torque, what):
             guard().check_command(Command(mode, speed, torque))
 
 
+@given(torque=st.floats(-400.0, 400.0), mode=st.sampled_from(Mode))
+def test_a_braking_torque_that_may_not_be_is_held_back_in_torque_mode(torque, mode):
+    watch = guard()
+    watch.no_braking, watch.to_brake = "none has been tried", "Try one"
+    if mode is Mode.TORQUE and torque < 0.0:
+        with pytest.raises(LimitHit, match="held back: none has been tried"):
+            watch.check_command(Command(mode, 1.0, torque))
+    else:
+        watch.check_command(Command(mode, 1.0, torque))
+
+
 def test_backwards_setpoints_need_allow_reverse():
     guard(REVERSIBLE).check_command(Command(Mode.SPEED, -10.0, 0.0))
     with pytest.raises(CommandRejected, match="outside -10 to 10"):

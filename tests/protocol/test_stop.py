@@ -8,6 +8,7 @@ from drivers.errors import CommunicationLost, StopNotConfirmed
 from tdhil.errors import ExitCode, exit_code
 from tdhil.protocol.settings import ControlAssumptions
 from tdhil.protocol.stop import (
+    LONGEST_GAP_CYCLES,
     LONGEST_GAP_S,
     MOST_INTERRUPTIONS,
     REST_AFTER_S,
@@ -156,6 +157,15 @@ def test_a_longer_gap_in_the_feedback_begins_the_wait_anew(world, missing_s, ane
     assert report.confirmed
     begins_s = (150 + missing) * PERIOD_S if anew else 5.0 / 2.0
     assert report.at_rest_s - start_s == pytest.approx(begins_s + 3.0 * LAG_S, abs=0.15)
+
+
+@pytest.mark.parametrize(("missing", "confirmed"), [(LONGEST_GAP_CYCLES - 1, True), (LONGEST_GAP_CYCLES, False)])
+def test_on_a_slow_line_the_gap_is_counted_in_cycles(world, missing, confirmed):
+    """At 10 Hz, again and again: some frames are lost for each that comes."""
+    here = world(FakeDrive(period_s=0.1))
+    here.turn(1.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % (missing + 1) == 0)
+    assert here.stop_sequence().run().confirmed is confirmed
 
 
 def test_a_drive_that_never_confirms_that_it_is_disabled(world):

@@ -100,6 +100,23 @@ def test_a_shaft_that_looks_show_turning_is_left_to_the_watchdog_soon(world):
     assert here.bench.now_s - begun_s <= AFTER_S + SLOWING_S + 3.0 * EVERY_S
 
 
+def test_without_a_watchdog_that_would_act_the_host_goes_on_asking(world):
+    """The drive takes the quick stop only after a while; nobody else would stop the shaft."""
+
+    class Late(LookedAt):
+        def look(self):
+            self.brakes = self.looks > 20
+            return super().look()
+
+    here = world(Late(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "missing"
+    report = here.stop_sequence(watched=False).run()
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+
+
 def test_one_that_coasts_to_rest_is_waited_for(world):
     here = world(LookedAt(brakes=False))
     here.turn(5.0)

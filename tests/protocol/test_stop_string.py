@@ -340,6 +340,8 @@ def preflight_of(**change):
         (replace(STRING, torque_ramp_nm_s=0.0), ExcitationRequest(), {}, "how fast"),
         (STRING, ExcitationRequest(), {"safe_action": "coast"}, "watchdog reaction is 'coast'"),
         (STRING, ExcitationRequest(), {"safe_action": "none"}, "watchdog reaction"),
+        (STRING, ExcitationRequest(), {"safe_action": "none", "watchdog_s": 0.0}, "no watchdog is armed"),
+        (replace(STRING, accept_no_watchdog=True), ExcitationRequest(), {"watchdog_s": 0.0}, "--accept-no-watchdog"),
         (STRING, ExcitationRequest(), {"checks": (replace(OPTION, found="2"),)}, "lets go of it"),
         (STRING, ExcitationRequest(), {"checks": (replace(OPTION, found="4"),)}, "lets go of it"),
     ],

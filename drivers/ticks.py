@@ -1,5 +1,7 @@
 """The beat of the cycle: when each one begins, which began late, and whether this loop itself stood still."""
 
+from collections.abc import Callable
+
 from drivers.clock import Clock
 from drivers.errors import CommunicationLost
 
@@ -15,13 +17,16 @@ class Ticks:
         self._next_s = self._ended_s + period_s
         self.overruns = 0
 
-    def wait(self) -> None:
-        """Until the next tick. Raises CommunicationLost if the loop comes back far too late, once for each time.
+    def wait(self, until: Callable[[float], None] | None = None) -> None:
+        """Until the next tick; ``until`` waits for a control time, s, in its own way.
 
-        A tick that was overslept is not caught up with: the line would carry two cycles in a row without a pause.
+        Raises CommunicationLost if the loop comes back far too late, once for each time.
+
+        A tick that was overslept is not caught up with: the line would carry two cycles in a row without a pause, and
+        what a SYNC measures would be one instant twice.
         """
         clock, due_s = self._clock, self._next_s
-        clock.wait_until(due_s)
+        (until or clock.wait_until)(due_s)
         now_s = clock.now_s()
         if now_s - due_s > 0.5 * self._period_s:
             self.overruns += 1
@@ -40,3 +45,7 @@ class Ticks:
     def done(self) -> None:
         """The talk of one cycle on the line is over."""
         self._ended_s = self._clock.now_s()
+
+    def put_off(self) -> None:
+        """Time was well spent on something else: the next tick is due now at the earliest, nothing was overslept."""
+        self._next_s = max(self._next_s, self._clock.now_s())

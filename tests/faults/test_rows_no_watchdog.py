@@ -1,0 +1,104 @@
+"""Row 50: a watchdog that is not armed in the drive is refused, and taken by name; both halves, on both buses.
+
+By name: the run is as safe as ever in all that the host can do, and nobody is told that the drive would do the rest.
+"""
+
+import pytest
+from path_runs import tdhil
+
+from tdhil.record.reader import read_run
+
+NOT_ARMED = ("--fault", "watchdog-not-armed")
+BY_NAME = "--accept-no-watchdog"
+BUSES = ("canopen", "modbus")
+WATCHED = {"canopen": "1016h:1", "modbus": "time_out"}
+RIG = """
+load: string
+make_up_torque_nm: 29000
+torque_ramp_nm_s: 400
+limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
+         watchdog_s: 0.5, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
+"""
+
+
+@pytest.fixture(params=BUSES)
+def bus(request):
+    return request.param
+
+
+@pytest.fixture
+def unarmed(rehearse, bus):
+    return lambda *arguments: rehearse("--drive", bus, *NOT_ARMED, *arguments)
+
+
+def assert_accepted(run):
+    """In the log: the row of the preflight table, an event, and the configuration that the result is made from."""
+    log = read_run(run.log)
+    told = {kind: [event.text for event in log.events if event.kind == kind] for kind in ("preflight", "watchdog")}
+    assert [text for text in told["preflight"] if text.startswith("no watchdog: ") and BY_NAME in text]
+    assert not [text for text in told["preflight"] if "(refused)" in text]
+    assert ["will not stop by itself" in text for text in told["watchdog"]] == [True]
+    assert log.configuration["watchdog"] == {"armed": False, "accepted_by": BY_NAME}
+    assert "will not stop by itself" in " ".join(run.done.err.split())
+
+
+def test_no_other_switch_takes_it(unarmed, bus, seen):
+    run = unarmed("--yes", "--accept-unverified", "likely", "--accept-unverified", "watchdog")
+    run.assert_ended(4, BY_NAME if bus == "canopen" else "register 40")
+    run.assert_nothing_moved()
+    assert BY_NAME in run.message
+    log = run.assert_log_whole()
+    if bus == "modbus":                # the other is told by the scripted row
+        seen(50, f"the same on Modbus: {run.message}", None, log, run.done.code)
+
+
+def test_taken_by_name_the_host_still_stops_the_shaft(unarmed, bus, seen):
+    cause, code = ("emcy@speed+15s", 6) if bus == "canopen" else ("torque-scale@speed+15s=5", 7)
+    run = unarmed(BY_NAME, "--fault", cause)
+    run.assert_ended(code)
+    assert_accepted(run)
+    standstill_s = run.assert_stopped(run.shaft.events("fault: ")[-1], 0.6)
+    run.shaft.assert_enabled(True)
+    assert "the shaft is at rest" in run.done.document["stop"]
+    seen(50, f"{bus}, {BY_NAME}: taken, and said; `{cause}` then: {run.message}", standstill_s,
+         run.assert_log_whole(), run.done.code)
+
+
+def test_taken_by_name_and_the_line_is_gone(unarmed, bus, seen):
+    """What was accepted: nothing stops the shaft. Then the message must not say so, and the hard-wired stop is left."""
+    cause = "bus-dead@speed+15s" if bus == "canopen" else "no-reply@speed+15s"
+    run = unarmed(BY_NAME, "--fault", cause)
+    run.assert_ended(8, "no watchdog is armed", "hard-wired emergency stop")
+    assert "watchdog stops the shaft" not in run.message
+    assert "NOT confirmed" in run.done.document["stop"]
+    assert abs(run.shaft.speed_rad_s[-1]) > 1.0, "the simulated drive was to have no watchdog"
+    detail = read_run(run.log).stages[-1].detail
+    assert "watchdog stops the shaft" not in detail
+    seen(50, f"{bus}, {BY_NAME}, `{cause}`: {run.message}", None, run.assert_log_whole(), run.done.code)
+
+
+def test_set_otherwise_is_refused_by_name_too(rehearse, bus):
+    fault = f"reads-back-otherwise={WATCHED[bus]}"
+    run = rehearse("--drive", bus, "--fault", fault, BY_NAME)
+    run.assert_ended(4, "set otherwise")
+    run.assert_nothing_moved()
+    run.assert_log_whole()
+
+
+def test_never_with_a_string(unarmed, tmp_path):
+    rig = tmp_path / "string.yaml"
+    rig.write_text(RIG)
+    run = unarmed(BY_NAME, "--rig", rig)
+    run.assert_ended(4, "drill string", "no watchdog", BY_NAME, "load in rig.yaml")
+    run.assert_nothing_moved()
+    run.assert_log_whole()
+
+
+def test_the_result_says_so_live_and_replayed(rehearse):
+    """On one bus, by the shortest way: the rest of it is the same."""
+    run = rehearse(*NOT_ARMED, BY_NAME, "--periods", 2, "--mode", "speed")
+    assert run.done.code in (0, 9), run.done.err
+    assert_accepted(run)
+    run.shaft.assert_at_rest()
+    assert [line for line in run.done.document["warnings"] if "no watchdog was armed" in line and BY_NAME in line]
+    assert tdhil("replay", "--json", run.log).document == run.done.document
