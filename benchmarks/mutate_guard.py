@@ -24,12 +24,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests" / "protocol"
-_STOP = ("test_stop.py", "test_stop_string.py")
+_STOP = ("test_stop.py", "test_stop_string.py", "test_stop_looks.py")
 SUBJECTS = {
     "guard": ("test_guard.py",),
     "stop": _STOP,
     "let_go": _STOP,
     "stop_patience": _STOP,
+    "stop_looks": ("test_stop_looks.py",),
     "string_rules": _STOP,
 }
 LONGEST_S = 90
@@ -38,7 +39,7 @@ LONGEST_S = 90
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
-    "stop.py, _decelerate: return None (last)": _FALLS_THROUGH,
+    "stop.py, _see_rest: return None (last)": _FALLS_THROUGH,
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
 

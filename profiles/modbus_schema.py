@@ -172,6 +172,11 @@ class Parameter(Entry):
     writable_in_operation: bool = Field(default=True, description="false: takes effect after a restart only")
     advice: str | None = Field(default=None, description="what to do at the drive where it reads wrong")
 
+    @property
+    def factor(self) -> str | None:
+        """The parameter that multiplies this one: not the speed that a ramp time counts from or to."""
+        return None if self.set_to in ("quick_stop_time", "ramp_up_time") else self.times
+
     @model_validator(mode="after")
     def _one_use(self) -> Self:
         findings: list[Finding] = []

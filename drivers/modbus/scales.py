@@ -24,14 +24,10 @@ class Scales:
 
 
 def per_count(parameter: Parameter, values: Mapping[str, float]) -> float | None:
-    """The parameter's unit for one count; None while the parameter that multiplies it isn't known.
-
-    With ``quick_stop_time`` and ``ramp_up_time``, ``times`` names the speed that the time counts from or to, and
-    multiplies nothing.
-    """
-    if parameter.times is None or parameter.set_to in ("quick_stop_time", "ramp_up_time"):
+    """The parameter's unit for one count; None while the parameter that multiplies it isn't known."""
+    if parameter.factor is None:
         return parameter.per_lsb
-    factor = values.get(parameter.times)
+    factor = values.get(parameter.factor)
     return None if factor is None else parameter.per_lsb * factor
 
 

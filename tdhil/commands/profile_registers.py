@@ -63,8 +63,8 @@ def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
     if modes.display is not None:
         found.append(RegisterUse("modes", "speed or torque, as shown", modes.display.register_, None, "", None, modes))
     found += [
-        RegisterUse(f"parameters.{one.name}", one.title, one.register_, one.per_lsb, unit_text(one.unit), one.times,
-                    one)
+        RegisterUse(f"parameters.{one.name}", one.title, one.register_, one.per_lsb, unit_text(one.unit),
+                    one.factor, one)
         for one in profile.parameters
         if one.register_ is not None
     ]

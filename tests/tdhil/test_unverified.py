@@ -12,6 +12,7 @@ from drivers.errors import PreflightRefused
 from profiles.entry import Confidence
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile
+from tdhil.cli import main
 from tdhil.commands.unverified import accepted_lines, check_names, doubtful, note, require_accepted
 from tdhil.errors import UsageError
 
@@ -88,3 +89,11 @@ def test_every_entry_of_every_profile_can_be_named(name: str) -> None:
     check_names(profile, [entry for entry, _ in profile.entries()])
     require_accepted(profile, {"likely", *profile.below("unverified")})
     assert bool(note(profile)) == bool(doubtful(profile))
+
+
+@pytest.mark.parametrize("short", ["--ye", "--accept-no", "--reset"])
+def test_no_beginning_of_an_option_is_taken_for_it(short: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["identify", "--simulate", short])
+    assert ended.value.code == 2
+    assert short in capsys.readouterr().err
