@@ -21,18 +21,46 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 LONG = re.compile(
-    r"test_modbus_profiles\.py::.*\[(?!generic/modbus|siemens/g120\]|schneider/atv320|siemens/s120)"
-    r"|test_modbus_wrongs\.py::.*\[(?!generic|abb/acs880-classic)"
+    r"path/test_modbus_profiles\.py::.*\[(?!generic/modbus|siemens/g120\]|schneider/atv320|siemens/s120)"
+    r"|path/test_modbus_wrongs\.py::.*\[(?!generic|abb/acs880-classic)"
     r"|test_stops\.py::test_a_signal_in_each_stage\[(SIGTERM|SIGINT twice)-(setup|torque|hold)"
+    r"|test_stops\.py::test_a_signal_in_each_stage\[(SIGTERM-acquire|SIGINT twice-speed)"
     r"|test_stops\.py::test_an_exception_in_each_stage\[(torque|hold)"
+    r"|test_kill_at_random\.py::.*\[1\]"
+    r"|test_real_peer\.py::test_a_wrong_word_moves_nothing\[MOVE it"
+    r"|test_field_rig\.py::.*(_slopes\[0\.[35]-|_inertia\[[23]\])"
     r"|test_modbus_scripted\.py::test_row\["
     r"|test_rows_scripted\.py::test_the_other_stages"
+    r"|test_default_plan\.py::.*_filters\[(two poles|matched|two long poles|torque through two poles)"
+    r"|test_hopeless\.py::test_never_a_number_without_a_warning\[((?!two_faults).*-[12]|two_faults-1.*)\]"
+    r"|test_coverage\.py::test_a_small_version.*\[12-"
 )
 """More cases of what others show already, and minutes of it: with --long."""
+
+TOGETHER = re.compile(
+    r"study/test_(field_amplitudes|field_slopes|field_loops|tables|figures)\.py"
+    r"|path/test_(report|cli_modbus|replay_csv)\.py"
+    r"|identify/test_(default_plan|record_route|hopeless|properties)\.py"
+    r"|(?P<several>identify)/test_(?:friction_curve|second_opinion)\.py"          # both look at the same runs
+)
+"""Files with an expensive fixture of their own; pytest-xdist gives each to one worker, so that it is made once."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="also the cases that are left out for their time")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def]  # where pytest-xdist is installed
+    """Not --dist loadgroup: with pytest 9, whose node-IDs pytest-xdist 3.8 can't mark, it groups nothing."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFixture(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            shared = TOGETHER.search(nodeid)
+            return nodeid if shared is None else shared["several"] or shared.group()
+
+    return ByFixture(config, log) if config.getvalue("dist") == "load" else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -87,6 +87,7 @@ class CoverageStudy:
                 of_plant = f"{group[0].plant}: {len(runs[group[0].plant])} of {settings.seeds} runs"
                 progress(0.98 * done / total, f"{of_plant}; {done} of {total} in all, about {_told(left_s)} left")
         except KeyboardInterrupt:
+            done = sum(map(len, runs.values()))     # it may have come between the two
             if done == 0:
                 raise
             interrupted = True

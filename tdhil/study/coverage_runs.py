@@ -6,22 +6,17 @@ of processes nor on how runs are grouped.
 
 from __future__ import annotations
 
-import signal
 import zlib
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
-from multiprocessing.synchronize import Event
 
 from tdhil.identify.identify import identify
 from tdhil.identify.options import Options
 from tdhil.study.coverage_plants import CoveragePlant
 from tdhil.study.coverage_simulator import simulate
+from tdhil.study.workers import results
 
 GROUP = 20     # runs simulated together: some 200 MB
-
-_interrupted: Event | None = None      # in a worker: set when the whole benchmark was
 
 
 @dataclass(frozen=True)
@@ -69,8 +64,6 @@ def run_task(task: Task) -> tuple[Run, ...]:
     options = Options(confidence=task.confidence)
     found = []
     for number, recording in zip(numbers, recordings, strict=True):
-        if _interrupted is not None and _interrupted.is_set():
-            break
         said = identify(recording, options)
         seconds = float(recording.time_s[-1] - recording.time_s[0])
         run = Run(task.plant.name, number, seconds, said.verdict.value, said.reason)
@@ -86,25 +79,7 @@ def _head(run: Run) -> tuple[str, int, float, str, str]:
 
 
 def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[Run, ...]]:
-    """Groups as they are done, in no particular order."""
+    """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
     if processes <= 1:
-        yield from map(run_task, wanted)
-        return
-    interrupted = get_context("spawn").Event()
-    with ProcessPoolExecutor(processes, get_context("spawn"), _as_worker, (interrupted,)) as pool:
-        waiting = [pool.submit(run_task, task) for task in wanted]
-        try:
-            for done in as_completed(waiting):
-                yield done.result()
-        except BaseException:
-            # The groups under way end with the run they are at; a worker killed in the middle may leave the pool stuck.
-            interrupted.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _as_worker(interrupted: Event) -> None:
-    """A terminal sends Ctrl-C to the children too, which would each say so with a traceback."""
-    global _interrupted  # noqa: PLW0603
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _interrupted = interrupted
+        return map(run_task, wanted)
+    return results(run_task, wanted, processes)

@@ -17,6 +17,10 @@ from path_runs import Shaft, process, tdhil, wait_for
 from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
+PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
+    "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
+    " watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+)
 NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
 
 
@@ -91,7 +95,8 @@ def test_the_list_names_those_of_both_buses():
 
 def test_a_connection_that_is_reset_in_motion(tmp_path):
     """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
-    trace = tmp_path / "shaft.csv"
+    trace, rig = tmp_path / "shaft.csv", tmp_path / "rig.yaml"
+    rig.write_text(PATIENT)
     with contextlib.ExitStack() as stack:
         drive = stack.enter_context(process(
             sys.executable, "-m", "sim_bus", "modbus", "--tcp", "127.0.0.1:0", "--trace", trace,
@@ -100,7 +105,8 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
         (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
         host = stack.enter_context(process(
             sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 20, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path,
+            "--rate", 10, "--rig", rig, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, cwd=tmp_path,
         ))
         out, err = host.communicate(timeout=60.0)
 

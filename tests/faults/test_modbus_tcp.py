@@ -92,7 +92,7 @@ class Bench:
         (self.folder / "rig.yaml").write_text(RIG)
         self.host = self.stack.enter_context(process(
             sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 20, "--rig", self.folder / "rig.yaml", "--log", self.log,
+            "--rate", 10, "--rig", self.folder / "rig.yaml", "--log", self.log,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
         ))
 

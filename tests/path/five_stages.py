@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from path_runs import HANGS_S, INERTIA, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
+from path_runs import HANGS_S, INERTIA, QUICK, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
 
 from tdhil.record.reader import read_frames, read_run, read_samples
 
@@ -20,7 +20,7 @@ class FiveStages:
     """Short excitation: what is tested is the path, not the last digit."""
 
     def test_the_five_stages_identify_the_inertia(self, bus, tmp_path):
-        done, shaft = bus(tmp_path, "--periods", PERIODS)
+        done, shaft = bus(tmp_path, *QUICK, "--periods", PERIODS)
         assert done.code == 0, done.err
         document = done.document
         assert document["verdict"] in ("valid", "valid_wide")
@@ -87,7 +87,7 @@ def interrupted(folder, *, on=()) -> AbstractContextManager[tuple[Peer, Host]]:
     @contextmanager
     def both():
         with peer(folder, *on, "--seed", SEED, "--stepped") as drive, host(
-            folder, *drive.options, "--stepped", "--periods", 20
+            folder, *drive.options, "--stepped", *QUICK, "--periods", 20
         ) as running:
             yield drive, running
 

@@ -26,6 +26,7 @@ import numpy as np
 from tdhil.cli import main
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
+QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles to compute
 HANGS_S = 120.0           # wall time after which something is taken to hang
 HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
 

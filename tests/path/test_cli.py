@@ -6,13 +6,13 @@ import sys
 
 import can
 import pytest
-from path_runs import Shaft, Terminal, clean_environment, identify, tdhil
+from path_runs import QUICK, Shaft, Terminal, clean_environment, identify, tdhil
 
 from sim_bus.params import RigParams
 from sim_bus.simulator import EmbeddedSimulator
 from tdhil.record.reader import read_run, read_samples
 
-SHORT = ("--simulate", "--seed", 1, "--periods", 3)
+SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 KEYS = {
     "verdict", "model", "inertia_kg_m2", "inertia_main_shaft_kg_m2", "reference_inertia_kg_m2", "viscous_nm_s_rad",
     "coulomb_nm", "speed_lag_s", "torque_lag_s", "skew_s", "paper", "simulated", "log", "stages",
@@ -22,7 +22,8 @@ ESTIMATE = {"value", "low", "high"}
 
 def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     rig = tmp_path / "rig.yaml"
-    rig.write_text("gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrun: {json: true, seed: 1, periods: 3}\n")
+    rig.write_text("gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrate_hz: 50\n"
+                   "run: {json: true, seed: 1, periods: 3}\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         done = tdhil("identify", "--simulate", "--rig", rig)      # json, seed and periods: rig.yaml's word
@@ -43,7 +44,7 @@ def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     assert all(stage.keys() >= {"name", "outcome", "duration_s"} for stage in document["stages"])
     assert document["log"] == "run.mcap"
     assert (tmp_path / "run.mcap").exists()
-    assert "rig.yaml:3" in done.err                               # which value came from where
+    assert "rig.yaml:4" in done.err                               # which value came from where
 
 
 def test_a_seed_repeats_result_and_samples(tmp_path):
@@ -54,19 +55,19 @@ def test_a_seed_repeats_result_and_samples(tmp_path):
 
 
 def test_without_a_seed_one_is_drawn_and_named(tmp_path):
-    runs = [identify(tmp_path, "--amplitude", 9, log=name) for name in ("a.mcap", "b.mcap")]
+    runs = [identify(tmp_path, *QUICK, "--amplitude", 9, log=name) for name in ("a.mcap", "b.mcap")]
     seeds = [read_run(done.log).configuration["seed"] for done in runs]
     assert seeds[0] != seeds[1]
     for done, seed in zip(runs, seeds, strict=True):
         assert f"seed {seed}" in done.err.replace("\n", " ")
         assert "no CAN bus is configured" in done.err.replace("\n", " ")
-    again = identify(tmp_path, "--amplitude", 9, "--seed", seeds[0], log="c.mcap")
+    again = identify(tmp_path, *QUICK, "--amplitude", 9, "--seed", seeds[0], log="c.mcap")
     assert list(read_samples(again.log)) == list(read_samples(runs[0].log))
 
 
 def test_an_older_log_is_kept(tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"an older run")
-    done = identify(tmp_path, "--simulate", "--amplitude", 9)
+    done = identify(tmp_path, "--simulate", *QUICK, "--amplitude", 9)
     (kept,) = [path for path in tmp_path.glob("run-*.mcap") if path.read_bytes() == b"an older run"]
     assert kept.name in done.err.replace("\n", "")
     assert read_run(done.log).complete
@@ -170,7 +171,7 @@ def test_the_environment_names_the_bus(tmp_path, monkeypatch):
     with EmbeddedSimulator(RigParams(), seed=1, stepped=True) as simulated:
         monkeypatch.setenv("CAN_INTERFACE", "virtual")
         monkeypatch.setenv("CAN_CHANNEL", simulated.channel)
-        done = identify(tmp_path, "--stepped", "--amplitude", 9)
+        done = identify(tmp_path, "--stepped", *QUICK, "--amplitude", 9)
     assert done.code == 4, done.err                                # it got as far as the plan
     assert done.outcomes[1] == ("speed", "ok")
     lines = [" ".join(line.split()) for line in done.err.splitlines()]
@@ -191,7 +192,7 @@ def test_a_bus_without_a_drive_is_refused_with_the_likely_causes(tmp_path, monke
 
 def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
-    done = identify(tmp_path, "--simulate", "--amplitude", 9)
+    done = identify(tmp_path, "--simulate", *QUICK, "--amplitude", 9)
     assert done.code == 4
     assert "SIMULATED" in done.err
 
@@ -200,7 +201,7 @@ def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
 def test_the_node_is_the_one_asked_for(tmp_path, node, said):
     with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
         done = identify(tmp_path, "-i", "virtual", "-c", simulated.channel, "--stepped", "--node", node,
-                        "--amplitude", 9)
+                        *QUICK, "--amplitude", 9)
     assert done.code == 4, done.err
     assert said in done.err
 
@@ -210,7 +211,7 @@ def test_the_node_is_the_one_asked_for(tmp_path, node, said):
 
 def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
     trace = tmp_path / "shaft.csv"
-    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, "--amplitude", 9)
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, *QUICK, "--amplitude", 9)
     assert done.code == 4
     assert "amplitude of 9 rad/s" in done.err
     assert "the shaft is at rest" in done.document["stop"]
@@ -229,7 +230,7 @@ def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
         assert "--reset-fault" in done.err
         assert "nothing has moved" in done.err
         bus = can.Bus(interface="virtual", channel=simulated.channel)      # keeps the channel for the second run
-        again = identify(tmp_path, *options, "--reset-fault", "--amplitude", 9, log="b.mcap")
+        again = identify(tmp_path, *options, "--reset-fault", *QUICK, "--amplitude", 9, log="b.mcap")
         bus.shutdown()
     assert again.outcomes[:2] == [("setup", "ok"), ("speed", "ok")]
     assert any(event.kind == "reset" for event in read_run(again.log).events)
@@ -240,7 +241,8 @@ def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
 
 
 def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path):
-    done = identify(tmp_path, "--simulate", "--seed", 1, "--excitation", "sine", "--frequency", 0.5, "--periods", 20)
+    done = identify(tmp_path, "--simulate", "--seed", 1, *QUICK, "--excitation", "sine", "--frequency", 0.5,
+                    "--periods", 20)
     assert done.code == 9
     document = done.document
     assert document["verdict"] == "not_identifiable"

@@ -8,7 +8,7 @@ import termios
 from types import SimpleNamespace
 
 import pytest
-from path_runs import identify, process, tdhil
+from path_runs import QUICK, identify, process, tdhil
 
 from profiles.library import load_modbus_profile, load_profile, profile_path
 from tdhil.record.reader import read_frames, read_run
@@ -31,7 +31,7 @@ limits:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return identify(tmp_path_factory.mktemp("modbus"), "--drive", "modbus", "--simulate", "--seed", 1)
+    return identify(tmp_path_factory.mktemp("modbus"), "--drive", "modbus", "--simulate", *QUICK, "--seed", 1)
 
 
 def test_the_inertia_of_the_simulated_rig(run):
@@ -65,7 +65,7 @@ def test_the_log_says_how_the_drive_was_spoken_to(run):
 
 
 def test_a_seed_repeats_it(tmp_path):
-    runs = [identify(tmp_path, "--profile", "generic/modbus", "--amplitude", 9, "--seed", 3, log=name)
+    runs = [identify(tmp_path, "--profile", "generic/modbus", *QUICK, "--amplitude", 9, "--seed", 3, log=name)
             for name in ("a.mcap", "b.mcap")]
     for done in runs:
         assert done.code == 4                                  # it got as far as the plan, which does not fit
@@ -75,7 +75,7 @@ def test_a_seed_repeats_it(tmp_path):
 
 
 def test_the_unit_is_the_one_asked_for(tmp_path):
-    done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, "--amplitude", 9)
+    done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, *QUICK, "--amplitude", 9)
     assert done.code == 4
     assert {frame.identifier for frame in read_frames(done.log)} == {17}
 
@@ -94,7 +94,7 @@ def test_a_dry_run_knows_the_drive(tmp_path):
 @pytest.mark.parametrize(("name", "bus"), [("maxon/epos4", "canopen"), ("siemens/g130-s120", "modbus")])
 def test_the_simulator_wears_the_profile(tmp_path, name, bus):
     profile = load_profile(name)
-    done = identify(tmp_path, "--profile", name, "--simulate", "--amplitude", 9)
+    done = identify(tmp_path, "--profile", name, "--simulate", *QUICK, "--amplitude", 9)
     assert "SIMULATED" in done.err
     assert f"drive          {bus}  (profile {name})" in done.err
     configuration = read_run(done.log).configuration

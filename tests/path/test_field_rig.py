@@ -8,6 +8,7 @@ import pytest
 from path_runs import identify
 
 INERTIA = 104.0
+RATE_HZ = 100
 
 # Speed mode is the paper's. At 1 Hz the simulated drive's speed loop (K_p/J = 2.9 rad/s) leaves less than half of the
 # amplitude that the torque limit allows, and the noise of the reported speed (6 % of the variance of α) then takes as
@@ -18,7 +19,8 @@ TONES = [(0.1, "speed", 107.0), (0.3, "speed", 118.0), (0.5, "speed", 137.0), (1
 @pytest.mark.parametrize(("frequency_hz", "mode", "slope"), TONES)
 def test_the_paper_s_method_gives_the_paper_s_slopes(tmp_path, frequency_hz, mode, slope):
     done = identify(
-        tmp_path, "--simulate", "--seed", 3, "--excitation", "sine", "--mode", mode, "--frequency", frequency_hz
+        tmp_path, "--simulate", "--rate", RATE_HZ, "--seed", 3, "--excitation", "sine", "--mode", mode,
+        "--frequency", frequency_hz
     )
     assert done.code == 9, done.err
     document = done.document
@@ -26,7 +28,7 @@ def test_the_paper_s_method_gives_the_paper_s_slopes(tmp_path, frequency_hz, mod
     # One tone can't be told from another inertia with other lags: no number of ours.
     assert document["verdict"] == "not_identifiable"
     assert document["inertia_kg_m2"] is None
-    assert 60.0 <= document["samples_used"] / 250.0 <= 120.0
+    assert 60.0 <= document["samples_used"] / RATE_HZ <= 120.0
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

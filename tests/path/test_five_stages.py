@@ -2,7 +2,7 @@
 
 import pytest
 from five_stages import SEED, FiveStages, interrupted, over_a_peer
-from path_runs import Shaft, identify
+from path_runs import QUICK, Shaft, identify
 
 from tdhil.record.reader import read_samples
 
@@ -29,6 +29,6 @@ def test_both_buses_give_the_same_result_and_the_same_samples(tmp_path):
     for run in (embedded, over_a_peer):
         folder = tmp_path / run.__name__
         folder.mkdir()
-        done, _ = run(folder, "--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12)
+        done, _ = run(folder, *QUICK, "--mode", "speed", "--excitation", "sine", "--frequency", 1, "--periods", 12)
         found.append((done.document | {"log": ""}, list(read_samples(done.log))))
     assert found[0] == found[1]

@@ -1,7 +1,7 @@
 """`--report`: one page, the same from a run and from its replay, and never in the way of either."""
 
 import pytest
-from path_runs import identify, tdhil
+from path_runs import QUICK, identify, tdhil
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -10,7 +10,7 @@ pytest.importorskip("jinja2")
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    done = identify(folder, "--simulate", "--seed", 4, "--periods", 4, "--report", folder / "live.html")
+    done = identify(folder, "--simulate", *QUICK, "--seed", 4, "--periods", 4, "--report", folder / "live.html")
     assert done.code == 0, done.err
     return done
 

@@ -5,7 +5,7 @@ import sys
 
 import can
 import pytest
-from path_runs import host, peer, process, tdhil, wait_for
+from path_runs import QUICK, host, peer, process, tdhil, wait_for
 
 NODE = 1
 REAL_TIME = ("--seed", 1)
@@ -93,7 +93,7 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
     """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
     rig = tmp_path / "rig.yaml"        # a slow cycle and a long watchdog bear a loaded machine
     rig.write_text(
-        "rate_hz: 20\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
+        "rate_hz: 10\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
         " quick_stop_rad_s2: 2.0, watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
     )
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
@@ -170,7 +170,7 @@ def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
 
 def test_a_stepped_drive_whose_host_has_died_is_stopped_too(tmp_path):
     with peer(tmp_path, *REAL_TIME, "--stepped") as drive, host(
-        tmp_path, *drive.options, "--stepped", "--periods", 40
+        tmp_path, *drive.options, "--stepped", *QUICK, "--periods", 40
     ) as running:
         assert running.wait_for_line("stage torque …"), running.err
         running.signal(signal.SIGKILL)
@@ -189,7 +189,7 @@ def test_without_a_bus_it_says_what_to_name():
 def test_ctrl_c_ends_the_watching_only(turning, number):
     drive, master = turning
     master.turn()
-    master.objects.write(0x6085, 0, 60, 32)           # slowly, so that there is something left to watch
+    master.objects.write(0x6085, 0, 120, 32)           # slowly, so that there is something left to watch
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         child.send_signal(number)

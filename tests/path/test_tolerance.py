@@ -1,7 +1,7 @@
 """`--tolerance`, `--max-time` and `--dry-run` as their users meet them."""
 
 import pytest
-from path_runs import Shaft, identify, tdhil
+from path_runs import QUICK, Shaft, identify, tdhil
 
 from tdhil.commands.quantities import seconds, share
 from tdhil.record.reader import read_run
@@ -14,7 +14,7 @@ def half_width(document):
 
 def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
     trace = tmp_path / "shaft.csv"
-    done = identify(tmp_path, "--simulate", "--seed", 2, "--tolerance", "1%", "--trace", trace)
+    done = identify(tmp_path, "--simulate", *QUICK, "--seed", 2, "--tolerance", "1%", "--trace", trace)
     assert done.code == 0, done.err
     document = done.document
     assert document["verdict"] == "valid"
@@ -35,7 +35,7 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
 
 
 def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
-    done = identify(tmp_path, "--simulate", "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
+    done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
     assert done.code == 0, done.err
     assert done.document["verdict"] == "valid_wide"
     said = done.err.replace("\n", " ")
@@ -46,7 +46,7 @@ def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
 
 
 def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
-    done = identify(tmp_path, "--simulate", "--seed", 1, "--tolerance", "0.1%", "--periods", 4)
+    done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.1%", "--periods", 4)
     assert done.code == 0, done.err
     assert done.document["verdict"] == "valid_wide"
     assert done.document["periods_used"] == 6

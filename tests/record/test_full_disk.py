@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tdhil.record.reader import read_run
 
+QUICK = ("--rate", "50", "--seed", "1", "--periods", "4")
 ROOT = Path(__file__).parents[2]
 
 
@@ -16,12 +17,12 @@ def identify(log, room):
     def cap():
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
-    command = [sys.executable, "-m", "tdhil", "identify", "--simulate", "--seed", "1", "--json", "--log", str(log)]
+    command = [sys.executable, "-m", "tdhil", "identify", "--simulate", *QUICK, "--json", "--log", str(log)]
     return subprocess.run(command, cwd=ROOT, preexec_fn=cap, capture_output=True, text=True, timeout=120)
 
 
 def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
-    done = identify(tmp_path / "run.mcap", 400_000)
+    done = identify(tmp_path / "run.mcap", 100_000)
     said = json.loads(done.stdout)
     assert (done.returncode, said["exit_code"]) == (3, 3), done.stderr
     assert said["error"]["kind"] == "LogBroken"
@@ -31,7 +32,7 @@ def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):
     run = read_run(tmp_path / "run.mcap")
     assert not run.complete
     assert run.recording.time_s[-1] > 5.0
-    assert (tmp_path / "run.mcap").stat().st_size <= 400_000
+    assert (tmp_path / "run.mcap").stat().st_size <= 100_000
 
 
 def test_a_disk_without_room_refuses_the_run(tmp_path):
@@ -55,7 +56,7 @@ def test_a_disk_that_fails_at_the_very_end_does_not_take_the_result_with_it(tmp_
     monkeypatch.setattr(Container, "finish", full)
     monkeypatch.setattr(RunWriter, "result", broken)
     log = tmp_path / "run.mcap"
-    code = main(["identify", "--simulate", "--seed", "1", "--json", "--log", str(log)])
+    code = main(["identify", "--simulate", *QUICK, "--json", "--log", str(log)])
     said = capsys.readouterr()
     assert json.loads(said.out)["verdict"] == "valid"
     assert code == 3

@@ -100,13 +100,16 @@ def test_ctrl_c_on_a_terminal(tmp_path):
     os.close(follower)
     os.set_blocking(leader, False)
     shown, end_s = b"", time.monotonic() + 120
-    while time.monotonic() < end_s and child.poll() is None and b"of 2000 in" not in shown:
-        shown += read_some(leader)
-    assert b"of 2000 in" in shown
-    os.killpg(child.pid, signal.SIGINT)
-    while child.poll() is None and time.monotonic() < end_s:
-        shown += read_some(leader)
-    assert child.wait(60) == 130
+    try:
+        while time.monotonic() < end_s and child.poll() is None and b"of 2000 in" not in shown:
+            shown += read_some(leader)
+        assert b"of 2000 in" in shown
+        os.killpg(child.pid, signal.SIGINT)
+        while child.poll() is None and time.monotonic() < end_s:
+            shown += read_some(leader)
+        assert child.wait(60) == 130
+    finally:
+        child.kill()
     shown += read_some(leader)
     os.close(leader)
     said = json.loads((tmp_path / "stdout").read_text())
