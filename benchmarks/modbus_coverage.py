@@ -29,8 +29,9 @@ from sim_bus.modbus.timing import LineTiming
 from sim_bus.params import RigParams
 from tdhil.identify import identify
 from tdhil.identify.options import Options
-from tdhil.protocol.runner import Runner, Task
+from tdhil.protocol.runner import Runner
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.protocol.task import Task
 from tdhil.record.recording import Recording, Stage
 from tdhil.record.run_log import RunLog
 from tdhil.record.writer import RunWriter

@@ -18,50 +18,25 @@ from typing import TYPE_CHECKING
 from drivers.cia402 import arming
 from drivers.cia402 import preflight as checks
 from drivers.cia402.feedback import Feedback
-from drivers.cia402.guarding import Guarding
+from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_doubt
 from drivers.cia402.limits import set_limits
 from drivers.cia402.link import CanLink
 from drivers.cia402.look import keep_stepping, look, push
 from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
 from drivers.cia402.parameters import check_parameters
-from drivers.cia402.sdo import Objects, name
+from drivers.cia402.reported import Reported
+from drivers.cia402.sdo import Objects
 from drivers.cia402.shape import RPDO1, RPDO1_SPEED, shape_of
-from drivers.cia402.state import (
-    DISABLE_VOLTAGE,
-    FAULT_RESET,
-    INTERNAL_LIMIT,
-    SPEED_ZERO,
-    TARGET_REACHED,
-    State,
-    Wish,
-    controlword_towards,
-    decode,
-    power_state,
-)
+from drivers.cia402.sign_of_life import HEARTBEAT_S, SignOfLife
+from drivers.cia402.state import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
 from drivers.cia402.units import find_units
-from drivers.cia402.watch import OPERATIONAL, STOPPED, Watch
+from drivers.cia402.watch import STOPPED, Watch
 from drivers.clock import Clock
-from drivers.drive import (
-    Command,
-    Counters,
-    FrameTap,
-    Identity,
-    Limits,
-    Mode,
-    PowerState,
-    Preflight,
-    Sample,
-)
-from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, Preflight, Sample
+from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
 from drivers.table import Table
 from drivers.ticks import Ticks
-from profiles.marker import (
-    CYCLE_ID,
-    MARKER_INDEX,
-    MARKER_STAGE,
-    MARKER_TEXT,
-    STAGE_NUMBERS,
-)
+from profiles.marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.schema import CanopenProfile
 
 if TYPE_CHECKING:
@@ -71,18 +46,11 @@ HOST_NODE = 127
 SYNC = 0x080
 NMT = 0x000
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
-HEARTBEAT_S = 0.1
-"""Both ways; the host's comes faster where the watchdog is shorter than five of them."""
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
-DOUBLED_ANSWERS = 3
-"""So many answers that came twice are no accident; `connect` asks some ten questions."""
-ANSWER_S = 0.2
-"""Wall time that the drive may take to answer the first question of the node guarding."""
 STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
 """Wall time that feedback may take in stepped time, and after a cycle that brought none."""
 _NO_WORD = b""
-_PROFILE_VELOCITY = 3
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
@@ -115,10 +83,7 @@ class Cia402Drive:
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
         self._watch = Watch(node, clock)
-        self._guarding = Guarding(self._watch, lambda: self._link.ask(0x700 + node)) if _guarded(profile) else None
-        self._feed = self._send_heartbeat if self._guarding is None else self._ask_guarded
-        heard = self._watch.on_heartbeat if self._guarding is None else self._guarding.on_frame
-        self._link.handlers[0x700 + node] = heard
+        self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
@@ -142,21 +107,14 @@ class Cia402Drive:
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
         self._watchdog_s = 0.0
-        self._heartbeat_every_s = HEARTBEAT_S
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
-        self._state = State.NOT_READY
-        self._status = 0
-        self._speed_raw = 0
-        self._torque_raw: float = 0
-        self._demand_raw: int | None = None
-        self._shown_code = 0
+        self._reported = Reported()
         self._sent_code = 0
         self._since_mode_sent = 0
         self._contradictions = 0
         self._heard = True
         self._ticks = Ticks(clock, self.period_s)
-        self._next_heartbeat_s = 0.0
         self._cycles = self._missed = self._late = 0
 
     @property
@@ -173,31 +131,11 @@ class Cia402Drive:
 
     def connect(self) -> Identity:
         """Find the node, put it into pre-operational, read who it is (1018h) and whether it is simulated."""
-        try:
-            self._objects.read(0x1000)
-        except CommunicationLost as error:
-            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
-        checks.refuse_if_driven(self._objects)
+        find_free_node(self._objects)
         self._taken = True
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
-        vendor, product, revision, serial = (self._objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
-        try:
-            title = self._objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 ")
-        except ObjectRefused:
-            title = "CiA 402 drive"
-        self._identity = Identity(vendor, product, revision, serial, title, self._is_simulated())
-        if self.clock.stepped and not self._identity.simulated:
-            raise PreflightRefused(
-                "stepped time was asked for, but the peer does not bear the simulator's marker",
-                where=name(MARKER_INDEX, 1),
-                next_step="Leave --stepped out: a real shaft moves in real time",
-            )
-        if self._objects.doubled >= DOUBLED_ANSWERS:
-            raise PreflightRefused(
-                "every question is answered twice: two nodes have the same node-ID",
-                where=f"node {self._node}",
-                next_step="Take one of them off the bus, or give each a node-ID of its own",
-            )
+        self._identity = read_identity(self._objects)
+        refuse_in_doubt(self._objects, self._identity, self._node, self.clock.stepped)
         self.announce(self._stage)
         return self._identity
 
@@ -229,7 +167,7 @@ class Cia402Drive:
             checks.check_mode_display(table, objects, code, self._pause)
         with_demand = arming.map_pdos(table, objects, self._node, self._profile, self._shape)
         self._slow_layout = self._shape.slow(with_demand)
-        self._heartbeat_every_s = min(HEARTBEAT_S, limits.watchdog_s / 5.0)
+        self._life.pace(limits.watchdog_s / 5.0)
         heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
         self._watchdog_s = limits.watchdog_s
         feed_s = arming.arm_watchdog(
@@ -239,31 +177,17 @@ class Cia402Drive:
             host_node=self._host_node,
             watchdog_s=limits.watchdog_s,
             period_s=self.period_s,
-            beat=self._feed,
-            answered=self._answered,
+            beat=self._life.feed,
+            answered=self._life.answered,
             accept_none=limits.accept_no_watchdog,
         )
-        if not feed_s:                 # nobody is asked who may not hear it: not every adapter carries remote frames
-            self._feed = self._send_heartbeat
-        self._heartbeat_every_s = min(HEARTBEAT_S, feed_s or HEARTBEAT_S)
+        self._life.keep_to(feed_s)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
             limits.watchdog_s if feed_s else 0.0,
         )
-        guarded = self._guarding is not None and feed_s > 0.0
-        self._start(limits.watchdog_s if guarded else DRIVE_SILENT_S if heard else 0.0)
+        self._start(limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0)
         return found
-
-    def _answered(self) -> bool:
-        """Waits for the first answer of a guarded drive."""
-        guarding = self._guarding
-        return guarding is None or self._link.pump_until(lambda: guarding.answers > 0, ANSWER_S)
-
-    def _is_simulated(self) -> bool:
-        try:
-            return self._objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
-        except ObjectRefused:
-            return False
 
     def _start(self, allowed_silence_s: float) -> None:
         try:
@@ -278,7 +202,7 @@ class Cia402Drive:
     def _pause(self) -> None:
         """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""
         if self._watchdog_s:
-            self._feed()
+            self._life.feed()
         self._link.pump_until(lambda: False, 0.01)
 
     # -- the cycle -------------------------------------------------------------------------------------------
@@ -318,15 +242,14 @@ class Cia402Drive:
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
         self._watch.check()
         now_s = self.clock.now_s()
-        if now_s >= self._next_heartbeat_s:
-            self._feed()
-        code = self._codes[command.mode]
+        self._life.feed_when_due(now_s)
+        code, shown_code = self._codes[command.mode], self._reported.shown_code
         self._since_mode_sent += 1
-        if code != self._sent_code or (code != self._shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES):
+        if code != self._sent_code or (code != shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES):
             if self._shape.mode:
                 self._link.send(self._rpdo2_id, RPDO2.pack(code))
             self._sent_code, self._since_mode_sent = code, 0
-        word = controlword_towards(self._state, self._wish)
+        word = controlword_towards(self._reported.state, self._wish)
         self._link.send(
             self._rpdo1_id,
             RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
@@ -343,8 +266,8 @@ class Cia402Drive:
         if feedback.doubted() and self._wish is not Wish.ENABLED:
             fresh = False
         if fresh:
-            self._status, self._torque_raw, self._speed_raw = self._layout.unpack(feedback.data)
-            self._state = decode(self._status)
+            status, torque_raw, speed_raw = self._layout.unpack(feedback.data)
+            self._reported.take(status, speed_raw, torque_raw)
             self._follow_state()
         while self._contradictions < feedback.contradictions:
             self._contradictions += 1
@@ -359,7 +282,7 @@ class Cia402Drive:
         """
         if self._watch.nmt_state == STOPPED:
             self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
-        self._feed()
+        self._life.feed()
         begun_s = self.clock.now_s()
         found = look(self._objects, self._profile, self._watchdog_s)
         if found is None:
@@ -367,12 +290,10 @@ class Cia402Drive:
         if self.clock.stepped:
             keep_stepping(self._objects, self._profile, self.period_s)
         half_s = 0.5 * (self.clock.now_s() - begun_s)
-        self._status, self._speed_raw = found.status, found.speed
-        self._torque_raw = self._torque_raw if found.torque is None else found.torque
-        self._state = decode(found.status)
+        self._reported.take(found.status, found.speed, found.torque)
         self._follow_state()
         push(self._objects, found.status, self._wish, self._watchdog_s)
-        self._feed()
+        self._life.feed()
         self._ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
 
@@ -385,9 +306,9 @@ class Cia402Drive:
         """
         if self._wish is not Wish.ENABLED:
             return
-        if self._state is State.OPERATION_ENABLED:
+        if self._reported.state is State.OPERATION_ENABLED:
             self._in_operation = True
-        elif self._in_operation or self._state in _OUT_OF_OPERATION:
+        elif self._in_operation or self._reported.state in _OUT_OF_OPERATION:
             self._wish = Wish.QUICK_STOP
 
     def _listen_until(self, tick_s: float) -> None:
@@ -422,18 +343,7 @@ class Cia402Drive:
 
         The heartbeats that are due in control time stay due.
         """
-        due_s = self._next_heartbeat_s
-        self._feed()
-        self._next_heartbeat_s = due_s
-
-    def _send_heartbeat(self) -> None:
-        self._link.send(0x700 + self._host_node, bytes((OPERATIONAL,)))
-        self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
-
-    def _ask_guarded(self) -> None:
-        assert self._guarding is not None
-        self._guarding.feed()
-        self._next_heartbeat_s = self.clock.now_s() + self._heartbeat_every_s
+        self._life.feed_between()
 
     def _on_foreign_sync(self, data: bytes) -> None:
         self._feedback.on_foreign_sync()
@@ -445,29 +355,10 @@ class Cia402Drive:
             data = data[2:]
         if len(data) == self._slow_layout.size:
             values = self._slow_layout.unpack(data)
-            self._shown_code = values[0]
-            self._demand_raw = values[1] if len(values) > 1 else None
+            self._reported.take_slow(values[0], values[1] if len(values) > 1 else None)
 
     def _sample(self, time_s: float, age_s: float, fresh: bool) -> Sample:
-        status, units = self._status, self._units
-        power = power_state(self._state)
-        reached = bool(status & TARGET_REACHED) and power is PowerState.QUICK_STOP
-        zero = bool(status & SPEED_ZERO) and self._shown_code == _PROFILE_VELOCITY and power is PowerState.ENABLED
-        demand = self._demand_raw
-        return Sample(
-            time_s,
-            age_s,
-            0.0,
-            fresh,
-            self._speed_raw * units.speed_rad_s_per_lsb,
-            self._torque_raw * units.torque_nm_per_lsb,
-            None if demand is None else demand * units.torque_nm_per_lsb,
-            self._modes.get(self._shown_code),
-            power,
-            reached or zero,
-            bool(status & INTERNAL_LIMIT),
-            status,
-        )
+        return self._reported.sample(time_s, age_s, fresh, self._units, self._modes)
 
     # -- afterwards ------------------------------------------------------------------------------------------
 
@@ -480,7 +371,7 @@ class Cia402Drive:
         self._watch.stop()
         left: tuple[str, ...] = ()
         try:
-            if self._taken and self._state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+            if self._taken and self._reported.state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
                 self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
                 left = self._objects.restore()
         except CommunicationLost as error:
@@ -488,10 +379,6 @@ class Cia402Drive:
         finally:
             self._link.close()
         return left
-
-
-def _guarded(profile: CanopenProfile) -> bool:
-    return profile.watchdog.kind == "node_guarding"
 
 
 __all__ = ["HOST_NODE", "Cia402Drive"]

@@ -12,8 +12,8 @@ from rich.console import Console
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
 from drivers.no_watchdog import ACCEPTED_BY, NOTHING_STOPS_IT
-from tdhil.protocol.runner import Idle, Task
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
+from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
 
 WORD = "MOVE"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sim_bus.params import RigParams
     from tdhil.options import Resolved
     from tdhil.protocol.excitation import Plan, SwingPlan
-    from tdhil.protocol.runner import Idle, RunOutcome, Task
+    from tdhil.protocol.task import Idle, RunOutcome, Task
     from tdhil.record.recording import Recording, Stage
     from tdhil.rig import Rig
     from tdhil.study.field import FieldRun, RunProgress
@@ -105,7 +105,7 @@ def _asked(wish: FieldRun) -> dict[str, object]:
 
 def _task(options: Resolved, rig: Rig, identity: Identity) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
-    from tdhil.protocol.runner import Task
+    from tdhil.protocol.task import Task
 
     bench = bench_of(identity, rig)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))

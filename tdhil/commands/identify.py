@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
     from tdhil.options import Resolved
-    from tdhil.protocol.runner import RunOutcome, Task
+    from tdhil.protocol.task import RunOutcome, Task
     from tdhil.record.run_log import RunLog
     from tdhil.rig import Rig
 
@@ -181,7 +181,7 @@ def _task(
 ) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
     from tdhil.commands.unverified import accepted_lines, note, require_accepted
-    from tdhil.protocol.runner import Task
+    from tdhil.protocol.task import Task
 
     bench = bench_of(identity, rig)
     log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))

@@ -52,7 +52,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
     """Plain data. Times are control time in s; ``under_way``: the stage that the log breaks off in, or None."""
-    from tdhil.protocol.runner import STAGES
+    from tdhil.protocol.task import STAGES
 
     run = found.run
     time_s = run.recording.time_s

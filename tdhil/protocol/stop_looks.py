@@ -69,7 +69,7 @@ class Slowing:
 
     def reset(self) -> None:
         """The cycle's feedback is back."""
-        self._since_s, self._speed_rad_s = None, math.inf
+        self._since_s = None
 
     def see(self, time_s: float, speed_rad_s: float) -> bool:
         """False once a shaft that turns has not got slower for `SLOWING_S`."""

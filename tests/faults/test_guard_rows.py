@@ -14,8 +14,8 @@ from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.protocol.bench import Bench
-from tdhil.protocol.runner import STAGES
 from tdhil.protocol.settings import ExcitationRequest
+from tdhil.protocol.task import STAGES
 from tdhil.record.errors import LogError
 
 IN_STAGE = 60

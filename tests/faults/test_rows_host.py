@@ -10,7 +10,7 @@ from rehearsal import at
 
 from drivers.drive import PowerState
 from sim_bus.simulator import EmbeddedSimulator
-from tdhil.protocol import runner
+from tdhil.protocol import plan_stage
 from tdhil.protocol.bench import Bench
 from tdhil.record.errors import LogBroken
 from tdhil.record.reader import read_run
@@ -66,7 +66,7 @@ def test_row_5_a_mistake_of_ours(where, rehearse, monkeypatch, seen):
         run = rehearse()
         since_s = acted[0]
     else:
-        monkeypatch.setattr(runner, "plan_acquisition", mistake)
+        monkeypatch.setattr(plan_stage, "plan_acquisition", mistake)
         run = rehearse()
         since_s = next(event.time_s for event in read_run(run.log).events if event.kind == "failure")
     assert run.done.code == 1

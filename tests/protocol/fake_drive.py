@@ -10,9 +10,10 @@ from drivers.drive import Check, Command, Counters, Identity, Limits, Mode, Outc
 from drivers.errors import CommunicationLost
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.guard import Guard
-from tdhil.protocol.runner import Runner, Task
+from tdhil.protocol.runner import Runner
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
 from tdhil.protocol.stop import StopSequence
+from tdhil.protocol.task import Task
 
 PERIOD_S = 0.02
 SPEED_RESOLUTION = 0.01

@@ -18,8 +18,9 @@ from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState,
 from sim_bus.control import Regulation
 from sim_bus.inverter import Inverter
 from sim_bus.params import DriveParams, RigParams
-from tdhil.protocol.runner import Runner, RunOutcome, Task
+from tdhil.protocol.runner import Runner
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.protocol.task import RunOutcome, Task
 from tdhil.record.builder import RecordingBuilder
 from tdhil.record.recording import Recording
 

@@ -10,7 +10,7 @@ from fake_drive import World
 from drivers.drive import PowerState
 from drivers.errors import DriveFault
 from tdhil.cli import build_parser
-from tdhil.protocol.runner import STAGES
+from tdhil.protocol.task import STAGES
 
 ROOT = Path(__file__).parents[2]
 

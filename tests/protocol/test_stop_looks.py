@@ -182,5 +182,7 @@ def test_slowing():
     assert all(slowing.see(10.0 + 0.1 * k, 0.04 * (-1) ** k) for k in range(100))
     assert not all(slowing.see(30.0 + 0.1 * k, 2.0) for k in range(12))
     slowing.reset()
+    assert not all(slowing.see(32.0 + 0.1 * k, -2.0) for k in range(12))
+    slowing.reset()
     assert slowing.see(40.0, 9.0)
     assert not slowing.see(41.0, float("nan"))

@@ -228,6 +228,15 @@ def test_what_is_no_number_holds_the_shaft(wrong):
     assert going.done
 
 
+def test_torque_about_zero_has_no_side_that_it_could_change():
+    """Ripple below what counts as none: what comes after it is yielded to as if there had been no ripple."""
+    calm, rippled = letting_go(), letting_go()
+    for k in range(600):
+        calm.step(0.0, 0.0)
+        rippled.step(0.6 * RESIDUAL_NM * (-1.0) ** (k // 30), 0.0)
+    assert rippled.step(300.0, 0.0) == pytest.approx(calm.step(300.0, 0.0)) != 0.0
+
+
 @settings(max_examples=25, deadline=None)
 @given(stiffness=st.floats(20.0, 20_000.0), lag_s=st.sampled_from([0.0, 0.15, 0.4]), trapped=st.floats(-380.0, 380.0))
 def test_any_string_is_let_go_behind_any_plausible_lag(stiffness, lag_s, trapped):
