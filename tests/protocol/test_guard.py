@@ -59,6 +59,14 @@ def test_a_braking_torque_that_may_not_be_is_held_back_in_torque_mode(torque, mo
         watch.check_command(Command(mode, 1.0, torque))
 
 
+def test_a_braking_torque_is_held_back_too_where_nobody_knows_what_would_change_that():
+    watch = guard()
+    watch.no_braking = "none has been tried"
+    with pytest.raises(LimitHit, match="held back") as caught:
+        watch.check_command(Command(Mode.TORQUE, 1.0, -5.0))
+    assert caught.value.next_step == ""
+
+
 def test_backwards_setpoints_need_allow_reverse():
     guard(REVERSIBLE).check_command(Command(Mode.SPEED, -10.0, 0.0))
     with pytest.raises(CommandRejected, match="outside -10 to 10"):
