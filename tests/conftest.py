@@ -34,6 +34,13 @@ LONG = re.compile(
     r"|test_default_plan\.py::.*_filters\[(two poles|matched|two long poles|torque through two poles)"
     r"|test_hopeless\.py::test_never_a_number_without_a_warning\[((?!two_faults).*-[12]|two_faults-1.*)\]"
     r"|test_coverage\.py::test_a_small_version.*\[12-"
+    r"|test_field_amplitudes\.py::.*\[figure2[01]"
+    r"|test_field_loops\.py::"
+    r"|test_stops\.py::test_a_frozen_host_is_no_watchdog_either"     # test_rows_process freezes one too
+    r"|test_default_plan\.py::.*_filters\[three poles"
+    r"|test_modbus_tcp\.py::test_a_connection_that_dies\[reset"      # test_modbus_scripted resets one too
+    r"|path/test_modbus_profiles\.py::test_the_inertia\[generic/modbus"     # so does test_cli_modbus
+    r"|test_stops\.py::test_a_(killed_host_.*|signal_in_each_stage)\[(SIGINT-)?hold"
 )
 """More cases of what others show already, and minutes of it: with --long."""
 
