@@ -13,7 +13,7 @@ class Ticks:
         self._clock = clock
         self._period_s = period_s
         self._longest_stall_s = longest_stall_s
-        self._ended_s = clock.now_s()
+        self._ended_s = self._began_s = clock.now_s()
         self._next_s = self._ended_s + period_s
         self.overruns = 0
 
@@ -31,11 +31,22 @@ class Ticks:
         if now_s - due_s > 0.5 * self._period_s:
             self.overruns += 1
         self._next_s = max(due_s + self._period_s, now_s + 0.5 * self._period_s)
+        self._began_s = now_s
         # Waiting for a reply that didn't come isn't standing still: that is told by its own error.
-        stood_still_s = now_s - max(due_s, self._ended_s)
+        self._refuse_stall(now_s - max(due_s, self._ended_s), now_s)
+
+    def check(self) -> None:
+        """Just before a setpoint goes out: a process can be frozen anywhere, also between the tick and here.
+
+        Raises CommunicationLost like `wait`.
+        """
+        now_s = self._clock.now_s()
+        self._refuse_stall(now_s - self._began_s, now_s)
+
+    def _refuse_stall(self, stood_still_s: float, now_s: float) -> None:
         if 0.0 < self._longest_stall_s < stood_still_s:
             self._next_s = now_s + self._period_s
-            self._ended_s = now_s
+            self._ended_s = self._began_s = now_s
             raise CommunicationLost(
                 f"the control loop stood still for {stood_still_s:.2f} s; the setpoint it had in hand was not sent",
                 where="host",

@@ -253,10 +253,11 @@ class Cia402Drive:
         self._link.send(
             self._rpdo1_id,
             RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
+            self._ticks.check,
         )
         feedback = self._feedback
         feedback.begin()
-        self._link.send(SYNC, _NO_WORD)
+        self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         fresh = bool(feedback.data)

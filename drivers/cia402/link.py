@@ -45,9 +45,15 @@ class CanLink:
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
 
-    def send(self, identifier: int, data: bytes) -> None:
-        """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it."""
-        self._put(self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False))
+    def send(self, identifier: int, data: bytes, last_look: Callable[[], None] | None = None) -> None:
+        """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it.
+
+        ``last_look`` is called when nothing but sending is left to be done, and may raise to prevent it.
+        """
+        message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
+        if last_look is not None:
+            last_look()
+        self._put(message)
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
 

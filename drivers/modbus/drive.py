@@ -223,6 +223,11 @@ class ModbusDrive:
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
         )
         image = self._codec.image(word, setpoints, command.mode)
+        try:
+            self._ticks.check()
+        except CommunicationLost:
+            self._stay_out()
+            raise
         begun_s = self.clock.now_s()
         self._cycles += 1
         try:

@@ -266,6 +266,31 @@ def test_a_frozen_loop_does_not_send_what_it_had_in_hand(in_real_time, peer, wir
     assert all(speed != 859 for _, _, speed in peer.setpoints)     # 9 rad/s = 85.9 rpm
 
 
+@pytest.mark.parametrize("after", [0x77F, 0x201])
+def test_frozen_between_two_frames_of_a_cycle_it_does_not_go_on(in_real_time, peer, wire, fake_time, after):
+    """After its heartbeat no setpoint goes out, and after the setpoint no SYNC that would make it act."""
+    exchange(in_real_time, 30)
+    send, sent = wire.on_send, []
+
+    def freeze(identifier, data):
+        sent.append(identifier)
+        send(identifier, data)
+        if identifier == after:
+            fake_time.sleep(3.0)
+
+    wire.on_send = freeze
+    with pytest.raises(CommunicationLost, match="stood still"):
+        exchange(in_real_time, 60)
+    assert sent[-1] == after
+    wire.on_send = send
+    wire.put(0x701, b"\x05")
+    in_real_time.quick_stop()
+    with contextlib.suppress(CommunicationLost):           # its heartbeat has been missing meanwhile
+        exchange(in_real_time, 1, 0.0)
+    exchange(in_real_time, 1, 0.0)
+    assert peer.setpoints[-1][0] & 0x0F == 0x02
+
+
 def test_a_short_stall_is_an_overrun_and_no_burst_follows(in_real_time, wire, fake_time):
     fake_time.sleep(0.1)
     syncs = []
