@@ -32,8 +32,8 @@ is marked. *To rest* is plant time from the fault to the last movement of the si
 
 def run_tests(path):
     environment = os.environ | {"TDHIL_FAULT_TABLE": str(path)}
-    done = subprocess.run([sys.executable, "-m", "pytest", "-q", "tests/faults", "-p", "no:cacheprovider"], cwd=ROOT,
-                          env=environment, check=False)
+    command = [sys.executable, "-m", "pytest", "-q", "--long", "tests/faults", "-p", "no:cacheprovider"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, check=False)
     return done.returncode
 
 
