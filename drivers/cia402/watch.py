@@ -143,9 +143,7 @@ class Watch:
 
     def on_foreign(self, _data: bytes) -> None:
         """A frame of the kinds that we send came in: somebody else drives this drive, or is about to."""
-        now_s = self._clock.now_s()
-        self._foreign_s.append(now_s)
-        if len(self._foreign_s) == FOREIGN_FRAMES and now_s - self._foreign_s[0] <= FOREIGN_S:
+        if self._no_accident(self._foreign_s):
             self._keep(
                 "master",
                 CommunicationLost(
@@ -157,9 +155,7 @@ class Watch:
 
     def on_contradiction(self) -> None:
         """A frame of feedback that the drive can't have sent, if it sent the one before it for the same SYNC."""
-        now_s = self._clock.now_s()
-        self._contradicted_s.append(now_s)
-        if len(self._contradicted_s) == FOREIGN_FRAMES and now_s - self._contradicted_s[0] <= FOREIGN_S:
+        if self._no_accident(self._contradicted_s):
             self._keep(
                 "feedback",
                 CommunicationLost(
@@ -197,6 +193,12 @@ class Watch:
         """Nothing is trouble any more."""
         self.expect_operational = False
         self.allowed_silence_s = 0.0
+
+    def _no_accident(self, seen_s: deque[float]) -> bool:
+        """One more now; have there been so many within the time?"""
+        now_s = self._clock.now_s()
+        seen_s.append(now_s)
+        return len(seen_s) == FOREIGN_FRAMES and now_s - seen_s[0] <= FOREIGN_S
 
     def _keep(self, kind: str, trouble: TdhilError) -> None:
         if kind not in self._raised:

@@ -11,7 +11,7 @@ has gone by like that, the drive counts as lost.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PowerState, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
@@ -211,11 +211,7 @@ class ModbusDrive:
         if command.mode not in self._modes:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="driver")
         setpoints = self._codec.setpoints(command)
-        try:
-            self._ticks.wait()
-        except CommunicationLost:
-            self._stay_out()
-            raise
+        self._unless_frozen(self._ticks.wait)
         if setpoints.speed:
             self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction it is braked from
         turning = not self._standstill.near(self._feedback.speed_rad_s)
@@ -223,11 +219,7 @@ class ModbusDrive:
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
         )
         image = self._codec.image(word, setpoints, command.mode)
-        try:
-            self._ticks.check()
-        except CommunicationLost:
-            self._stay_out()
-            raise
+        self._unless_frozen(self._ticks.check)
         begun_s = self.clock.now_s()
         self._cycles += 1
         try:
@@ -247,6 +239,13 @@ class ModbusDrive:
         self._follow_state()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def _unless_frozen(self, look_at_ticks: Callable[[], None]) -> None:
+        try:
+            look_at_ticks()
+        except CommunicationLost:
+            self._stay_out()
+            raise
 
     def look(self) -> Sample | None:
         """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still tell how it is.
