@@ -240,6 +240,14 @@ class Echo(Entry):
     times: Name | None = None
 
 
+_NO_ECHO = Entry(
+    source="no register shows before motion what the drive has made of this setpoint; look its address, type, scale "
+    "and sign up in the manual",
+    confidence="unverified",
+)
+"""Stands where an echo is missing: no check at standstill can find that setpoint's entry wrong, so a person answers."""
+
+
 class ModbusCycle(Entry):
     """The numbers of every cycle."""
 
@@ -331,13 +339,21 @@ class ModbusProfile(DataModel):
         return next(one for one in self.parameters if one.name == name)
 
     def entries(self) -> tuple[tuple[str, Entry], ...]:
-        """(name, entry) of everything that carries a source and a confidence."""
+        """(name, entry) of everything that carries a source and a confidence; a missing echo is one, unverified."""
         found: list[tuple[str, Entry]] = [(name, part) for name, part in self if isinstance(part, Entry)]
         found += [(f"cycle.{name}", part) for name, part in self.cycle if isinstance(part, Entry)]
         found += [(f"parameters.{part.name}", part) for part in self.parameters]
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         found += [(f"echoes.{part.setpoint}", part) for part in self.echoes]
+        found += [(f"echoes.{setpoint}", _NO_ECHO) for setpoint in self.unseen]
         return tuple(found)
+
+    @property
+    def unseen(self) -> tuple[Literal["speed", "torque"], ...]:
+        """Setpoints of which the drive doesn't show, before motion, what it has made of them."""
+        used: tuple[Literal["speed", "torque"], ...] = ("speed", "torque") if self.modes.torque else ("speed",)
+        shown = {echo.setpoint for echo in self.echoes}
+        return tuple(setpoint for setpoint in used if setpoint not in shown)
 
     def below(self, confidence: Confidence) -> tuple[str, ...]:
         """Names of the entries of exactly this confidence."""

@@ -55,7 +55,7 @@ def check_setpoints(
         if RANGES[signal.register_.type][0] == 0:
             tests = [abs(value) for value in tests]     # its sign stands in the control word, if anywhere
         echoes = [one for one in profile.echoes if one.setpoint == name]
-        if not echoes:
+        if name in profile.unseen:
             text = "this drive doesn't show it: its scale and sign can be seen in motion only"
             table.note(f"{name} setpoint as the drive understood it", text, "profile, echoes")
         for echo in (*echoes, None):

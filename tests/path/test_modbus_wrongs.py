@@ -1,8 +1,9 @@
 """A drive wired otherwise than its profile says, on the whole path: what is refused before motion, and what can't be.
 
 A register without a twin, an echo or a name plate to compare it with says nothing of its own scale or sign. Where
-that is so, preflight notes it, and the first that can tell is the sign probe, which pushes forward at walking pace, or
-for what is read without a sign the braking probe, which brakes once at low speed before torque mode goes on.
+that is so of a setpoint, a real drive is refused until the operator takes it by name (``echoes.speed``). Then the first
+that can tell is the sign probe, which pushes forward at walking pace, or for what is read without a sign the braking
+probe, which brakes once at low speed before torque mode goes on.
 """
 
 from functools import partial
@@ -11,10 +12,13 @@ import numpy as np
 import pytest
 from path_runs import Shaft, identify
 
+from drivers.errors import PreflightRefused
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile
-from sim_bus.modbus import embedded
+from sim_bus.modbus import embedded, slots
 from sim_bus.modbus.wrongs import parse
+from tdhil.commands.unverified import accepted_lines, require_accepted
+from tdhil.record.reader import read_frames
 
 NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]
 WRONGS = ("word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied")
@@ -113,6 +117,47 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     found = drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
     assert found.refused == ()
     notes = [check.name for check in found.checks if "in motion only" in check.found]
+    assert notes == [f"{name} setpoint as the drive understood it" for name in unseen(profile)]
+
+
+def unseen(profile):
     setpoints = {"speed", "torque"} if profile.modes.torque else {"speed"}
-    unseen = sorted(setpoints - {echo.setpoint for echo in profile.echoes})
-    assert notes == [f"{name} setpoint as the drive understood it" for name in unseen]
+    return sorted(setpoints - {echo.setpoint for echo in profile.echoes})
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if unseen(load_modbus_profile(name))])
+def test_a_real_drive_with_a_setpoint_that_no_register_tells_is_refused_unless_it_is_taken_by_name(name):
+    profile = load_modbus_profile(name)
+    asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
+    others = {"likely", "echoes", *profile.below("unverified")} - asked
+    with pytest.raises(PreflightRefused) as refused:
+        require_accepted(profile, others)
+    lines = [line.split()[0] for line in refused.value.what.split("\n") if line.startswith("  ")]
+    assert set(lines) == asked
+    assert all(f"--accept-unverified {one}" in str(refused.value) for one in asked)
+    require_accepted(profile, others | asked)
+    assert asked <= {line.split()[0] for line in accepted_lines(profile, others | asked)}     # stands in the prompt
+
+
+@pytest.mark.parametrize(("name", "wrong"), [
+    (name, wrong) for name, wrong in UNTOLD if wrong != "word_order" and unseen(load_modbus_profile(name))
+])
+def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, monkeypatch, tmp_path):
+    wired(monkeypatch, wrong)
+    monkeypatch.setattr(slots, "MARKER_TEXT", "somebody's drive")         # taken for a real one
+    profile, trace = load_modbus_profile(name), tmp_path / "shaft.csv"
+    asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
+    others = {"likely", *profile.below("unverified")} - asked
+    done = identify(tmp_path, "--simulate", "--real-time", "--yes", "--profile", name, "--trace", trace,
+                    *(f"--accept-unverified={one}" for one in others))
+    assert done.code == 4, done.err
+    assert all(f"{one} (unverified): no register shows" in done.err for one in asked)
+    assert not any(frame.outgoing and frame.data[0] in (5, 6, 15, 16, 22, 23) for frame in read_frames(done.log))
+    Shaft.read(trace).assert_enabled(False)
+
+
+def test_what_moves_before_anyone_can_tell_has_been_taken_by_name():
+    """But for signs of what a drive reports: at rest that is zero, and zero has none."""
+    left = {(name, wrong) for name, wrong in UNTOLD if wrong != "word_order"}
+    taken = {(name, wrong) for name, wrong in left if unseen(load_modbus_profile(name))}
+    assert left - taken == {("delta/ms300", "sign"), ("delta/ms300", "unsigned")}
