@@ -144,6 +144,7 @@ class Preflight:
     watchdog_s: float                  # 0: none is armed
     safe_action: str                   # what the drive does by itself when the host falls silent
     filters: ReportingFilters = ReportingFilters()
+    torque_setpoint: str = "torque setpoint"     # object or register that takes it
 
     @property
     def watched(self) -> bool:

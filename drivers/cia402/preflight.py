@@ -143,4 +143,5 @@ def report(
         watchdog_s=watchdog_s,
         safe_action=profile.watchdog.reaction if watchdog_s else "none",
         filters=filters,
+        torque_setpoint="6071h",
     )

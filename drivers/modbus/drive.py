@@ -153,6 +153,7 @@ class ModbusDrive:
         self._standstill = Standstill(scales.speed, limits.speed_rad_s, self.period_s)
         self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
         self._late_before = late_replies(self._link)
+        target = profile.cycle.torque_setpoint
         return Preflight(
             identity=self._identity,
             checks=tuple(table.checks),
@@ -165,6 +166,7 @@ class ModbusDrive:
             watchdog_s=limits.watchdog_s if watched else 0.0,
             safe_action=profile.watchdog.reaction if watched else "none",
             filters=filters,
+            torque_setpoint=register_name(target.register_) if target is not None else "none",
         )
 
     def _off_word(self) -> int:

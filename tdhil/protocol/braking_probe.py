@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.drive import Command, Mode, Preflight, Sample
+from drivers.drive import Command, Mode, Sample
 from drivers.errors import PreflightRefused
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.braking_answer import Answer, Listener, speed_noise_rad_s
@@ -31,9 +31,6 @@ RAMP_S = 5.0
 
 TORQUE_SHARE = 0.25
 """Of the torque limit, that slowing down may take."""
-
-_SETPOINT_ROW = "torque setpoint"
-_TARGET = "6071h"
 
 
 def slow_speed(limits: MachineLimits) -> float:
@@ -58,16 +55,6 @@ def slow_down(
     bench.hold(command, assumptions.largest_speed_lag_s)
     settled = wait_until_steady(bench, command, target, tolerance, timeout_s=60.0)
     return tuple(settled[-bench.cycles(STEADY_S) :])
-
-
-def torque_setpoint(preflight: Preflight) -> str:
-    """Where the drive takes its torque setpoint, as preflight has written it there: a register, or 6071h."""
-    for check in preflight.checks:
-        if check.name.startswith(_SETPOINT_ROW) and "register" in check.where:
-            return check.where.split(" → ")[0]
-        if _TARGET in check.where:
-            return _TARGET
-    return "torque setpoint"
 
 
 def probe_braking(

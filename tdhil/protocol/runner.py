@@ -14,7 +14,7 @@ from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog
 from tdhil.protocol.bench import Bench
-from tdhil.protocol.braking_probe import NOT_YET, slow_down, torque_setpoint
+from tdhil.protocol.braking_probe import NOT_YET, slow_down
 from tdhil.protocol.choose_mode import choose_mode, no_torque
 from tdhil.protocol.control import MeanSpeedControl
 from tdhil.protocol.excitation import RigGuess, SwingPlan
@@ -134,7 +134,7 @@ class Runner:
         if mode is Mode.TORQUE:
             with self._book.stage("torque", 15.0):
                 drifted = run_torque(
-                    bench, limits, assumptions, speed, slow, torque_offset, resolution, torque_setpoint(preflight)
+                    bench, limits, assumptions, speed, slow, torque_offset, resolution, preflight.torque_setpoint
                 )
                 ramps = (speed.ramp, drifted.ramp)
                 self._log.motion(None, speed.levels, ramps)

@@ -6,10 +6,10 @@ import pytest
 from fake_drive import LIMITS, FakeDrive
 from line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
-from drivers.drive import Check, Mode, Outcome, PowerState
+from drivers.drive import Mode, PowerState
 from drivers.errors import PreflightRefused
 from tdhil.errors import ExitCode, exit_code
-from tdhil.protocol.braking_probe import NOT_YET, torque_setpoint
+from tdhil.protocol.braking_probe import NOT_YET
 from tdhil.protocol.settings import ExcitationRequest
 
 MISREAD = {
@@ -113,16 +113,3 @@ def test_in_speed_mode_there_is_nothing_to_try(world):
     here = world()
     assert here.runner(ExcitationRequest(mode="speed", periods=2)).run().cause is None
     assert not any("braking" in text for _, text in here.log.events)
-
-
-@pytest.mark.parametrize(("checks", "where"), [
-    ([("setpoints cleared", "register 1, register 2"), ("torque setpoint as it was understood", "profile, echoes"),
-      ("torque setpoint reads back", "register 2 → register 7")], "register 2"),
-    ([("targets", "6071h, 60FFh")], "6071h"),
-    ([], "torque setpoint"),
-])
-def test_the_setpoint_s_place_is_named_as_preflight_names_it(world, checks, where):
-    here = world()
-    rows = tuple(Check(name, "", "", Outcome.OK, place) for name, place in checks)
-    found = replace(here.drive.preflight(LIMITS), checks=rows)
-    assert torque_setpoint(found) == where
