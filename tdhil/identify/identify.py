@@ -6,10 +6,13 @@ there are samples, and shown beside whatever comes out.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tdhil.identify.bent.fit import Motion
+from tdhil.identify.bent.verdict import identify_bent
+from tdhil.identify.bent.wave import wave_of
 from tdhil.identify.beside.friction_curve import friction_curve
 from tdhil.identify.beside.friction_curve_points import Inertia
 from tdhil.identify.beside.second_look import with_second_look
@@ -17,7 +20,8 @@ from tdhil.identify.compliant.choice import may_swing, usable_lines
 from tdhil.identify.compliant.verdict import identify_compliant
 from tdhil.identify.faults.line_faults import hints, refuse_lines
 from tdhil.identify.faults.quality import Refusal, refuse_motion, refuse_samples
-from tdhil.identify.identification import Identification
+from tdhil.identify.identification import Identification, Verdict
+from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import Levels, ViscousTie, measure_levels, tie_viscous
 from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
 from tdhil.identify.lines.model import GaussianPrior
@@ -81,13 +85,28 @@ def _identify(recording: Recording, options: Options) -> Identification:
     if len(lines) < len(every):
         warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
     evidence = Evidence(paper, periods, used, warnings)
-    found = None
-    swinging = options.model in ("two-mass", "string")
-    if not swinging:
-        found, swinging = _rigid(recording, options, evidence, lines, levels, tie)
-    if found is None or swinging:
+    rigid = _Rigid()
+    if options.model not in ("two-mass", "string"):
+        rigid = _rigid(recording, options, evidence, lines, levels, tie)
+    found = rigid.said
+    if found is None or rigid.doubted:
         found = _compliant(recording, options, evidence, usable_lines(every, _LEAST_NU), levels, tie, found)
+    if found.verdict is Verdict.MODEL_REJECTED and rigid.result is not None and options.model in ("auto", "rigid"):
+        waves = tuple(wave_of(fit, one.segment) for fit, one in zip(fits, cut, strict=True) if len(fit.speed))
+        bent = Motion(waves, levels, lines, tie_viscous(levels))
+        found = identify_bent(recording, options, evidence, bent, rigid.priors, rigid.held, rigid.result) or found
     return with_second_look(found, recording, samples, levels, options)
+
+
+@dataclass(frozen=True)
+class _Rigid:
+    """What a rigid shaft makes of the lines; ``doubted``: another one should be tried."""
+
+    said: Identification | None = None
+    result: RigidResult | None = None
+    priors: tuple[GaussianPrior, ...] = ()
+    held: Held = field(default_factory=dict)
+    doubted: bool = False
 
 
 def _rigid(
@@ -97,10 +116,9 @@ def _rigid(
     lines: tuple[Line, ...],
     levels: Levels,
     tie: ViscousTie | None,
-) -> tuple[Identification, bool]:
-    """The verdict on a rigid shaft; and whether another one should be tried."""
+) -> _Rigid:
     priors: tuple[GaussianPrior, ...] = ()
-    held: dict[int, float] = {}
+    held: Held = {}
     if options.model == "paper":
         refusal = None if len(lines) > 1 else _one_line_paper()
         held = unfiltered()
@@ -109,11 +127,11 @@ def _rigid(
         refusal = refuse_count(len(lines), tie, priors)
         held = known_structure(recording.lag_prior)
     if refusal is not None:
-        return refused(refusal, evidence.paper, evidence.periods, evidence.samples, evidence.warnings), False
+        return _Rigid(refused(refusal, evidence.paper, evidence.periods, evidence.samples, evidence.warnings))
     result = _fitted(lines, levels, tie, priors, held, options.confidence, recording.torque_scale_rel_sd)
     found = conclude(result, recording, options, evidence, tie, priors)
     doubted = options.model == "auto" and result is not None and may_swing(result, lines, tie, priors, held)
-    return found, doubted
+    return _Rigid(found, result, priors, held, doubted)
 
 
 def _compliant(

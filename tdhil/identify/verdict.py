@@ -15,6 +15,8 @@ from tdhil.identify.options import Options
 from tdhil.identify.torque_scale import with_total
 from tdhil.record.recording import LagPrior, Recording
 
+RIGID = "rigid+lags"
+_RIGID_WORDS = "a rigid shaft seen through reporting lags"
 _OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
 
 
@@ -61,8 +63,9 @@ def conclude(
     evidence: Evidence,
     tie: ViscousTie | None,
     priors: tuple[GaussianPrior, ...],
+    words: str = _RIGID_WORDS,
 ) -> Identification:
-    """The verdict on a fitted rigid model."""
+    """The verdict on a fitted rigid model; ``words``: which, for the reader."""
     rejected = result is not None and rejects(result.residual)
     if result is None or not (rejected or _bounded(result)):
         return refused(
@@ -82,11 +85,11 @@ def conclude(
     verdict = Verdict.VALID if relative <= options.tolerance else Verdict.VALID_WIDE
     if inertia is None:
         verdict = Verdict.MODEL_REJECTED
-    reason, advice = _words(verdict, result, options, tie, relative)
+    reason, advice = _words(verdict, result, options, tie, relative, words)
     kept = not rejected
     return Identification(
         verdict=verdict,
-        model="paper" if as_paper else "rigid+lags",
+        model="paper" if as_paper else RIGID,
         reason=reason,
         advice=advice,
         inertia=inertia,
@@ -153,10 +156,9 @@ def of_reports(prior: LagPrior) -> list[str]:
 
 
 def _words(
-    verdict: Verdict, result: RigidResult, options: Options, tie: ViscousTie | None, relative: float
+    verdict: Verdict, result: RigidResult, options: Options, tie: ViscousTie | None, relative: float, words: str
 ) -> tuple[str, str]:
-    rigid = "a rigid shaft seen through reporting lags"
-    what = "the paper's model, without lags," if options.model == "paper" else rigid
+    what = "the paper's model, without lags," if options.model == "paper" else words
     p_value = result.residual.p_value if result.residual is not None else None
     if verdict is Verdict.MODEL_REJECTED:
         advice = (

@@ -7,7 +7,7 @@ of the design's notes and is scaled to the torque and speed of the others.
 
 from __future__ import annotations
 
-from tdhil.study.coverage_plants import CoveragePlant, Noise, Reading, Report
+from tdhil.study.coverage_plants import Bend, CoveragePlant, Noise, Reading, Report
 
 RPM = 0.10471975511965977   # rad/s
 
@@ -118,5 +118,13 @@ FLEET: tuple[CoveragePlant, ...] = (
         "modbus_poles", "10 Hz, instants 40 ms apart, speed through two poles", 350.0, 20.0, 150.0, (0.5, 12.0), 1200.0,
         _lag(0.30, 0.10), _lag(0.10), Noise(10.0, 0.6, 25.0, 0.02, 0.003, 5.0, 0.1 * RPM, 3.0),
         Reading(10.0, 0.010, 0.005, -0.020, 0.020, 0.0, 0.1),
+    ),
+    CoveragePlant(
+        "stribeck", "friction that falls by 24 N·m from rest to 3 rad/s, then rises", 104.0, 8.0, 60.0, (0.5, 10.0),
+        400.0, _lag(0.40), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004), bend=Bend(24.0, 1.5),
+    ),
+    CoveragePlant(
+        "fan", "half of the friction's slope goes with the square of speed", 104.0, 4.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.40), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004), bend=Bend(square_nm_s2_rad2=0.6),
     ),
 )

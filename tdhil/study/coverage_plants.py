@@ -78,8 +78,23 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class Bend:
+    """Friction besides its straight line, at positive speed: bell·exp(−(ω/width)²) + square·ω²."""
+
+    bell_nm: float = 0.0
+    width_rad_s: float = 1.0
+    square_nm_s2_rad2: float = 0.0
+
+    def torque(self, speed: FloatArray) -> FloatArray:
+        """N·m against rotation."""
+        found: FloatArray = self.bell_nm * np.exp(-((speed / self.width_rad_s) ** 2))
+        found += self.square_nm_s2_rad2 * speed * speed
+        return found
+
+
+@dataclass(frozen=True)
 class CoveragePlant:
-    """J dω/dt + B ω + T_c = T + load at positive speed, seen through two reports.
+    """J dω/dt + B ω + T_c + bend = T + load at positive speed, seen through two reports.
 
     ``lowest_hz``: lowest line of the multisine. ``model_true``: a first-order lag on either report and a skew are the
     whole truth. ``degenerate``: the lags are equal or absent, so that they can't be told apart.
@@ -99,6 +114,7 @@ class CoveragePlant:
     lowest_hz: float = 0.1
     step_s: float = 0.002
     motor_lag_s: float = 0.010
+    bend: Bend | None = None
     model_true: bool = False
     degenerate: bool = False
 

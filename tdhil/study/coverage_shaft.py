@@ -5,10 +5,11 @@ recursion, with h = step/τ and a = e^(−h),
 
     y₁ = a y₀ + g₀ u₀ + g₁ u₁,   g₀ = (1 − a)/h − a,   g₁ = 1 − (1 − a)/h.
 
-The shaft is such a lag of u = (T + load − T_c)/B with τ = J/B (positive speed, so that T_c is constant). The motor
-follows its command through a short lag. The command is feed-forward from the rough inertia plus a slow PI on the mean
-speed, K_p = Ĵ ω_b, K_i = K_p ω_b/4, ω_b = 0.2/0.4 s, on a speed that is as late as the report's delay; it is renewed
-once a host cycle and held between.
+The shaft is such a lag of u = (T + load − T_c)/B with τ = J/B (positive speed, so that T_c is constant). A bend of
+friction is part of u: known at the step's beginning, and at its end from the last two speeds by a straight line. The
+motor follows its command through a short lag. The command is feed-forward from the rough inertia plus a slow PI on the
+mean speed, K_p = Ĵ ω_b, K_i = K_p ω_b/4, ω_b = 0.2/0.4 s, on a speed that is as late as the report's delay; it is
+renewed once a host cycle and held between.
 """
 
 from __future__ import annotations
@@ -70,6 +71,8 @@ def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatAr
     seen, integral, command = omega.copy(), np.zeros(runs), motor.copy()
     torque[0] += motor
     push[0] += torque[0]
+    if plant.bend is not None:
+        push[0] -= plant.bend.torque(omega)
     speed[0] = omega
     limit = plant.torque_limit_nm
     for n in range(steps - 1):
@@ -84,6 +87,8 @@ def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatAr
         motor += pulled
         torque[n + 1] += motor
         push[n + 1] += torque[n + 1]
+        if plant.bend is not None:
+            push[n + 1] -= plant.bend.torque(omega + (omega - speed[n - 1] if n else 0.0))
         omega = keep * omega
         omega += early * push[n]
         omega += late * push[n + 1]

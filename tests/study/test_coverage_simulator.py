@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tdhil.study.coverage_fleet import FLEET
-from tdhil.study.coverage_plants import Noise, Reading, Report
+from tdhil.study.coverage_plants import FloatArray, Noise, Reading, Report
 from tdhil.study.coverage_shaft import coloured
 from tdhil.study.coverage_simulator import lagged, quiet_shaft, shown, simulate
 
@@ -79,6 +79,28 @@ def test_the_shaft_obeys_newton_at_every_line() -> None:
                 # integration by parts: the net change of speed is the end term
                 w, t = (turned * speed).mean(), (turned * torque).mean()
                 assert t == pytest.approx((104.0 * s + 8.0) * w + 104.0 * drift, rel=1e-4)
+
+
+
+@pytest.mark.parametrize("name", ["stribeck", "fan"])
+def test_bent_friction_is_where_scipy_s_integrator_has_it(name: str) -> None:
+    """The torque of the run as given, taken as straight between steps, through an integrator of scipy's."""
+    from scipy.integrate import solve_ivp
+
+    plant = PLANT[name]
+    _, shaft = quiet_shaft(plant, np.array([0.5]), 4)
+    time = np.arange(len(shaft.speed)) * STEP
+
+    def rate(t: float, speed: FloatArray) -> FloatArray:
+        bell = 24.0 * np.exp(-((speed / 1.5) ** 2)) if name == "stribeck" else 0.6 * speed**2
+        viscous = 8.0 if name == "stribeck" else 4.0
+        acceleration: FloatArray = (np.interp(t, time, shaft.torque[:, 0]) - viscous * speed - 60.0 - bell) / 104.0
+        return acceleration
+
+    end = 20.0
+    found = solve_ivp(rate, (0.0, end), shaft.speed[0], max_step=STEP, rtol=1e-8, atol=1e-10)
+    assert found.y[0, -1] == pytest.approx(float(shaft.speed[round(end / STEP), 0]), rel=3e-6)
+    assert np.ptp(found.y[0]) > 1.0
 
 
 def test_the_load_is_coloured_as_stated() -> None:

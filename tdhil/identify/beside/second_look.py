@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+from tdhil.identify.bent.verdict import MODEL as BENT
 from tdhil.identify.beside.friction_curve import friction_curve
 from tdhil.identify.beside.friction_curve_points import Inertia
 from tdhil.identify.beside.second_opinion import disagreements, known_delay, reference_inertia, second_opinions
@@ -28,7 +29,8 @@ def with_second_look(
         curve = friction_curve(
             recording, samples, levels, Inertia(*inertia, delay=known_delay(recording, found)), options
         )
-        points, warnings = curve.points, (*warnings, *curve.warnings)
+        # where the bend is part of the model, J knows of it
+        points, warnings = curve.points, (*warnings, *(() if found.model == BENT else curve.warnings))
     return replace(found, second_opinions=opinions, friction_curve=points, warnings=warnings)
 
 

@@ -140,6 +140,11 @@ def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: fl
     return levels.direction * (torque - viscous * speed), float(np.sqrt(variance))
 
 
+def slope_over_speed(levels: Levels, values: FloatArray) -> float:
+    """Of ``values`` (N,) at the levels, weighted as their torques are for B."""
+    return _slope(levels.speed, values, levels.duration)
+
+
 def _steady_row(samples: Samples) -> tuple[float, ...] | None:
     """A level of the protocol: means, net acceleration, duration and middle of a stretch of steady speed."""
     if len(samples) < 16:

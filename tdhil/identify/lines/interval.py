@@ -30,19 +30,24 @@ def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
     return student_quantile(confidence, dof) * math.sqrt(excess_rise(fitted.problem, len(fitted.free)))
 
 
-def estimate(fitted: Fitted, index: int, confidence: float) -> Estimate:
-    """Value and interval of theta[index]; infinite on a side that the data leave open. Held: no width."""
+def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0) -> Estimate:
+    """Value and interval of theta[index]; infinite on a side that the data leave open. Held: no width.
+
+    ``behind``: by how much −2 ln L lies above that of another model's fit, to which this one is a rival.
+    """
     value = fitted.value(unit(fitted, index))
     if index in fitted.held:
         return Estimate(value, value, value)
     quantile = quantile_of(fitted, index, confidence)
-    seen = [value, *_edges(fitted, fitted.whole, fitted.held, index, quantile, 0.0)]
-    if fitted.first_order and fitted.simple is not fitted.whole and index not in fitted.simple_held:
+    if behind >= quantile**2:
+        return Estimate(value, value, value)
+    seen = [value, *_edges(fitted, fitted.whole, fitted.held, index, quantile, behind)]
+    if behind == 0.0 and fitted.first_order and fitted.simple is not fitted.whole and index not in fitted.simple_held:
         seen += _edges(fitted, fitted.simple, fitted.simple_held, index, 1.0, 0.0)
     for rival in fitted.rivals:
-        behind = rival.objective - fitted.whole.objective
-        if behind < quantile**2:
-            seen += _edges(fitted, rival, fitted.held, index, quantile, behind)
+        further = behind + rival.objective - fitted.whole.objective
+        if further < quantile**2:
+            seen += _edges(fitted, rival, fitted.held, index, quantile, further)
     return Estimate(value, min(seen), max(seen))
 
 

@@ -9,8 +9,12 @@ true lines and the true covariance concentrated out of the Gaussian likelihood
 
 M segments. This is a complex t-distribution: what the weights don't know is in its tails, and for ν → ∞ it is Σ 2q,
 a χ². It is a sum of squares of φ(q)·r/√v with φ² = 2(ν + M) ln(1 + q/ν)/q, smooth at q = 0, for least squares.
-The tie of B to the levels is a real t-distribution, (n + 1) ln(1 + z²/n); what is known of the lags is Gaussian.
+What acts on the shaft besides and doesn't go with the speed at the line, c N_s of a bent friction (`Load`), is taken
+off T̄_s first. The tie of B to the levels is a real t-distribution, (n + 1) ln(1 + z²/n); what is known of the lags is
+Gaussian.
 """
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +25,24 @@ from tdhil.identify.lines.spectrum import ComplexArray, Line
 from tdhil.record.recording import FloatArray
 
 
+@dataclass(frozen=True)
+class Load:
+    """Torque in proportion to theta[index]: N·m per its unit in every segment mean of every line, in their order."""
+
+    index: int
+    lines: ComplexArray
+
+
 class Likelihood:
     """−2 ln L of a model's theta (P,), a sum of squares."""
 
     def __init__(
-        self, lines: tuple[Line, ...], model: Model, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]
+        self,
+        lines: tuple[Line, ...],
+        model: Model,
+        tie: ViscousTie | None,
+        priors: tuple[GaussianPrior, ...],
+        load: Load | None = None,
     ) -> None:
         self.lines, self.model, self.tie, self.priors = lines, model, tie, priors
         self.s: ComplexArray = 2j * np.pi * np.array([line.hertz for line in lines])
@@ -38,6 +55,7 @@ class Likelihood:
         self.s_tw = np.array([line.s_tw for line in lines])
         self.nu = np.array([line.nu for line in lines])
         self.segments = np.array([float(len(line.speed)) for line in lines])
+        self._load = load
         self._of_line = np.equal.outer(np.arange(len(lines)), self.owner).astype(np.float64)
         known = (*priors, *model.plausible({prior.index for prior in priors}))
         self._prior_rows = np.zeros((len(known), model.size))
@@ -47,6 +65,13 @@ class Likelihood:
         self._prior_mean = np.array([prior.mean for prior in known])
         self._prior_sd = np.array([prior.sd for prior in known])
         self._tie_row = model.viscous_row + (tie.slope_per_inertia if tie is not None else 0.0) * model.inertia_row
+
+    def unloaded(self, theta: FloatArray) -> tuple[Line, ...]:
+        """The lines without the torque of the load."""
+        if self._load is None:
+            return self.lines
+        torque = self.torque - theta[self._load.index] * self._load.lines
+        return tuple(replace(line, torque=torque[self.owner == k]) for k, line in enumerate(self.lines))
 
     def variance(self, g: ComplexArray) -> FloatArray:
         """v_k of one period's equation error, (K,); floored where the cross term cancels all but rounding."""
@@ -58,9 +83,14 @@ class Likelihood:
         """√P r/√v of every segment and line, and q (K,)."""
         g = self.model.impedance(theta, self.s)
         root_v = np.sqrt(self.variance(g))
-        e: ComplexArray = (self.torque - g[self.owner] * self.speed) * self.root_periods / root_v[self.owner]
+        e: ComplexArray = self._error(theta, g) * self.root_periods / root_v[self.owner]
         q: FloatArray = self._of_line @ (e.real**2 + e.imag**2)
         return e, q
+
+    def _error(self, theta: FloatArray, g: ComplexArray) -> ComplexArray:
+        """The equation error of every segment and line."""
+        error: ComplexArray = self.torque - g[self.owner] * self.speed
+        return error if self._load is None else error - theta[self._load.index] * self._load.lines
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """A real vector whose sum of squares is −2 ln L."""
@@ -81,9 +111,9 @@ class Likelihood:
         )
         k = self.owner
         gain = self.root_periods / np.sqrt(v)[k]
-        e: ComplexArray = (self.torque - g[k] * self.speed) * gain
+        e: ComplexArray = self._error(theta, g) * gain
         q = self._of_line @ (e.real**2 + e.imag**2)
-        e_slopes = -(gain * self.speed)[:, None] * slopes[k] - e[:, None] * (v_slopes / (2.0 * v[:, None]))[k]
+        e_slopes = -gain[:, None] * self._by(slopes) - e[:, None] * (v_slopes / (2.0 * v[:, None]))[k]
         q_slopes = 2.0 * (self._of_line @ (e.conj()[:, None] * e_slopes).real)
         phi, phi_slope = self._phi(q)
         u = phi[k] * e
@@ -92,6 +122,13 @@ class Likelihood:
             np.concatenate([u.real, u.imag, self._prior_residuals(theta)]),
             np.concatenate([u_slopes.real, u_slopes.imag, self._prior_jacobian(theta)]),
         )
+
+    def _by(self, slopes: ComplexArray) -> ComplexArray:
+        """∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
+        found: ComplexArray = self.speed[:, None] * slopes[self.owner]
+        if self._load is not None:
+            found[:, self._load.index] += self._load.lines
+        return found
 
     def _phi(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q) and dφ/dq, (K,) each; by series where q/ν is small."""
@@ -134,15 +171,16 @@ class Likelihood:
     def information(self, theta: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, float]]]:
         """Fisher information (P, P), and its parts with the degrees of freedom of each part's weight.
 
-        Of a line: 2 Re Σ P |W̄|² ∂Gᴴ∂G / v · (ν − 1)/ν, since E 1/v̂ = ν/((ν − 1) v). Of the tie and priors: 1/sd².
+        Of a line: 2 Re Σ P ∂(G W̄)ᴴ∂(G W̄) / v · (ν − 1)/ν, since E 1/v̂ = ν/((ν − 1) v). Of the tie and priors: 1/sd².
         """
         g, slopes = self.model.impedance_jacobian(theta, self.s)
-        energy = self._of_line @ (np.abs(self.speed) * self.root_periods) ** 2
-        weight = 2.0 * energy / self.variance(g)
+        by = self._by(slopes) * self.root_periods[:, None]
+        weight = 2.0 / self.variance(g)
         parts: list[tuple[FloatArray, float]] = []
         for k in range(len(self.s)):
             shrink = max(self.nu[k] - 1.0, 0.5) / self.nu[k]
-            part: FloatArray = weight[k] * shrink * np.outer(slopes[k].conj(), slopes[k]).real
+            own = by[self.owner == k]
+            part: FloatArray = weight[k] * shrink * (own.conj().T @ own).real
             parts.append((part, 2.0 * float(self.nu[k])))
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
         if self.tie is not None:

@@ -18,8 +18,8 @@ from tdhil.identify.lines.structure import Fitted
 
 def fitted_points(fitted: Fitted, confidence: float) -> tuple[LinePoint, ...]:
     """The lines of a fit beside the likelier of its two answers."""
-    problem = fitted.problem
-    return line_points(problem.lines, problem.model.impedance(fitted.likelier.theta, problem.s), confidence)
+    problem, theta = fitted.problem, fitted.likelier.theta
+    return line_points(problem.unloaded(theta), problem.model.impedance(theta, problem.s), confidence)
 
 
 def line_points(lines: tuple[Line, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:

@@ -28,12 +28,15 @@ def rejects(test: ResidualTest | None) -> bool:
     return test is not None and not test.p_value >= REJECT_P
 
 
-def residual_of(fitted: Fitted) -> ResidualTest | None:
-    """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds."""
+def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:
+    """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds.
+
+    ``chosen``: how many more were, by a choice among models.
+    """
     theta, limits = fitted.whole.theta, fitted.limits
     near = _AT_BOUND * limits.scale
     inside = (theta > limits.low + near) & (theta < limits.high - near)
-    return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])))
+    return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])) + chosen)
 
 
 def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> ResidualTest | None:

@@ -1,0 +1,99 @@
+"""The verdict on a shaft whose friction bends over speed."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tdhil.identify.bent.fit import BentFit, Motion, fit_bends, inertia_of
+from tdhil.identify.identification import BudgetLine, Estimate, Identification
+from tdhil.identify.lines.budget import budget_of
+from tdhil.identify.lines.fit import Held, rigid_rivals
+from tdhil.identify.lines.friction import ViscousTie
+from tdhil.identify.lines.interval import estimate
+from tdhil.identify.lines.model import GaussianPrior
+from tdhil.identify.lines.profile import student_quantile
+from tdhil.identify.lines.residual import rejects
+from tdhil.identify.lines.rigid_result import RigidResult, lags_of
+from tdhil.identify.lines.shaft import INERTIA
+from tdhil.identify.options import Options
+from tdhil.identify.verdict import RIGID, Evidence, conclude
+from tdhil.record.recording import Recording
+
+MODEL = f"{RIGID}, bent friction"
+
+
+def identify_bent(
+    recording: Recording,
+    options: Options,
+    evidence: Evidence,
+    motion: Motion,
+    priors: tuple[GaussianPrior, ...],
+    held: Held,
+    rigid: RigidResult,
+) -> Identification | None:
+    """``rigid``, ``priors`` and ``held``: of the rigid shaft with straight friction, which the data contradict.
+
+    None where this one does no better, or leaves the inertia open.
+    """
+    tie = motion.tie
+    if tie is None or rigid_rivals(rigid.fitted.likelier.theta):
+        return None
+    try:
+        found = fit_bends(motion, priors, held, rigid)
+        if not found or found[0].residual is None or rejects(found[0].residual):
+            return None
+        result = _result(found, tie, options.confidence, recording.torque_scale_rel_sd)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return None
+    words = "a rigid shaft whose friction is no straight line over speed"
+    said = conclude(result, recording, options, evidence, tie, priors, words)
+    if said.inertia is None:
+        return None
+    against = rigid.residual.p_value if rigid.residual is not None else 0.0
+    return replace(
+        said,
+        model=MODEL,
+        reason=f"the residuals contradict straight friction (p = {against:.1g}); {said.reason}",
+        warnings=(*said.warnings, _told(found[0], motion)),
+    )
+
+
+def _result(found: list[BentFit], tie: ViscousTie, confidence: float, torque_scale_rel_sd: float) -> RigidResult:
+    """As of a rigid shaft; ``viscous`` is the slope of friction between the two mean speeds, Coulomb's is not told."""
+    best = found[0]
+    inertia = inertia_of(found, confidence)
+    speed_lag, torque_lag, skew = lags_of(best.fitted, confidence)
+    chord = tie.slope - tie.slope_per_inertia * inertia.value
+    half = student_quantile(confidence, tie.dof) * tie.sd
+    return RigidResult(
+        inertia=inertia,
+        viscous=Estimate(chord, chord - half, chord + half),
+        coulomb=None,
+        speed_lag_s=speed_lag,
+        torque_lag_s=torque_lag,
+        skew_s=skew,
+        residual=best.residual,
+        budget=_budget(best, inertia, confidence, torque_scale_rel_sd),
+        first_order=best.fitted.first_order,
+        fitted=best.fitted,
+    )
+
+
+def _budget(
+    best: BentFit, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+) -> tuple[BudgetLine, ...]:
+    """With a line more: what other shapes add."""
+    own = estimate(best.fitted, INERTIA, confidence)
+    *lines, scale = budget_of(best.fitted, own, confidence, torque_scale_rel_sd)
+    grown = math.sqrt(max((inertia.high - inertia.low) ** 2 - (own.high - own.low) ** 2, 0.0))
+    return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
+
+
+def _told(best: BentFit, motion: Motion) -> str:
+    width = best.bend.width_rad_s
+    shape = "with the square of speed" if width is None else f"by a bell of about {width:.2g} rad/s (Stribeck)"
+    return (
+        f"friction is no straight line over speed: it bends {shape}, which is allowed for; B is its slope between the "
+        f"mean speeds {', '.join(f'{wave.mean:.3g}' for wave in motion.waves)} rad/s"
+    )
