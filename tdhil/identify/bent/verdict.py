@@ -1,4 +1,8 @@
-"""The verdict on a shaft whose friction bends over speed."""
+"""The verdict on a shaft whose friction bends over speed.
+
+Its two parameters more, c and the bell's width, must lower −2 ln L by more than Schwarz's 2 ln n, as with the lags
+(`lines/structure.py`): a rigid shaft that is rejected by chance doesn't bend.
+"""
 
 import math
 from dataclasses import replace
@@ -21,6 +25,7 @@ from tdhil.identify.verdict import RIGID, Evidence, conclude
 from tdhil.record.recording import Recording
 
 MODEL = f"{RIGID}, bent friction"
+_MORE = 2      # parameters than with straight friction
 
 
 def identify_bent(
@@ -42,6 +47,8 @@ def identify_bent(
     try:
         found = fit_bends(motion, priors, held, rigid)
         if not found or found[0].residual is None or rejects(found[0].residual):
+            return None
+        if rigid.fitted.whole.objective - found[0].objective <= _MORE * math.log(found[0].fitted.problem.numbers):
             return None
         result = _result(found, tie, options.confidence, recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):

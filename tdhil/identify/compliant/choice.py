@@ -77,8 +77,7 @@ def choose(
     if _refuse_count(StringShaft(), lines, tie, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
     string = fit_compliant(StringShaft(), lines, tie, priors, held, two)
-    numbers = 2.0 * len(two.fitted.problem.owner) + len(priors) + (tie is not None)
-    better = two.fitted.whole.objective - string.fitted.whole.objective > math.log(numbers)
+    better = two.fitted.whole.objective - string.fitted.whole.objective > math.log(two.fitted.problem.numbers)
     if not rejects(two.residual) and not better:
         return Chosen(two, string, rejected=not plausible(two))
     return Chosen(string, rejected=rejects(string.residual) or not plausible(string))

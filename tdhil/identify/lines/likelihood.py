@@ -66,6 +66,11 @@ class Likelihood:
         self._prior_sd = np.array([prior.sd for prior in known])
         self._tie_row = model.viscous_row + (tie.slope_per_inertia if tie is not None else 0.0) * model.inertia_row
 
+    @property
+    def numbers(self) -> int:
+        """n: how many real numbers are fitted."""
+        return 2 * len(self.owner) + len(self.priors) + (self.tie is not None)
+
     def unloaded(self, theta: FloatArray) -> tuple[Line, ...]:
         """The lines without the torque of the load."""
         if self._load is None:

@@ -92,9 +92,8 @@ def fit_model(
             whole = found if found.objective < whole.objective else whole
     from_simple = minimise(problem, limits, simple.theta, held)
     whole = from_simple if from_simple.objective < whole.objective else whole
-    numbers = 2.0 * len(problem.owner) + len(problem.priors) + (problem.tie is not None)
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(held))
-    excess = gain - len(open_structure) * math.log(numbers)
+    excess = gain - len(open_structure) * math.log(problem.numbers)
     weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
     return Fitted(problem, limits, held, simple, whole, weight, others)
 
