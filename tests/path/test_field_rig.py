@@ -42,3 +42,18 @@ def test_the_default_excitation_finds_the_inertia(tmp_path, seed):
     assert inertia["high"] - inertia["low"] <= 0.03 * INERTIA
     # The same rig, by the paper's method on the same data, is several percent off, and the tool shows it.
     assert document["paper"]["inertia_kg_m2"] > 1.04 * INERTIA
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_rig_whose_friction_bends_over_speed_is_identified(tmp_path, seed):
+    """Stribeck's bell reaches well into the speed window: straight friction is contradicted, the inertia found."""
+    plant = tmp_path / "plant.yaml"
+    plant.write_text("plant: {friction: stribeck, static_nm: 100, stribeck_speed_rad_s: 3.0}\n", encoding="utf-8")
+    done = identify(tmp_path, "--simulate", "--seed", seed, "--plant", plant)
+    assert done.code == 0, done.err
+    document = done.document
+    inertia = document["inertia_kg_m2"]
+    assert document["model"] == "rigid+lags, bent friction"
+    assert inertia["low"] <= INERTIA <= inertia["high"]
+    assert abs(inertia["value"] / INERTIA - 1.0) <= 0.01
+    assert any("(Stribeck)" in text for text in document["warnings"])
