@@ -25,6 +25,7 @@ from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import Levels, ViscousTie, measure_levels, tie_viscous
 from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, unfiltered, with_skew
 from tdhil.identify.lines.model import GaussianPrior
+from tdhil.identify.lines.residual import contradicted
 from tdhil.identify.lines.rigid_result import RigidResult, fit_rigid
 from tdhil.identify.lines.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.identify.options import Options
@@ -88,6 +89,12 @@ def _identify(recording: Recording, options: Options) -> Identification:
     rigid = _Rigid()
     if options.model not in ("two-mass", "string"):
         rigid = _rigid(recording, options, evidence, lines, levels, tie)
+        weak = tuple(line for line in usable_lines(every, _LEAST_NU) if all(line is not one for one in lines))
+        if rigid.result is not None and contradicted(
+            rigid.result.fitted.problem, rigid.result.fitted.whole.theta, weak
+        ):
+            lines = usable_lines(every, _LEAST_NU)
+            rigid = replace(_rigid(recording, options, evidence, lines, levels, tie), doubted=options.model == "auto")
     found = rigid.said
     if found is None or rigid.doubted:
         found = _compliant(recording, options, evidence, usable_lines(every, _LEAST_NU), levels, tie, found)

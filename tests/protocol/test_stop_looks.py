@@ -186,3 +186,10 @@ def test_slowing():
     slowing.reset()
     assert slowing.see(40.0, 9.0)
     assert not slowing.see(41.0, float("nan"))
+
+
+def test_a_drive_that_can_not_be_looked_at_is_not():
+    looks = Looks(FakeDrive(), PERIOD_S)
+    assert looks.ask() is None
+    assert all(looks.missed() is None for _ in range(round(3.0 / PERIOD_S)))
+    assert (looks.answered, looks.standing) == (0, True)

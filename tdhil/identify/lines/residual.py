@@ -16,6 +16,7 @@ import numpy as np
 
 from tdhil.identify.identification import ResidualTest
 from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.lines.structure import Fitted
 from tdhil.record.recording import FloatArray
 
@@ -37,6 +38,23 @@ def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:
     near = _AT_BOUND * limits.scale
     inside = (theta > limits.low + near) & (theta < limits.high - near)
     return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])) + chosen)
+
+
+def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[Line, ...]) -> bool:
+    """Do lines that were not fitted contradict theta (P,)? For lines that were too weak in one signal.
+
+    A shaft that swings stands still at its antiresonance while the torque goes on: that line has no speed to speak of,
+    and says most. Each by itself, by Bartlett's form as above; theta is all but exact for lines as weak as these.
+    """
+    from scipy.stats import chi2
+
+    if not others:
+        return False
+    beside = Likelihood(others, problem.model, None, ())
+    _, q = beside.weighted(theta)
+    m, nu = beside.segments, beside.nu
+    p_values = chi2.sf((2.0 * nu + m - 1.0) * np.log1p(q / nu), 2.0 * m)
+    return bool(np.min(p_values) < REJECT_P / len(others))
 
 
 def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> ResidualTest | None:
