@@ -29,7 +29,7 @@ _STOP = (
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_looks.py",
 )
 SUBJECTS = {
-    "guard": ("test_guard.py",),
+    "guard": ("test_guard.py", "test_guard_prediction.py"),
     "stop": _STOP,
     "let_go": _STOP,
     "stop_patience": _STOP,
