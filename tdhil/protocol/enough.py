@@ -84,7 +84,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
 
     found = looked(seen)
     if found is None:
-        return Decision(0, "what was acquired can't be judged by its scatter", None, seen, rule.working(seen))
+        return _by_interval_alone(recording, rule, counted / segments, room, seen)
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"±{100.0 * found.half_width_now:.3g} %"
     if found.half_width_now > rule.tolerance / MARGIN:
         periods = more(found, LEAST_EXTENSION)
@@ -106,6 +106,26 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
     periods = max(more(again, half_as_much), min(room, half_as_much))
     why = f"{interval} instead of {asked}, as other lags are not excluded: {periods} more periods at each mean speed"
     return Decision(periods, why, found, seen + 1, rule.working(seen + 1), width)
+
+
+def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, room: int, seen: int) -> Decision:
+    """Where a rigid shaft with straight friction is not what the scatter is about; ``periods`` at each mean speed.
+
+    Friction that bends, or a shaft that swings, may still have an interval. Each that is looked at costs its share.
+    """
+    working = rule.working(seen)
+    width = interval_of(recording, working)
+    if not math.isfinite(width):
+        return Decision(0, "what was acquired can't be judged, and has no interval", None, seen, working)
+    asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
+    if width <= rule.tolerance:
+        return Decision(0, f"{now}: as tight as {asked}", None, seen, working, width)
+    wanted = math.ceil(periods * ((MARGIN * width / rule.tolerance) ** 2 - 1.0))
+    more = min(room, max(LEAST_EXTENSION, wanted))
+    if more < LEAST_EXTENSION:
+        return Decision(0, f"{now} instead of {asked}, and no time or look is left", None, seen, working, width)
+    why = f"{now} instead of {asked}: {more} more periods at each mean speed"
+    return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
 
 
 def _counted(recording: Recording) -> int:

@@ -131,9 +131,24 @@ def test_decisions(monkeypatch, interval, now, scale, then, looks, seen, left_s,
     assert found.interval in (None, interval)
 
 
-def test_what_can_t_be_judged_ends(monkeypatch):
+@pytest.mark.parametrize(("interval", "looks", "left_s", "periods", "after"), [
+    (0.008, 0, 400.0, 0, 0),
+    (0.011, 0, 900.0, 3, 1),              # six periods at ±1.1 %: (1.05·1.1)² − 1 = 0.334 times as many more
+    (0.0099999, 0, 900.0, 0, 0),
+    (0.010001, 0, 900.0, 2, 1),           # not worth the way for less
+    (0.100, 0, 900.0, 44, 1),             # what there is time for
+    (0.011, 4, 900.0, 0, 0),
+    (0.011, 0, 30.0, 0, 0),
+    (np.inf, 0, 900.0, 0, 0),
+])
+def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, interval, looks, left_s, periods, after):
     monkeypatch.setattr(enough_room, "look", lambda *_: None)
-    assert decide(recording(), RULE, PLAN, 400.0, 0, 0).periods == 0
+    monkeypatch.setattr(enough_room, "interval_of", lambda *_: interval)
+    found = decide(recording(), RULE, PLAN, left_s, looks, 0)
+    assert (found.periods, found.seen) == (periods, after)
+    assert found.working_confidence == RULE.working(after)
+    assert found.why
+    assert found.plain()["interval"] == (interval if np.isfinite(interval) else None)
 
 
 def test_all_looks_together_miss_no_more_than_asked():
