@@ -51,7 +51,7 @@ def with_stepping(found: Identification, recording: Recording, options: Options)
     verdict, reason, advice = found.verdict, found.reason, found.advice
     if verdict is Verdict.VALID and relative > options.tolerance:
         verdict = Verdict.VALID_WIDE
-        reason = f"{reason}, but the interval is ±{relative:.1%}, wider than ±{options.tolerance:.1%}"
+        reason = f"{reason}, but the interval is ±{relative:.2%}, wider than ±{options.tolerance:.2%}"
     note = f"torque is read once in {1e3 * stepped.period_s:.3g} ms, in step with the setpoint that moves the drive"
     warnings = found.warnings
     if half > 0.5 * (inertia.high - inertia.low):

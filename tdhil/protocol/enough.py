@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from statistics import NormalDist
 from typing import Any
 
 from tdhil.protocol.design.look import Look, interval_of, look
@@ -120,12 +121,17 @@ def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, roo
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
     if width <= rule.tolerance:
         return Decision(0, f"{now}: as tight as {asked}", None, seen, working, width)
-    wanted = math.ceil(periods * ((MARGIN * width / rule.tolerance) ** 2 - 1.0))
+    stricter = _quantile(rule.working(seen + 1)) / _quantile(working)
+    wanted = math.ceil(periods * ((MARGIN * stricter * width / rule.tolerance) ** 2 - 1.0))
     more = min(room, max(LEAST_EXTENSION, wanted))
     if more < LEAST_EXTENSION:
         return Decision(0, f"{now} instead of {asked}, and no time or look is left", None, seen, working, width)
     why = f"{now} instead of {asked}: {more} more periods at each mean speed"
     return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
+
+
+def _quantile(confidence: float) -> float:
+    return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
 
 
 def _counted(recording: Recording) -> int:

@@ -133,12 +133,12 @@ def test_decisions(monkeypatch, interval, now, scale, then, looks, seen, left_s,
 
 @pytest.mark.parametrize(("interval", "looks", "left_s", "periods", "after"), [
     (0.008, 0, 400.0, 0, 0),
-    (0.011, 0, 900.0, 3, 1),              # six periods at ±1.1 %: (1.05·1.1)² − 1 = 0.334 times as many more
+    (0.011, 0, 900.0, 8, 1),              # six periods at ±1.1 %: (1.05·1.1·1.291)² − 1 = 1.22 times as many more
     (0.0099999, 0, 900.0, 0, 0),
-    (0.010001, 0, 900.0, 2, 1),           # not worth the way for less
+    (0.010001, 0, 900.0, 6, 1),           # the next interval that is looked at has a wider quantile
     (0.100, 0, 900.0, 44, 1),             # what there is time for
     (0.011, 4, 900.0, 0, 0),
-    (0.011, 0, 30.0, 0, 0),
+    (0.011, 0, 50.0, 0, 0),               # no time for two
     (np.inf, 0, 900.0, 0, 0),
 ])
 def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, interval, looks, left_s, periods, after):

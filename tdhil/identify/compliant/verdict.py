@@ -132,7 +132,7 @@ def _words(fit: CompliantFit, rigid: Identification | None, relative: float, opt
     if relative <= options.tolerance:
         return reason, "identical filters on reported speed and torque, or known ones, would sharpen this further"
     if math.isfinite(relative):
-        reason += f", but the interval is ±{relative:.1%}, wider than ±{options.tolerance:.1%}"
+        reason += f", but the interval is ±{relative:.2%}, wider than ±{options.tolerance:.2%}"
     return reason, "state the drive's speed and torque filters, or excite with more amplitude above the resonance"
 
 

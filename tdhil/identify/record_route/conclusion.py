@@ -89,7 +89,7 @@ def _words(verdict: Verdict, solved: Solved, options: Options, relative: float) 
         "noise": "change the speed more often or by more, or record for longer",
         "friction model": "run at more speeds, so that friction is told from them",
     }.get(most, "state the filters of the drive's reported speed and torque with their uncertainty, or set them equal")
-    return f"{fits}, but the interval is ±{relative:.1%}, wider than ±{options.tolerance:.1%}", advice
+    return f"{fits}, but the interval is ±{relative:.2%}, wider than ±{options.tolerance:.2%}", advice
 
 
 def _caveats(solved: Solved) -> tuple[str, ...]:
