@@ -59,7 +59,8 @@ class BentFit:
 
 def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, rigid: RigidResult) -> list[BentFit]:
     """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``held``: as rigid."""
-    start = rigid.fitted.likelier.theta
+    # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
+    start = rigid.fitted.simple.theta
     speeds = [wave.over_period(start[_RIGID:]) for wave in motion.waves]
     ways = {float(np.sign(wave.mean)) for wave in motion.waves}
     slowest = min(float(np.min(speed * np.sign(wave.mean))) for speed, wave in zip(speeds, motion.waves, strict=True))

@@ -42,7 +42,7 @@ def identify_bent(
     None where this one does no better, or leaves the inertia open.
     """
     tie = motion.tie
-    if tie is None or rigid_rivals(rigid.fitted.likelier.theta):
+    if tie is None or rigid_rivals(rigid.fitted.simple.theta):
         return None
     try:
         found = fit_bends(motion, priors, held, rigid)
