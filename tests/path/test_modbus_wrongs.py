@@ -148,10 +148,13 @@ def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, 
     profile, trace = load_modbus_profile(name), tmp_path / "shaft.csv"
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", *profile.below("unverified")} - asked
-    done = identify(tmp_path, "--simulate", "--real-time", "--yes", "--profile", name, "--trace", trace,
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, "
+                   "quick_stop_rad_s2: 2.0, probe_torque_nm: 150.0, probe_travel_rad: 3.0}\n", encoding="utf-8")
+    done = identify(tmp_path, "--simulate", "--real-time", "--yes", "--profile", name, "--trace", trace, "--rig", rig,
                     *(f"--accept-unverified={one}" for one in others))
     assert done.code == 4, done.err
-    assert all(f"{one} (unverified): no register shows" in done.err for one in asked)
+    assert all(f"{one} (unverified): no register shows" in done.err for one in asked), done.err
     assert not any(frame.outgoing and frame.data[0] in (5, 6, 15, 16, 22, 23) for frame in read_frames(done.log))
     Shaft.read(trace).assert_enabled(False)
 
