@@ -86,18 +86,19 @@ def _identify(recording: Recording, options: Options) -> Identification:
     if len(lines) < len(every):
         warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
     evidence = Evidence(paper, periods, used, warnings)
+    usable = usable_lines(every, _LEAST_NU)
     rigid = _Rigid()
     if options.model not in ("two-mass", "string"):
         rigid = _rigid(recording, options, evidence, lines, levels, tie)
-        weak = tuple(line for line in usable_lines(every, _LEAST_NU) if all(line is not one for one in lines))
+        weak = tuple(line for line in usable if all(line is not one for one in lines))
         if rigid.result is not None and contradicted(
             rigid.result.fitted.problem, rigid.result.fitted.whole.theta, weak
         ):
-            lines = usable_lines(every, _LEAST_NU)
+            lines = usable
             rigid = replace(_rigid(recording, options, evidence, lines, levels, tie), doubted=options.model == "auto")
     found = rigid.said
     if found is None or rigid.doubted:
-        found = _compliant(recording, options, evidence, usable_lines(every, _LEAST_NU), levels, tie, found)
+        found = _compliant(recording, options, evidence, usable, levels, tie, found)
     if found.verdict is Verdict.MODEL_REJECTED and rigid.result is not None and options.model in ("auto", "rigid"):
         waves = tuple(wave_of(fit, one.segment) for fit, one in zip(fits, cut, strict=True) if len(fit.speed))
         bent = Motion(waves, levels, lines, tie_viscous(levels))
