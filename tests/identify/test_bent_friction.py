@@ -14,7 +14,7 @@ from tdhil.identify import Options, identify
 from tdhil.identify.bent.bends import Bend, bends
 from tdhil.identify.bent.shaft import BEND, BentShaft
 from tdhil.identify.bent.verdict import MODEL
-from tdhil.identify.bent.wave import Wave, filters
+from tdhil.identify.bent.wave import Wave
 from tdhil.identify.identification import Verdict
 from tdhil.identify.lines import reports
 from tdhil.identify.lines.likelihood import Likelihood, Load
@@ -31,7 +31,7 @@ FIRST_ORDER = np.array([0.4, 0.0, 0.15, 0.0, 0.0, 0.02])
 @given(PHI)
 def test_the_two_filters_have_the_ratio_that_the_lines_show(phi):
     s = 2j * np.pi * np.array(LINES)
-    speed, torque = filters(phi, s)
+    speed, torque = reports.filters(phi, s)
     assert np.allclose(torque / speed, np.exp(reports.log_ratio(phi, s)), rtol=1e-12)
 
 

@@ -24,7 +24,7 @@ class Bend:
     width_rad_s: float | None
 
     def over(self, speed: FloatArray) -> FloatArray:
-        """G at speeds of any shape (rad/s)."""
+        """The shape g at speeds (rad/s)."""
         if self.width_rad_s is None:
             parabola: FloatArray = speed * np.abs(speed)
             return parabola

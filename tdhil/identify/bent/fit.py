@@ -84,9 +84,8 @@ def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, rig
     return sorted(found, key=lambda one: one.objective)
 
 
-def inertia_of(found: Sequence[BentFit], confidence: float) -> Estimate:
-    """The best shape's, with an interval that holds whatever the others leave open. ``found``: the best first."""
-    best = estimate(found[0].fitted, INERTIA, confidence)
+def inertia_of(found: Sequence[BentFit], best: Estimate, confidence: float) -> Estimate:
+    """``best``, the best shape's, with an interval that holds whatever the others leave open. ``found``: it first."""
     rise = quantile_of(found[0].fitted, INERTIA, confidence) ** 2
     low, high = [best.low], [best.high]
     for one in found[1:]:

@@ -69,7 +69,8 @@ def identify_bent(
 def _result(found: list[BentFit], tie: ViscousTie, confidence: float, torque_scale_rel_sd: float) -> RigidResult:
     """As of a rigid shaft; ``viscous`` is the slope of friction between the two mean speeds, Coulomb's is not told."""
     best = found[0]
-    inertia = inertia_of(found, confidence)
+    own = estimate(best.fitted, INERTIA, confidence)
+    inertia = inertia_of(found, own, confidence)
     speed_lag, torque_lag, skew = lags_of(best.fitted, confidence)
     chord = tie.slope - tie.slope_per_inertia * inertia.value
     half = student_quantile(confidence, tie.dof) * tie.sd
@@ -81,17 +82,16 @@ def _result(found: list[BentFit], tie: ViscousTie, confidence: float, torque_sca
         torque_lag_s=torque_lag,
         skew_s=skew,
         residual=best.residual,
-        budget=_budget(best, inertia, confidence, torque_scale_rel_sd),
+        budget=_budget(best, own, inertia, confidence, torque_scale_rel_sd),
         first_order=best.fitted.first_order,
         fitted=best.fitted,
     )
 
 
 def _budget(
-    best: BentFit, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+    best: BentFit, own: Estimate, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
-    """With a line more: what other shapes add."""
-    own = estimate(best.fitted, INERTIA, confidence)
+    """Of the best shape's ``own`` interval, with a line more: what other shapes add to it."""
     *lines, scale = budget_of(best.fitted, own, confidence, torque_scale_rel_sd)
     grown = math.sqrt(max((inertia.high - inertia.low) ** 2 - (own.high - own.low) ** 2, 0.0))
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)

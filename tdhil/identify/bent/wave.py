@@ -14,6 +14,7 @@ seen in the first term; the second is a correction, for which the filters that f
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,45 +35,31 @@ class Wave:
     mean: float
     period_s: float
 
-    @property
-    def _turns(self) -> FloatArray:
-        """Cycles of each line in a period, (K,) whole numbers."""
-        return np.round(np.asarray(self.lines_hz) * self.period_s)
+    @cached_property
+    def _s(self) -> ComplexArray:
+        """(K,)."""
+        return 2j * math.pi * np.asarray(self.lines_hz)
 
-    def _angles(self) -> FloatArray:
-        """(N, K)."""
-        turns = self._turns
+    @cached_property
+    def _turned(self) -> ComplexArray:
+        """e^(jω_k t_n), (N, K): each line makes a whole number of turns in a period."""
+        turns = np.round(np.asarray(self.lines_hz) * self.period_s)
         count = _POINTS * int(max(turns.max(), 1.0))
-        angles: FloatArray = 2.0 * math.pi / count * np.multiply.outer(np.arange(count), turns)
-        return angles
+        turned: ComplexArray = np.exp(2j * math.pi / count * np.multiply.outer(np.arange(count), turns))
+        return turned
 
     def over_period(self, phi: FloatArray) -> FloatArray:
         """The shaft's own speed behind the report ``phi`` (6,) (`reports`), (N,) rad/s."""
-        s = 2j * math.pi * np.asarray(self.lines_hz)
-        true = self.speed / filters(phi, s)[0]
-        angles = self._angles()
-        found: FloatArray = self.mean + np.cos(angles) @ true.real - np.sin(angles) @ true.imag
+        found: FloatArray = self.mean + (self._turned @ (self.speed / reports.filters(phi, self._s)[0])).real
         return found
 
     def through(self, bend: Bend, phi: FloatArray) -> tuple[ComplexArray, float]:
         """F_T G (K,) and ḡ."""
         torque = bend.over(self.over_period(phi))
-        angles = self._angles()
-        lines = (torque @ np.cos(angles) - 1j * (torque @ np.sin(angles))) * (2.0 / len(torque))
-        s = 2j * math.pi * np.asarray(self.lines_hz)
-        return filters(phi, s)[1] * lines, float(torque.mean())
+        lines = torque @ self._turned.conj() * (2.0 / len(torque))
+        return reports.filters(phi, self._s)[1] * lines, float(torque.mean())
 
 
 def wave_of(fit: PeriodLines, segment: Segment) -> Wave:
     """Of all its periods together."""
     return Wave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
-
-
-def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """F_w and F_T, (K,) each; ``phi`` (6,) as in `reports`, whose ratio F_T/F_w these have."""
-    x, y = phi[reports.SPEED_LAG] * s, phi[reports.TORQUE_LAG] * s
-    speed = 1.0 / (1.0 + x + phi[reports.SPEED_SHAPE] * x * x)
-    torque = np.exp(-phi[reports.SKEW] * s) / (1.0 + y + phi[reports.TORQUE_SHAPE] * y * y)
-    u = float(phi[reports.AVERAGE])
-    average = np.sinc(np.abs(s) * math.sqrt(abs(u)) / (2.0 * math.pi))
-    return (speed, torque * average) if u > 0.0 else (speed * average, torque)

@@ -75,8 +75,11 @@ class Likelihood:
         """The lines without the torque of the load."""
         if self._load is None:
             return self.lines
-        torque = self.torque - theta[self._load.index] * self._load.lines
+        torque = self._unloaded(theta)
         return tuple(replace(line, torque=torque[self.owner == k]) for k, line in enumerate(self.lines))
+
+    def _unloaded(self, theta: FloatArray) -> ComplexArray:
+        return self.torque if self._load is None else self.torque - theta[self._load.index] * self._load.lines
 
     def variance(self, g: ComplexArray) -> FloatArray:
         """v_k of one period's equation error, (K,); floored where the cross term cancels all but rounding."""
@@ -94,8 +97,8 @@ class Likelihood:
 
     def _error(self, theta: FloatArray, g: ComplexArray) -> ComplexArray:
         """The equation error of every segment and line."""
-        error: ComplexArray = self.torque - g[self.owner] * self.speed
-        return error if self._load is None else error - theta[self._load.index] * self._load.lines
+        error: ComplexArray = self._unloaded(theta) - g[self.owner] * self.speed
+        return error
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """A real vector whose sum of squares is −2 ln L."""

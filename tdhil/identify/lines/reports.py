@@ -55,6 +55,16 @@ def log_ratio(phi: FloatArray, s: ComplexArray) -> ComplexArray:
     return ratio
 
 
+def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is that of `log_ratio`."""
+    x, y = phi[SPEED_LAG] * s, phi[TORQUE_LAG] * s
+    speed = 1.0 / (1.0 + x + phi[SPEED_SHAPE] * x * x)
+    torque = np.exp(-phi[SKEW] * s) / (1.0 + y + phi[TORQUE_SHAPE] * y * y)
+    u = float(phi[AVERAGE])
+    average = np.sinc(np.abs(s) * np.sqrt(abs(u)) / (2.0 * np.pi))
+    return (speed, torque * average) if u > 0.0 else (speed * average, torque)
+
+
 def log_ratio_jacobian(phi: FloatArray, s: ComplexArray) -> ComplexArray:
     """∂ ln F_T/F_w / ∂phi, (K, 6).
 
