@@ -103,12 +103,12 @@ class FrictionPoint:
 class Compliant:
     """A shaft that is not rigid: what turns behind the spring, kg·m², N·m/rad, N·m·s/rad, Hz.
 
-    ``total_inertia`` is J_r + J_L, known even where the two can't be told apart. A quantity that the data leave open is
-    None. ``antiresonance_hz``: √(k/J_L)/2π, where the load swings and torque hardly moves the motor; ``resonance_hz``:
-    where little torque moves both much.
+    ``total_inertia`` is J_r + J_L, known even where the two can't be told apart, if only from one side: then it is as
+    wide as it is. A quantity that the data leave open is None. ``antiresonance_hz``: √(k/J_L)/2π, where the load swings
+    and torque hardly moves the motor; ``resonance_hz``: where little torque moves both much.
     """
 
-    total_inertia: Estimate
+    total_inertia: Estimate | None
     load_inertia: Estimate | None
     stiffness_nm_rad: Estimate | None
     damping_nm_s_rad: Estimate | None

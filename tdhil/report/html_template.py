@@ -24,8 +24,9 @@ figure { margin: .5rem 0 } figcaption { color: #555; max-width: 54rem }
 <div class="answer {{ colour }}">
 {% if d.inertia_kg_m2 %}{% set j = d.inertia_kg_m2 %}
 <p class="big">{{ "J_r" if d.compliant else "J" }} = {{ interval(j, "kg·m²") }}</p>
-{% if d.compliant %}<p class="half">of a compliant shaft's motor side; J_r + J_L = \
-{{ interval(d.compliant.total_inertia_kg_m2, "kg·m²") }}</p>{% endif %}
+{% if d.compliant %}<p class="half">of a compliant shaft's motor side; J_r + J_L \
+{% if d.compliant.total_inertia_kg_m2 %}= {{ interval(d.compliant.total_inertia_kg_m2, "kg·m²") }}\
+{% else %}left open by the data{% endif %}</p>{% endif %}
 <p class="half">{{ percent(0.5 * (j.high - j.low), j.value) }} at {{ "%g"|format(100 * j.confidence) }} %, if the
 drive's torque is right; with its torque scale's uncertainty \
 {{ interval({"value": j.value, "low": j.low_total, "high": j.high_total}, "kg·m²") }}</p>

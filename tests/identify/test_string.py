@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compliant_bench import Pipe, run
+from compliant_bench import Noise, Pipe, TwoMass, run
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from test_two_mass import KNOWN, MILD, S, parameters
@@ -13,6 +13,7 @@ from test_two_mass import KNOWN, MILD, S, parameters
 from tdhil.identify import Verdict, identify
 from tdhil.identify.compliant.string_shaft import StringShaft, resonances
 from tdhil.identify.compliant.two_mass import TwoMassShaft
+from tdhil.record.recording import LagPrior
 
 few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.generate])
 
@@ -35,8 +36,6 @@ def test_impedance_is_that_of_the_waves(share, k, b, hz):
 
 
 def test_a_string_that_weighs_nothing_is_a_spring():
-    from compliant_bench import TwoMass
-
     m = parameters(TwoMass())
     assert np.allclose(StringShaft().impedance(np.append(m, 0.0), S), TwoMassShaft().impedance(m, S), rtol=1e-12)
     near, far = (StringShaft().impedance(np.append(m, share), S) for share in (1e-9, 1e-6))
@@ -78,3 +77,19 @@ def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
         seen = np.sum(turn.real * turn.conj()) / np.sum(speed * turn.conj())
         late = cmath.exp(1j * np.pi * hz * 0.01)       # torque is held over a step, speed is read at its beginning
         assert seen / late == pytest.approx(pipe.impedance(hz), rel=0.01)
+
+
+@pytest.mark.parametrize("seed", (2, 17))
+def test_a_string_must_gain_more_than_chance_gives(seed):
+    """A spring that weighs nothing, where scatter speaks for a weight: two masses stand, with intervals that hold what
+    a string would say. In the first J_r + J_L is open above; J_r is told all the same."""
+    plant = TwoMass()
+    wrong = 1.0 + 0.01 * np.random.default_rng([seed, 1]).standard_normal(2)
+    known = LagPrior(0.40 * wrong[0], 0.004, 0.15 * wrong[1], 0.0015, "the manual")
+    found = identify(run(plant, [seed], noise=Noise(), lag_prior=known, lags_s=(0.40, 0.15), settle=4)[0])
+    assert found.model == "two-mass", found.reason
+    assert found.inertia.value == pytest.approx(plant.motor, rel=0.01)
+    assert found.inertia.low <= plant.motor <= found.inertia.high
+    assert "the motor turns a spring or a uniform string" in found.inertia.conditional_on
+    open_above = any("J_r + J_L is left open" in warning for warning in found.warnings)
+    assert open_above == (seed == 2)

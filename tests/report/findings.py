@@ -71,10 +71,12 @@ def bare():
 
 
 def open_sided():
-    """Estimates whose intervals are open."""
+    """Estimates whose intervals are open, or open to the point of none."""
+    everything = full()
     return replace(
-        full(), verdict=Verdict.VALID_WIDE, speed_lag_s=Estimate(0.4, 0.1, float("inf")),
+        everything, verdict=Verdict.VALID_WIDE, speed_lag_s=Estimate(0.4, 0.1, float("inf")),
         skew_s=Estimate(0.0, -float("inf"), float("inf")),
+        compliant=replace(everything.compliant, total_inertia=None),
     )
 
 

@@ -1,6 +1,7 @@
 """The result card: eighty columns, every part where there is one, nothing invented where there is none."""
 
 import io
+import re
 
 import pytest
 from findings import bare, full, open_sided, recording
@@ -42,6 +43,7 @@ def test_open_sides_are_said():
     card = shown(open_sided())
     assert "0.4 s, open on one side" in card
     assert "0 s, open on both sides" in card
+    assert re.search(r"J_r \+ J_L +left open by the data", card)
 
 
 def test_a_refusal_shows_nothing_that_is_not_there():

@@ -85,6 +85,7 @@ def test_a_refusal_has_no_number_and_no_banner_on_a_real_drive():
 
 def test_open_sides_are_open():
     assert page(open_sided()).count("<td>open</td>") == 3
+    assert "J_r + J_L left open by the data" in page(open_sided())
 
 
 def test_the_same_result_is_the_same_file(tmp_path):

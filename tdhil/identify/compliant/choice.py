@@ -3,10 +3,12 @@
 Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
 shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
 wave's frequency 1/T, tells. So where two masses explain the data, J_r and J_L are theirs, but their intervals hold
-whatever string the data do not contradict (`compliant_result.py`); J_r + J_L is the same in both. Only who says
+whatever string the data do not contradict (`result.py`); J_r + J_L is the same in both. Only who says
 ``--model two-mass`` takes the spring's weight for nothing.
 
-One parameter more must lower −2 ln L by more than Schwarz's ln n to be preferred, as with lags (`structure.py`).
+So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up too
+early: the string must gain what would be as unlikely by chance as residuals that reject a model (χ²(1); half of that
+at the bound η = 0).
 """
 
 import math
@@ -21,7 +23,7 @@ from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.model import GaussianPrior
-from tdhil.identify.lines.residual import rejects
+from tdhil.identify.lines.residual import REJECT_P, rejects
 from tdhil.identify.lines.rigid_result import RigidResult
 from tdhil.identify.lines.shaft import INERTIA
 from tdhil.identify.lines.spectrum import Line
@@ -77,10 +79,16 @@ def choose(
     if _refuse_count(StringShaft(), lines, tie, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
     string = fit_compliant(StringShaft(), lines, tie, priors, held, two)
-    better = two.fitted.whole.objective - string.fitted.whole.objective > math.log(two.fitted.problem.numbers)
-    if not rejects(two.residual) and not better:
+    if not rejects(two.residual) and not _outdoes(string, two):
         return Chosen(two, string, rejected=not plausible(two))
     return Chosen(string, rejected=rejects(string.residual) or not plausible(string))
+
+
+def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
+    """Does the string gain more on two masses, by its one parameter, than chance gives?"""
+    from scipy.stats import chi2
+
+    return bool(two.fitted.whole.objective - string.fitted.whole.objective > chi2.isf(REJECT_P, 1))
 
 
 def may_swing(

@@ -34,10 +34,13 @@ class CompliantResult:
     budget: tuple[BudgetLine, ...]
 
 
-def bounded(one: Estimate) -> bool:
+def bounded(one: Estimate | None) -> bool:
     """Does the interval say anything?"""
-    finite = all(math.isfinite(x) for x in (one.value, one.low, one.high))
-    return finite and one.value > 0.0 and 0.5 * (one.high - one.low) <= _OPEN * one.value
+    return one is not None and _finite(one) and one.value > 0.0 and 0.5 * (one.high - one.low) <= _OPEN * one.value
+
+
+def _finite(one: Estimate) -> bool:
+    return all(math.isfinite(x) for x in (one.value, one.low, one.high))
 
 
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
@@ -48,7 +51,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     return CompliantResult(
         inertia=held.inertia,
         shaft=Compliant(
-            total_inertia=held.total,
+            total_inertia=held.total if _finite(held.total) else None,
             load_inertia=_unless_open(held.load),
             stiffness_nm_rad=_unless_open(held.stiffness),
             damping_nm_s_rad=None if chosen.fit.is_string else _unless_open(held.damping),

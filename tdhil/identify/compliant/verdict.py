@@ -52,7 +52,7 @@ def identify_compliant(
         found = result_of(chosen, levels, options.confidence, recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return rigid or _refused(_open(), evidence)
-    if not bounded(found.shaft.total_inertia):
+    if not bounded(found.shaft.total_inertia) and not bounded(found.inertia):
         # a rigid shaft that is only doubted gives a number, which would be wrong: see `may_swing`
         return rigid if rigid is not None and rigid.inertia is None else _refused(_open(), evidence)
     return _stands(chosen, found, recording, options, evidence, rigid)
@@ -79,11 +79,7 @@ def _stands(
     reason, advice = _words(fit, rigid, relative, options)
     if inertia is None:
         verdict = Verdict.NOT_IDENTIFIABLE
-        total = found.shaft.total_inertia
-        reason += (
-            f", but the motor's inertia can't be told from the load's; together they are {total.value:.4g} kg·m² "
-            f"({total.low:.4g} to {total.high:.4g})"
-        )
+        reason += f", but the motor's inertia can't be told from the load's{_together(found.shaft.total_inertia)}"
         advice = "excite lines on both sides of the resonance, and well above it, where the motor turns alone"
     return Identification(
         verdict=verdict,
@@ -105,6 +101,12 @@ def _stands(
         compliant=found.shaft,
         lines=fitted_points(fit.fitted, options.confidence),
     )
+
+
+def _together(total: Estimate | None) -> str:
+    if total is None:
+        return ""
+    return f"; together they are {total.value:.4g} kg·m² ({total.low:.4g} to {total.high:.4g})"
 
 
 def name_of(fit: CompliantFit) -> str:
@@ -138,6 +140,8 @@ def _words(fit: CompliantFit, rigid: Identification | None, relative: float, opt
 
 def _caveats(fit: CompliantFit, found: CompliantResult) -> tuple[str, ...]:
     said = ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
+    if not bounded(found.shaft.total_inertia):
+        said.append("J_r + J_L is left open on one side: a slower line, well below the resonance, would show it")
     hertz = [line.hertz for line in fit.fitted.problem.lines]
     for name, one in (("resonance", found.shaft.resonance_hz), ("antiresonance", found.shaft.antiresonance_hz)):
         if one is not None and min(hertz) <= one.value <= max(hertz):
