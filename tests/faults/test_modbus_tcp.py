@@ -27,6 +27,8 @@ TURNING_RAD_S = 0.3
 QUICK_STOP_RAD_S2 = 2.0
 LATE_S = 0.3
 """A machine that is busy with other tests looks at its watchdog late."""
+RATE_HZ = 4.0
+"""Slow for the same reason: three cycles without feedback end a run."""
 
 
 class Relay(threading.Thread):
@@ -92,7 +94,7 @@ class Bench:
         (self.folder / "rig.yaml").write_text(RIG)
         self.host = self.stack.enter_context(process(
             sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 10, "--rig", self.folder / "rig.yaml", "--log", self.log,
+            "--rate", RATE_HZ, "--rig", self.folder / "rig.yaml", "--log", self.log,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=self.folder,
         ))
 
