@@ -1,6 +1,6 @@
 """Where to begin: rough sizes, and linear least squares for shafts behind first-order lags; then the best of many."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from tdhil.record.recording import FloatArray
 _STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
 _SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
 _PROPOSALS = 3
+_NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
 
 Held = dict[int, float]
 
@@ -34,12 +35,41 @@ def rough_inertia_of(problem: Likelihood) -> float:
 
 
 def minimise(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
-    """One descent; the parameters in ``held`` keep the value that stands there."""
+    """A descent, and another from beside a lag of zero; the parameters in ``held`` keep the value that stands there.
+
+    At no lag at all descents stand still, a minimum or not: a short lag whose delay the skew takes back is felt through
+    its square only, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and the slope of that is zero at τ = 0.
+    """
+    fit = _descent(problem, limits, start, held)
+    for begin in _beside_no_lag(problem, fit.theta, held):
+        other = _descent(problem, limits, begin, held)
+        fit = other if other.objective < fit.objective else fit
+    return fit
+
+
+def _descent(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
     free = np.ones(len(start), dtype=np.bool_)
     begin = np.array(start, dtype=np.float64)
     for index, value in held.items():
         free[index], begin[index] = False, value
     return descend(problem.linearised, problem.residuals, begin, free, limits)
+
+
+def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterator[FloatArray]:
+    """Starts with a lag of some size instead of hardly any, and the skew that makes up for its delay."""
+    at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
+    if at(reports.SKEW) in held:
+        return
+    for lag, shape, sign in (
+        (reports.SPEED_LAG, reports.SPEED_SHAPE, 1.0), (reports.TORQUE_LAG, reports.TORQUE_SHAPE, -1.0)
+    ):
+        if at(lag) in held or theta[at(lag)] * fastest > _NO_LAG:
+            continue
+        begin = theta.copy()
+        begin[at(lag)] = _SOME_LAG / fastest
+        begin[at(shape)] = 0.0
+        begin[at(reports.SKEW)] += sign * (begin[at(lag)] - theta[at(lag)])
+        yield begin
 
 
 def best_fit(problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray]) -> Fit:
