@@ -14,6 +14,8 @@ from tdhil.identify.record_route.stretches import runs, thinned
 from tdhil.identify.record_route.tapers import flat_top
 from tdhil.identify.samples import usable_samples
 from tdhil.record.recording import LagPrior
+from tdhil.study import coverage_plants
+from tdhil.study.coverage_simulator import simulate as simulate_plan
 
 
 def found(recording, **options):
@@ -168,3 +170,18 @@ def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, 
     assert refused.inertia is None
     assert said in refused.reason
     assert refused.advice
+
+
+def test_what_stands_beside_a_line_need_not_stand_clear():
+    """A multisine that nobody declared, in much noise: just above its last line the speed is what noise makes of it.
+    Bins there had counted as clear for their neighbours' sake, and spoken against the model."""
+    plant = coverage_plants.CoveragePlant(
+        "lines", "noise of 3 % of the torque limit", 178.0, 5.0, 30.0, (1.0, 11.7), 435.0,
+        coverage_plants.Report((0.06, 0.04)), coverage_plants.Report((0.03,)),
+        coverage_plants.Noise(5.5, 1.0, 14.0, 0.037, 0.0075, 3.5, 0.01, 1.0),
+        coverage_plants.Reading(jitter_s=0.001), lowest_hz=0.2,
+    )
+    for recording in simulate_plan(plant, [(1, 2, 0), (1, 2, 1)], 20):
+        got = found(replace(recording, excitation=None))
+        assert got.verdict in (Verdict.VALID, Verdict.VALID_WIDE), got.reason
+        assert got.inertia.low <= plant.inertia_kg_m2 <= got.inertia.high

@@ -26,13 +26,16 @@ class Noise:
     count: FloatArray
 
 
-def smoothed(hertz: FloatArray, power: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of ``power`` over neighbouring frequencies, and over how many; (M,) each, any order."""
+def smoothed(hertz: FloatArray, power: FloatArray, width: float = _WIDTH) -> tuple[FloatArray, FloatArray]:
+    """Mean of ``power`` over neighbouring frequencies, and over how many; (M,) each, any order.
+
+    ``width``: how far neighbours reach, of the frequency; for what is as smooth as noise, unless told otherwise.
+    """
     order = np.argsort(hertz, kind="stable")
     f = hertz[order]
     rank = np.arange(len(f))
-    first = np.minimum(np.searchsorted(f, f * (1.0 - _WIDTH), side="left"), rank - _NEIGHBOURS)
-    last = np.maximum(np.searchsorted(f, f * (1.0 + _WIDTH), side="right"), rank + _NEIGHBOURS + 1)
+    first = np.minimum(np.searchsorted(f, f * (1.0 - width), side="left"), rank - _NEIGHBOURS)
+    last = np.maximum(np.searchsorted(f, f * (1.0 + width), side="right"), rank + _NEIGHBOURS + 1)
     first, last = np.maximum(first, 0), np.minimum(last, len(f))
     total = np.concatenate([[0.0], np.cumsum(power[order])])
     mean, count = np.empty(len(f)), np.empty(len(f))

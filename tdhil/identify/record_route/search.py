@@ -32,6 +32,7 @@ from tdhil.record.recording import BoolArray, FloatArray
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
 _ROUNDS = 5
 _CLEAR = 20.0            # power of what is explained over the residual's
+_NARROW = 0.05           # of the frequency: where excitation is lines, what stands beside one need not stand clear
 _PHASE = 1.2             # rad
 _LEAST_BINS = 8
 _ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
@@ -68,7 +69,7 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
         taken[keep] = leverage
         found = evaluate(_levelled(every, fit.theta, _unseen_levels(problem, fit.theta)), bins)
         every = replace(every, variance=noise.from_residuals(bins, found.error, taken).variance)
-        explained, _ = noise.smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy)
+        explained, _ = noise.smoothed(bins.hertz, np.abs(found.gain * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
         stands = explained * bins.energy > _CLEAR * every.variance
         clear = int(np.count_nonzero(stands))
         if clear < _LEAST_BINS:
@@ -126,7 +127,7 @@ def _rough(bins: Bins) -> float | None:
 def _worth_a_look(every: Problem, inertia: float) -> BoolArray:
     """For the first fit: where torque and acceleration stand above their noise at the highest frequencies."""
     bins = every.bins
-    moved, _ = noise.smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy)
+    moved, _ = noise.smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)
     keep = np.asarray(moved * bins.energy > _CLEAR * every.variance)
     return keep if np.count_nonzero(keep) >= _ENOUGH_BINS else np.ones(len(bins), dtype=np.bool_)
 
