@@ -105,7 +105,7 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
         (port,) = re.findall(r"127\.0\.0\.1:(\d+)", drive.stdout.readline())
         host = stack.enter_context(process(
             sys.executable, "-m", "tdhil", "identify", "--json", "--host", "127.0.0.1", "--port", port,
-            "--rate", 10, "--rig", rig, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE,
+            "--rate", 4, "--rig", rig, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, cwd=tmp_path,
         ))
         out, err = host.communicate(timeout=60.0)

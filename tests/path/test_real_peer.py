@@ -15,7 +15,7 @@ from path_runs import REAL, Terminal, host, identify, peer, tail_time, wait_for
 WATCHDOG_S = 2.0
 ACCEPTED = "accept_unverified: [likely]\n"
 RIG = f"""\
-rate_hz: 10
+rate_hz: 4
 {ACCEPTED}\
 limits:
   speed_min_rad_s: 0.5
