@@ -1,7 +1,10 @@
 """What identification concludes: numbers with intervals, or the reason why there are none."""
 
+import math
 from dataclasses import dataclass
 from enum import Enum
+
+_OPEN = 0.5     # half-width, of the value, beyond which an interval says nothing worth a number
 
 
 class Verdict(Enum):
@@ -15,11 +18,21 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its interval at the identification's confidence."""
+    """A value with its interval at the identification's confidence; infinite on a side that the data leave open."""
 
     value: float
     low: float
     high: float
+
+    @property
+    def finite(self) -> bool:
+        """Is it a number, with an end on either side?"""
+        return all(math.isfinite(x) for x in (self.value, self.low, self.high))
+
+    @property
+    def bounded(self) -> bool:
+        """Of something positive: does the interval say anything worth a number?"""
+        return self.finite and self.value > 0.0 and 0.5 * (self.high - self.low) <= _OPEN * self.value
 
 
 @dataclass(frozen=True)

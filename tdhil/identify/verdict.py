@@ -17,7 +17,6 @@ from tdhil.record.recording import LagPrior, Recording
 
 RIGID = "rigid+lags"
 _RIGID_WORDS = "a rigid shaft seen through reporting lags"
-_OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def conclude(
 ) -> Identification:
     """The verdict on a fitted rigid model; ``words``: which, for the reader."""
     rejected = result is not None and rejects(result.residual)
-    if result is None or not (rejected or _bounded(result)):
+    if result is None or not (rejected or result.inertia.bounded):
         return refused(
             Refusal(
                 "the data leave the inertia open: it can't be told from the lags of the reported signals",
@@ -106,13 +105,6 @@ def conclude(
         budget=result.budget if kept else (),
         lines=fitted_points(result.fitted, options.confidence),
     )
-
-
-def _bounded(result: RigidResult) -> bool:
-    low, value, high = result.inertia.low, result.inertia.value, result.inertia.high
-    if not all(math.isfinite(x) for x in (low, value, high)) or value <= 0.0:
-        return False
-    return 0.5 * (high - low) <= _OPEN * value
 
 
 def _inertia(

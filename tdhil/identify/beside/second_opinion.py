@@ -144,7 +144,7 @@ def reference_inertia(identification: Identification) -> Estimate | None:
 def _agrees(own: Estimate, identification: Identification, confidence: float, miss_share: float) -> bool | None:
     """Is the difference within what two independent intervals leave? ``miss_share``: the chance to say no wrongly."""
     reference = reference_inertia(identification)
-    if reference is None or not all(math.isfinite(x) for x in (reference.value, reference.low, reference.high)):
+    if reference is None or not reference.finite:
         return None
     below = own.value < reference.value
     theirs = reference.value - reference.low if below else reference.high - reference.value

@@ -17,8 +17,6 @@ from tdhil.identify.lines.rigid_result import lags_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS
 from tdhil.identify.torque_scale import torque_scale_line
 
-_OPEN = 0.5     # relative half-width beyond which a quantity is left open
-
 
 @dataclass(frozen=True)
 class CompliantResult:
@@ -34,15 +32,6 @@ class CompliantResult:
     budget: tuple[BudgetLine, ...]
 
 
-def bounded(one: Estimate | None) -> bool:
-    """Does the interval say anything?"""
-    return one is not None and _finite(one) and one.value > 0.0 and 0.5 * (one.high - one.low) <= _OPEN * one.value
-
-
-def _finite(one: Estimate) -> bool:
-    return all(math.isfinite(x) for x in (one.value, one.low, one.high))
-
-
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
     """Of the model that stands; where two masses stand, their intervals hold what a string would say too."""
     alone = intervals(chosen.fit, confidence)
@@ -51,7 +40,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     return CompliantResult(
         inertia=held.inertia,
         shaft=Compliant(
-            total_inertia=held.total if _finite(held.total) else None,
+            total_inertia=held.total if held.total.finite else None,
             load_inertia=_unless_open(held.load),
             stiffness_nm_rad=_unless_open(held.stiffness),
             damping_nm_s_rad=None if chosen.fit.is_string else _unless_open(held.damping),
@@ -68,7 +57,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
 
 
 def _unless_open(one: Estimate) -> Estimate | None:
-    return one if bounded(one) else None
+    return one if one.bounded else None
 
 
 def _united(one: CompliantIntervals, others: dict[str, Estimate]) -> CompliantIntervals:

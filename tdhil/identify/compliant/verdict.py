@@ -7,7 +7,7 @@ import numpy as np
 
 from tdhil.identify.compliant.choice import Chosen, choose
 from tdhil.identify.compliant.fit import CompliantFit
-from tdhil.identify.compliant.result import CompliantResult, bounded, result_of
+from tdhil.identify.compliant.result import CompliantResult, result_of
 from tdhil.identify.faults.refusal import Refusal
 from tdhil.identify.identification import Estimate, Identification, InertiaEstimate, Verdict
 from tdhil.identify.lines.fit import Held
@@ -52,7 +52,7 @@ def identify_compliant(
         found = result_of(chosen, levels, options.confidence, recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return rigid or _refused(_open(), evidence)
-    if not bounded(found.shaft.total_inertia) and not bounded(found.inertia):
+    if not found.inertia.bounded and not _told(found.shaft.total_inertia):
         # a rigid shaft that is only doubted gives a number, which would be wrong: see `may_swing`
         return rigid if rigid is not None and rigid.inertia is None else _refused(_open(), evidence)
     return _stands(chosen, found, recording, options, evidence, rigid)
@@ -72,7 +72,7 @@ def _stands(
     rigid: Identification | None,
 ) -> Identification:
     fit = chosen.fit
-    told = bounded(found.inertia)
+    told = found.inertia.bounded
     inertia = _inertia(found.inertia, chosen, recording, options) if told else None
     relative = 0.5 * (found.inertia.high - found.inertia.low) / found.inertia.value if told else math.inf
     verdict = Verdict.VALID if relative <= options.tolerance else Verdict.VALID_WIDE
@@ -101,6 +101,10 @@ def _stands(
         compliant=found.shaft,
         lines=fitted_points(fit.fitted, options.confidence),
     )
+
+
+def _told(total: Estimate | None) -> bool:
+    return total is not None and total.bounded
 
 
 def _together(total: Estimate | None) -> str:
@@ -140,7 +144,7 @@ def _words(fit: CompliantFit, rigid: Identification | None, relative: float, opt
 
 def _caveats(fit: CompliantFit, found: CompliantResult) -> tuple[str, ...]:
     said = ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
-    if not bounded(found.shaft.total_inertia):
+    if not _told(found.shaft.total_inertia):
         said.append("J_r + J_L is left open on one side: a slower line, well below the resonance, would show it")
     hertz = [line.hertz for line in fit.fitted.problem.lines]
     for name, one in (("resonance", found.shaft.resonance_hz), ("antiresonance", found.shaft.antiresonance_hz)):

@@ -1,7 +1,5 @@
 """The verdict on a record, in the words that the frequency route uses."""
 
-import math
-
 from tdhil.identify.identification import Estimate, Identification, PaperEstimate, Verdict
 from tdhil.identify.lines.identifiable import lag_priors
 from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
@@ -12,15 +10,11 @@ from tdhil.identify.torque_scale import torque_scale_line, with_total
 from tdhil.record.recording import Recording
 
 MODEL = "rigid+lags (time domain)"
-OPEN = 0.5     # relative half-width of J beyond which the interval says nothing worth a number
 
 
 def is_open(inertia: Estimate) -> bool:
     """Does the interval say nothing worth a number?"""
-    low, value, high = inertia.low, inertia.value, inertia.high
-    if not all(math.isfinite(x) for x in (low, value, high)) or value <= 0.0 or low <= 0.0:
-        return True
-    return 0.5 * (high - low) > OPEN * value
+    return not inertia.bounded or inertia.low <= 0.0
 
 
 def conclude_record(
