@@ -27,6 +27,7 @@ from tdhil.record.recording import FloatArray, Recording
 
 _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
+_FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
 
 
 def second_opinions(
@@ -48,7 +49,7 @@ def second_opinions(
         opinions = _opinions(recording, samples, found, levels, identification, options)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
         return ()
-    share = (1.0 - options.confidence) / max(1, len(opinions))
+    share = _FALSE_ALARM / max(1, len(opinions))
     return tuple(
         replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, identification, options.confidence, share))
         for opinion in opinions
