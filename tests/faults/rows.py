@@ -1,12 +1,12 @@
-"""The fifty faults that a run must survive: what each is, what must happen, and the tests that show it.
+"""The faults that a run must survive, the fifty and those beyond: what each is, what must happen, and its tests.
 
 R refuse before the shaft has moved · QS the stop sequence · WD the drive's own watchdog stops the shaft · M finish, but
 mark what was degraded.
 """
 
-from dataclasses import dataclass
+from row import HERE, Row
+from rows_beyond import BEYOND
 
-HERE = "tests/faults/"
 SCRIPTED, ADAPTER, HOST, PROCESS, MODBUS = (
     f"{HERE}test_rows_scripted.py::test_row", f"{HERE}test_rows_adapter.py::", f"{HERE}test_rows_host.py::",
     f"{HERE}test_rows_process.py::", f"{HERE}test_modbus_rows.py::",
@@ -15,22 +15,11 @@ GUARD = f"{HERE}test_guard_rows.py::"
 NO_WATCHDOG = f"{HERE}test_rows_no_watchdog.py::"
 
 
-@dataclass(frozen=True)
-class Row:
-    """``codes``: how the process may end. ``said``: what tests elsewhere show, where none here measures it."""
-
-    fault: str
-    expected: str
-    codes: str
-    tests: tuple[str, ...]
-    said: str = ""
-
-
 def _scripted(fault, expected, codes, *more):
     return Row(fault, expected, codes, (SCRIPTED, *more))
 
 
-ROWS = {
+FIFTY = {
     1: Row("Ctrl-C once", "QS", "130", (f"{HOST}test_rows_1_3_a_signal", f"{GUARD}test_rows_1_2_3_signals",
                                         "tests/path/test_stops.py::test_a_signal_in_each_stage")),
     2: Row("Ctrl-C twice", "the stop runs to its end; a turning shaft is never disabled", "130",
@@ -167,3 +156,5 @@ ROWS = {
                   "tests/drivers/test_no_watchdog.py::test_node_guarding_that_does_not_work",
                   "tests/drivers/test_no_watchdog.py::test_a_time_out_that_cannot_be_set"),
 }
+
+ROWS = FIFTY | BEYOND
