@@ -19,8 +19,9 @@ from rows import ROWS  # noqa: E402
 
 HEAD = """# The faults, and what a run does about each
 
-Fifty that were asked for, and those beyond that were found by trying. Made by `python benchmarks/fault_table.py` from the tests that it names; a rehearsal of any scripted row is
-`tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault list` shows the names).
+The first fifty were asked for; those beyond were found by trying. Made by `python benchmarks/fault_table.py` from the
+tests that it names; a rehearsal of any scripted row is `tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault
+list` shows the names).
 
 **QS** the one stop sequence: quick stop, standstill seen, trapped torque down, only then disable · **WD** the drive's
 own watchdog stops the shaft · **R** refused before the shaft has moved · **M** the run goes on, and what was degraded
