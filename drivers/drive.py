@@ -175,7 +175,7 @@ class Drive(Protocol):
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
 
-    A drive may also be a `Looking` one.
+    A drive may also be a `Looking` one, and one that `StopsFeeding`.
     """
 
     @property
@@ -213,3 +213,15 @@ class Looking(Protocol):
     """
 
     def look(self) -> Sample | None: ...
+
+
+@runtime_checkable
+class StopsFeeding(Protocol):
+    """A drive that a stop can leave to its own watchdog while it goes on being watched.
+
+    After ``stop_feeding`` nothing goes out that the watchdog takes for the host's sign of life: `exchange` goes on with
+    what doesn't feed it, be it by listening alone, and so does `Looking.look`. There is no way back but `close`. Called
+    only where a watchdog is armed; it may raise TdhilError, and a second call does nothing.
+    """
+
+    def stop_feeding(self) -> None: ...

@@ -18,6 +18,9 @@ Where the cycle brings no feedback any more (a drive that restarted, a foreign N
 looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
 has had its time, and a look contradicts it (`stop_looks`).
 
+A shaft that goes on turning in spite of the quick stop (somebody else commands it, or the drive doesn't brake) is not
+held up by the host's own sign of life: the drive is not fed any more, so that its watchdog acts, and it is watched on.
+
 A turning shaft is never disabled from here. If the drive can't be reached, its own watchdog must act, and that
 is what the report says. Nothing that is raised on the way, an interrupt included, skips any of it.
 """
@@ -29,7 +32,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.drive import Command, Mode, PowerState, Sample
+from drivers.drive import Command, Mode, PowerState, Sample, StopsFeeding
 from drivers.errors import StopNotConfirmed
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.let_go import MEAN_S, LetGo, LetGoLimits
@@ -51,6 +54,10 @@ MODE_S = 0.5
 
 REST_AFTER_S = 10.0
 """A shaft that begins to turn once its torque is off gets so long to come to rest by itself."""
+
+UNMOVED_S, UNMOVED_STRING_S, UNMOVED_RAMP_SHARE = 3.0, 10.0, 0.1
+"""A shaft that got no slower for so long after the quick stop is left to the drive's watchdog; one with a string may
+swing meanwhile. On a long ramp this share of it, from the highest speed, if that is more."""
 
 MOST_INTERRUPTIONS = 5
 """The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
@@ -110,6 +117,10 @@ class StopSequence:
         self._trouble: list[str] = []
         self._looks = Looks(bench.drive, bench.period_s)
         self._slowing = Slowing(self._at_rest_rad_s)
+        self._unmoved_s = max(
+            UNMOVED_STRING_S if self._string is not None else UNMOVED_S, UNMOVED_RAMP_SHARE * ramp_s
+        )
+        self._fed = True
         self._silent = 0
         self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
         self._running = False
@@ -219,6 +230,7 @@ class StopSequence:
 
     def _see_rest(self, asked: bool) -> float | None:
         patience = Patience(self._enough_s, self._at_rest_rad_s)
+        braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
         quiet_since_s: float | None = None
         heard_s = 0.0
         while not patience.over:
@@ -233,6 +245,8 @@ class StopSequence:
             if not self._gets_slower(sample):
                 return None
             patience.see(sample.speed_rad_s, self._bench.period_s)
+            if not braking.see(sample.time_s, sample.speed_rad_s) and self._leave_to_watchdog(sample):
+                patience = Patience(self._enough_s, self._at_rest_rad_s)
             # Single lost frames don't unsay what the others showed; a longer gap does.
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
@@ -243,6 +257,18 @@ class StopSequence:
                 return sample.time_s
         self._trouble.append(f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop")
         return None
+
+    def _leave_to_watchdog(self, sample: Sample) -> bool:
+        """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
+        drive = self._bench.drive
+        if not (self._fed and self._watched and isinstance(drive, StopsFeeding) and self._ask(drive.stop_feeding)):
+            return False
+        self._fed = False
+        self._trouble.append(
+            f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s in spite of the quick stop: the host's sign"
+            " of life was ended, so that the drive's own watchdog acts"
+        )
+        return True
 
     def _disable(self) -> bool:
         asked = self._ask(self._bench.drive.disable)

@@ -60,20 +60,21 @@ class Looks:
 
 
 class Slowing:
-    """Does the shaft lose speed, as far as looks show it?"""
+    """Does the shaft lose speed? ``within_s``: how long it may take over `SLOWER` of it."""
 
-    def __init__(self, at_rest_rad_s: float) -> None:
+    def __init__(self, at_rest_rad_s: float, within_s: float = SLOWING_S) -> None:
         self._at_rest_rad_s = at_rest_rad_s
+        self._within_s = within_s
         self._since_s: float | None = None
         self._speed_rad_s = math.inf
 
     def reset(self) -> None:
-        """The cycle's feedback is back."""
+        """What comes next is seen as the first."""
         self._since_s = None
 
     def see(self, time_s: float, speed_rad_s: float) -> bool:
-        """False once a shaft that turns has not got slower for `SLOWING_S`."""
+        """False once a shaft that turns has not got slower for so long."""
         speed_rad_s = abs(speed_rad_s)
         if self._since_s is None or speed_rad_s <= max(self._at_rest_rad_s, SLOWER * self._speed_rad_s):
             self._since_s, self._speed_rad_s = time_s, speed_rad_s
-        return time_s - self._since_s < SLOWING_S
+        return time_s - self._since_s < self._within_s

@@ -1,14 +1,14 @@
 """A stop without the cycle's feedback: single looks tell of rest, and never lead to a turning shaft being let go."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
-from fake_drive import PERIOD_S, FakeDrive
+from fake_drive import LIMITS, PERIOD_S, FakeDrive
 
-from drivers.drive import Mode
+from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost
 from tdhil.protocol.settings import ControlAssumptions
-from tdhil.protocol.stop import REST_AFTER_S, SILENT_S
+from tdhil.protocol.stop import REST_AFTER_S, SILENT_S, UNMOVED_S
 from tdhil.protocol.stop_looks import AFTER_S, EVERY_S, SLOWING_S, Looks, Slowing
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
@@ -174,6 +174,85 @@ def test_looks_are_due_by_time(period_s):
     looks.heard()
     assert not looks.standing
     assert looks.missed() is None or period_s >= AFTER_S
+
+
+@dataclass
+class Starved(FakeDrive):
+    """Is driven on by somebody else at ``driven`` rad/s, until its watchdog has heard nothing for a while."""
+
+    driven: float | None = 5.0
+    watchdog_s: float = 0.5
+    unfed_since_s: float | None = None
+    refuses: int = 0
+
+    def stop_feeding(self):
+        self.calls.append("stop_feeding")
+        if self.refuses:
+            self.refuses -= 1
+            raise CommunicationLost("busy")
+        self.unfed_since_s = self.clock.now_s()
+
+    def _move(self, command):
+        unfed = self.unfed_since_s is not None and self.clock.now_s() - self.unfed_since_s > self.watchdog_s
+        if unfed and self.state is not PowerState.FAULT:
+            self.fault()
+        super()._move(command)
+        if self.driven is not None and self.state is not PowerState.FAULT:
+            self.speed = self.driven
+
+
+@pytest.mark.parametrize("refuses", [0, 3])
+def test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched(world, refuses):
+    here = world(Starved(driven=None, refuses=refuses))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert here.drive.calls.count("stop_feeding") == 1 + refuses
+    assert here.drive.unfed_since_s - begun_s == pytest.approx(UNMOVED_S, abs=0.2)
+    assert report.confirmed and here.drive.speed == 0.0 and here.drive.disabled_at in ([], [0.0])
+    assert any("sign of life was ended" in line for line in report.trouble)
+
+
+@pytest.mark.parametrize("options", [{"watched": False}, {}])
+def test_a_drive_without_a_watchdog_or_one_that_can_not_is_fed_on(world, options):
+    drive = Starved(driven=None) if options else FakeDrive(brakes=False)
+    here = world(drive)
+    here.turn(5.0)
+    drive.driven, drive.coulomb, drive.viscous = 5.0, 0.0, 0.0
+    report = here.stop_sequence(**options).run()
+    assert not report.confirmed and "stop_feeding" not in drive.calls
+
+
+def test_a_watchdog_that_does_not_act_either_is_said(world):
+    here = world(Starved(driven=None, watchdog_s=1e9))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None
+    assert here.drive.calls.count("stop_feeding") == 1 and "disable" not in here.drive.calls
+
+
+@pytest.mark.parametrize("inertia", [100.0, 1500.0])
+def test_a_shaft_that_brakes_as_well_as_it_can_is_fed_to_the_end(world, inertia):
+    """Down the drive's ramp, and a heavy one by its friction alone, for more than a minute."""
+    here = world(Starved(driven=None, inertia=inertia, brakes=inertia < 1000.0))
+    here.turn(9.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed and "stop_feeding" not in here.drive.calls
+
+
+def test_a_swinging_string_or_a_long_ramp_is_no_shaft_that_goes_on_turning(world):
+    for limits in (replace(LIMITS, load="string", torque_ramp_nm_s=20.0), replace(LIMITS, quick_stop_rad_s2=0.1)):
+        here = world(Starved(driven=None), limits)
+        here.turn(5.0)
+        here.drive.driven = 5.0
+        sequence, unfed = here.stop_sequence(), []
+        here.drive.stop_feeding = lambda unfed=unfed, here=here: unfed.append(here.bench.now_s)
+        quick_stop, begun = here.drive.quick_stop, []
+        here.drive.quick_stop = lambda begun=begun, here=here, ask=quick_stop: (begun.append(here.bench.now_s), ask())
+        sequence.run()
+        assert unfed[0] - begun[0] == pytest.approx(10.0, abs=0.3)
 
 
 def test_slowing():
