@@ -1,6 +1,7 @@
 """The base of every model that is read from a data file, and how a check across several keys names its line."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict
 from pydantic_core import PydanticCustomError
@@ -14,6 +15,9 @@ class DataModel(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=False, hide_input_in_errors=True
     )
+
+    never_here: ClassVar[Mapping[str, str]] = {}
+    """Keys that no file of this kind takes, and what is said of each instead of 'unknown key'."""
 
 
 Finding = tuple[str, str]

@@ -70,6 +70,9 @@ def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterat
             yield there, tree.line(there), message
     elif kind == "extra_forbidden":
         key, known = str(item["loc"][-1]), sorted(_fields_at(model, path[:-1]))
+        if said := _never_here(model, path[:-1]).get(key):
+            yield path, tree.line(path), said
+            return
         yield path[:-1], tree.line(path), f"unknown key '{_clean(key)}'{_meant(key, known)}"
     elif kind == "missing":
         key = str(item["loc"][-1])
@@ -156,6 +159,13 @@ def _value(data: Any, path: Path) -> Any:
 
 def _fields_at(model: type[BaseModel], path: Path) -> set[str]:
     return {info.alias or name for found in _models_at(model, path) for name, info in found.model_fields.items()}
+
+
+def _never_here(model: type[BaseModel], path: Path) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for one in _models_at(model, path):
+        found |= getattr(one, "never_here", {})
+    return found
 
 
 def _description(model: type[BaseModel], path: Path, key: str) -> str:

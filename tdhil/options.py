@@ -14,7 +14,10 @@ from tdhil.rig import Rig
 
 @dataclass(frozen=True)
 class Option:
-    """``name`` as in the parsed command line, its ``flag``, its key ``at`` in rig.yaml, and its default."""
+    """``name`` as in the parsed command line, its ``flag``, its key ``at`` in rig.yaml, and its default.
+
+    Without ``at`` no file says it: what a person at the shaft answers for.
+    """
 
     name: str
     flag: str
@@ -44,7 +47,7 @@ OPTIONS = (
     Option("simulate", "--simulate", "run.simulate", False),
     Option("real_time", "--real-time", "run.real_time", False),
     Option("stepped", "--stepped", "run.stepped", False),
-    Option("yes", "--yes", "run.yes", False),
+    Option("yes", "--yes", "", False),
     Option("json", "--json", "run.json", False),
     Option("log", "--log", "run.log", "run.mcap"),
     Option("plant", "--plant", "run.plant", beside_rig=True),
@@ -112,7 +115,7 @@ def _setting(option: Option, given: Mapping[str, Any], cli_values: Mapping[str, 
     if option.name in given:
         other = "--real-time" if option.name == "stepped" else "--stepped"
         return Setting(given[option.name], option.flag if cli_values.get(option.name) is not None else other)
-    value = rig.get(option.at) if rig is not None else None
+    value = rig.get(option.at) if rig is not None and option.at else None
     if rig is None or value is None:
         return Setting(option.default, "default")
     if option.beside_rig and (option.name != "profile" or value.endswith((".yaml", ".yml"))):
@@ -121,8 +124,15 @@ def _setting(option: Option, given: Mapping[str, Any], cli_values: Mapping[str, 
 
 
 def _joined(option: Option, given: Mapping[str, Any], rig: Rig | None) -> Setting:
-    """Everything that either place names, each thing once."""
+    """Everything that either place names, each thing once.
+
+    What a file takes of a profile it takes of the one that it goes with, not of another on the command line.
+    """
     in_rig = (rig.get(option.at) if rig is not None else None) or ()
+    if rig is not None and given.get("profile") not in (None, rig.profile):
+        if in_rig and option.name not in given:
+            return Setting((), f"{rig.source(option.at)} is for the profile of that file, not for --profile")
+        in_rig = ()
     named = tuple(dict.fromkeys((*given.get(option.name, ()), *in_rig)))
     at = (rig.source(option.at) or "rig") if rig is not None and in_rig else ""
     sources = [source for source in (option.flag if option.name in given else "", at) if source]
@@ -134,7 +144,7 @@ def _check(given: Mapping[str, Any]) -> None:
     data: dict[str, Any] = {}
     flags: dict[tuple[str | int, ...], str] = {}
     for option in OPTIONS:
-        if option.name in given:
+        if option.name in given and option.at:
             *section, key = option.at.split(".")
             (data.setdefault(section[0], {}) if section else data)[key] = given[option.name]
             flags[tuple(option.at.split("."))] = option.flag

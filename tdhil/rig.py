@@ -13,7 +13,7 @@ motor shaft. It is frozen, and knows from which line of which file each of its k
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
@@ -122,8 +122,23 @@ class Expected(DataModel):
     load_noise_nm: Positive | None = Field(default=None, description="N·m; standard deviation of what disturbs")
 
 
+_OPERATORS = {
+    "yes": "--yes",
+    "accept_no_watchdog": "--accept-no-watchdog",
+    "accept_wider_limit": "--accept-wider-limit NAME",
+    "accept_wider_limits": "--accept-wider-limit NAME",
+    "reset_fault": "--reset-fault",
+}
+_ONLY_THE_OPERATOR = {
+    key: f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the command line"
+    for key, flag in _OPERATORS.items()
+}
+
+
 class Run(DataModel):
     """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
+
+    never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     excitation: Literal["multisine", "sine", "step", "pulses", "coast-down"] | None = None
     mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
@@ -141,7 +156,6 @@ class Run(DataModel):
     simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")
     real_time: bool | None = Field(default=None, description="simulator against the wall clock")
     stepped: bool | None = Field(default=None, description="simulator in another process, stepped by SYNC")
-    yes: bool | None = Field(default=None, description="no prompt before motion; replaces no limit")
     json_: bool | None = Field(default=None, alias="json", description="one JSON document on stdout")
     log: str | None = Field(default=None, min_length=1, description="file to write, from the working directory")
     plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
@@ -156,6 +170,8 @@ class Run(DataModel):
 
 class Rig(DataModel):
     """Everything that a bench has; each key is optional until something needs it."""
+
+    never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     drive: Literal["canopen", "modbus"] | None = None
     bus: Bus = Bus()

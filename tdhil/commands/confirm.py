@@ -41,7 +41,7 @@ def confirm_motion(
     if yes:
         console.print("Confirmed by --yes.")
         return
-    if not sys.stdin.isatty():
+    if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(
             "nobody is there to confirm that the shaft may move",
             where="no terminal",

@@ -45,7 +45,6 @@ def test_rig_example_is_a_bench_that_may_move():
     require_limits(rig)
     assert rig.bus.interface == "socketcan"
     assert rig.run.simulate is None
-    assert rig.run.yes is None
 
 
 def test_modbus_example_is_a_bench_that_may_move():
@@ -70,7 +69,7 @@ def test_the_examples_show_every_key_but_those_for_trying_things_out():
     text = EXAMPLE.read_text(encoding="utf-8") + MODBUS.read_text(encoding="utf-8")
     missing = {key for key in keys(Rig) if not re.search(rf"^[# ]*{key.split('.')[-1]}:", text, re.MULTILINE)}
     assert missing == {"bus.options", "run.mode", "run.frequency_hz", "run.amplitude_rad_s", "run.offset_rad_s",
-                       "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped", "run.yes",
+                       "run.periods", "run.seed", "run.simulate", "run.real_time", "run.stepped",
                        "run.json", "run.plant", "run.trace"}
 
 
@@ -112,6 +111,6 @@ def test_page_says_the_true_default(key):
         assert not re.match(r"[0-9]", shown)
 
 
-@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.flag)
+@pytest.mark.parametrize("option", [option for option in OPTIONS if option.at], ids=lambda option: option.flag)
 def test_page_names_the_option(option):
     assert f"`{option.flag}`" in rows()[option.at][1]
