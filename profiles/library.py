@@ -33,6 +33,22 @@ def profile_names() -> tuple[str, ...]:
     return tuple(sorted(f"{path.parent.name}/{path.stem}" for path in _ROOT.glob("*/*.yaml")))
 
 
+def matching_names(text: str) -> tuple[str, ...]:
+    """Those that ship and that ``text`` may be short for: a vendor's all, else what begins so; capitals don't count.
+
+    ``abb`` is all of ABB's, ``abb/acs880`` or ``acs880`` two of them; a whole name is itself alone.
+    """
+    asked, names = text.strip().lower(), profile_names()
+    if not asked or asked in names:
+        return (asked,) if asked else ()
+    ways = (
+        [name for name in names if name.partition("/")[0] == asked.rstrip("/")],
+        [name for name in names if name.startswith(asked)],
+        [name for name in names if name.partition("/")[2].startswith(asked)],
+    )
+    return tuple(next((found for found in ways if found), []))
+
+
 def profile_path(name_or_path: str) -> Path:
     """The file of a profile; DataFileError, with names that come close, if none ships under that name.
 
@@ -89,9 +105,11 @@ def _other_bus(name: str, found: str, wanted: str) -> DataFileError:
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:
     shown = re.sub(r"\s+", " ", name)[:60]
-    close = difflib.get_close_matches(name[:80], names, n=3, cutoff=0.5)
-    # People type the model without its vendor.
-    close += [known for known in names if known.split("/")[1] == name and known not in close]
+    # People type the vendor alone, or the model without its vendor; or one of them wrongly.
+    close = list(matching_names(name[:80])) or difflib.get_close_matches(name[:80], names, n=3, cutoff=0.5)
+    if not close:
+        parts = {part: known for known in reversed(names) for part in known.split("/")}
+        close = [parts[part] for part in difflib.get_close_matches(name[:80].lower(), parts, n=2, cutoff=0.6)]
     meant = " or ".join(f"'{item}'" for item in close)
     known = f"did you mean {meant}?" if close else f"these ship: {', '.join(names)}."
     return f"none named '{shown}'; {known} A file of your own is named by its path, ending in .yaml"

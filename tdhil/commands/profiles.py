@@ -16,8 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
     shown = actions.add_parser("show", help="all that a person at the drive needs of one profile",
-                               description="All that a person at the drive needs of one profile.")
-    shown.add_argument("name", metavar="NAME", help="vendor/model, or a .yaml file")
+                               description="All that a person at the drive needs of one profile. A vendor's name "
+                                           "lists what ships for that vendor's drives.")
+    shown.add_argument("name", metavar="NAME", help="vendor/model or the beginning of it, a vendor, or a .yaml file")
     checked = actions.add_parser("check", help="is a profile of your own right? exit 2 and a line a problem if not",
                                  description="Is a profile of your own right? Exit 2 and a line a problem if not.")
     checked.add_argument("files", metavar="FILE", nargs="+", help="a .yaml file, or vendor/model")
@@ -37,11 +38,12 @@ def run(namespace: argparse.Namespace) -> int:
     return _list(as_json)
 
 
-def _list(as_json: bool) -> int:
+def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
+    """All, or those of ``names``."""
     from profiles.library import load_profile, profile_names
     from tdhil.commands.profile_said import row, sure_text
 
-    profiles = [load_profile(name) for name in profile_names()]
+    profiles = [load_profile(name) for name in names or profile_names()]
     if as_json:
         _dump({"profiles": [row(profile) for profile in profiles]})
         return 0
@@ -63,10 +65,13 @@ def _list(as_json: bool) -> int:
 
 
 def _show(name: str, as_json: bool) -> int:
-    from profiles.library import load_profile
+    from profiles.library import load_profile, matching_names
     from tdhil.commands.unverified import doubtful
 
-    profile = load_profile(name)
+    meant = matching_names(name)
+    if len(meant) > 1:
+        return _list(as_json, meant)
+    profile = load_profile(meant[0] if meant else name)
     if as_json:
         _dump({
             "profile": profile.model_dump(mode="json", by_alias=True),

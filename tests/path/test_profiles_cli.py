@@ -58,6 +58,45 @@ def test_an_unknown_name_is_answered_with_those_that_come_close():
     assert "did you mean 'generic/modbus' or" in done.err
 
 
+@pytest.mark.parametrize(("asked", "wanted"), [
+    ("abb", "abb/"), ("ABB", "abb/"), ("siemens/", "siemens/"), ("siem", "siemens/"), ("abb/acs880", "abb/acs880"),
+    ("acs880", "abb/acs880"), ("generic", "generic/"),
+])
+def test_a_vendor_shows_what_the_vendor_has(asked, wanted, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    done = tdhil("profiles", "show", asked)
+    assert done.code == 0, done.err
+    names = [name for name in profile_names() if name.startswith(wanted)]
+    assert len(names) > 1
+    assert [name for name in profile_names() if name in done.out] == names
+    assert [one["name"] for one in tdhil("profiles", "show", asked, "--json").document["profiles"]] == names
+
+
+@pytest.mark.parametrize(("asked", "name"), [
+    ("maxon", "maxon/epos4"), ("epos", "maxon/epos4"), ("MS300", "delta/ms300"),
+])
+def test_what_only_one_begins_with_is_that_one(asked, name):
+    done = tdhil("profiles", "show", asked)
+    assert done.code == 0, done.err
+    assert done.out.startswith(f"{name}: ")
+    assert tdhil("profiles", "show", asked, "--json").document["profile"]["name"] == name
+
+
+@pytest.mark.parametrize(("asked", "meant"), [
+    ("simens", "siemens/"), ("epso4", "maxon/epos4"), ("generic/cia401", "generic/cia402"), ("schnieder", "schneider/"),
+])
+def test_a_slip_of_the_fingers_is_answered_with_what_comes_close(asked, meant):
+    done = tdhil("profiles", "show", asked)
+    assert done.code == 2
+    assert f"did you mean '{meant}" in done.err
+
+
+def test_no_title_takes_a_real_drive_for_the_simulator():
+    """On Modbus the title is all the name that a peer has: it heads the preflight and stands in the prompt."""
+    for name in profile_names():
+        assert "simulat" not in load_profile(name).title.lower(), name
+
+
 def test_what_ships_is_right():
     done = tdhil("profiles", "check", *profile_names())
     assert done.code == 0, done.err
