@@ -98,6 +98,7 @@ class Limits:
     quick_stop_rad_s2: float
     watchdog_s: float
     accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
+    accept_wider: frozenset[str] = frozenset()     # of `drivers.wider.NAMES`: own limits that may be made wider
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,8 @@ class Preflight:
     safe_action: str                   # what the drive does by itself when the host falls silent
     filters: ReportingFilters = ReportingFilters()
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
+    kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
+    kept_speed_rad_s: float | None = None        # (`drivers.wider`)
 
     @property
     def watched(self) -> bool:

@@ -36,6 +36,7 @@ from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, P
 from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
 from drivers.table import Table
 from drivers.ticks import Ticks
+from drivers.wider import OwnLimits
 from profiles.marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.schema import CanopenProfile
 
@@ -161,7 +162,8 @@ class Cia402Drive:
         self._codes = checks.choose_modes(table, objects, self._profile)
         self._modes = {code: mode for mode, code in self._codes.items()}
         table.checks += scaling.checks
-        set_limits(table, objects, self._profile, limits, rated_nm)
+        own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
+        set_limits(table, objects, self._profile, limits, rated_nm, own)
         checks.clear_targets(table, objects, self._profile)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
@@ -184,7 +186,7 @@ class Cia402Drive:
         self._life.keep_to(feed_s)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
-            limits.watchdog_s if feed_s else 0.0,
+            limits.watchdog_s if feed_s else 0.0, own.kept,
         )
         self._start(limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0)
         return found

@@ -9,12 +9,17 @@ from drivers.cia402.objects import RPM
 from drivers.cia402.parameters import Settings
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.values import decode_value, encode_value
-from drivers.drive import Limits
-from drivers.errors import ObjectRefused
+from drivers.drive import Check, Limits, Outcome
+from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.table import Table
+from drivers.wider import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from profiles.canopen_parameter import Parameter
 from profiles.schema import CanopenProfile
 
+_LIMIT = {
+    "torque_limit": TORQUE, "torque_limit_reverse": TORQUE, "speed_limit": SPEED, "speed_limit_reverse": SPEED,
+    "quick_stop_time": QUICK_STOP, "quick_stop_deceleration": QUICK_STOP,
+}
 _TITLES = {
     "torque_limit": "torque limit", "torque_limit_reverse": "torque limit, reverse", "speed_limit": "speed limit",
     "speed_limit_reverse": "speed limit, reverse", "quick_stop_time": "quick-stop ramp",
@@ -23,32 +28,34 @@ _TITLES = {
 
 
 def set_limits(
-    table: Table, objects: Objects, profile: CanopenProfile, limits: Limits, rated_nm: float
+    table: Table, objects: Objects, profile: CanopenProfile, limits: Limits, rated_nm: float, own: OwnLimits
 ) -> None:
-    """The drive's own torque limit, speed limit and quick stop, written and read back."""
+    """The drive's own torque limit, speed limit and quick stop, written and read back; ``own`` says which may be."""
     elsewhere = {one.set_to for one in profile.parameters}
     torque_lsb = profile.torque.max_torque_rated_per_lsb
     if torque_lsb is not None:
-        _limit(table, objects, "torque limit", 0x6072, limits.torque_nm, torque_lsb * rated_nm, 16, "N·m", math.floor)
+        lsb = torque_lsb * rated_nm
+        _limit(table, objects, own, TORQUE, "torque limit", 0x6072, limits.torque_nm, lsb, 16, "N·m", math.floor)
     elif "torque_limit" not in elsewhere:
         table.note("torque limit", "the drive has no 6072h: the host alone limits it, by the guard and the setpoint")
     speed_lsb = profile.speed.max_motor_speed_rpm_per_lsb
     if speed_lsb is not None:
-        _limit(table, objects, "speed limit", 0x6080, limits.speed_rad_s, speed_lsb * RPM, 32, "rad/s", math.ceil)
+        lsb = speed_lsb * RPM
+        _limit(table, objects, own, SPEED, "speed limit", 0x6080, limits.speed_rad_s, lsb, 32, "rad/s", math.ceil)
     elif "speed_limit" not in elsewhere:
         table.note("speed limit", "the drive has no 6080h: set its own speed limit by hand")
     settings = Settings(objects, profile)
     for one in profile.parameters:
         # What a ramp begins at is itself a limit: it has to stand before the ramp is worked out.
         if one.set_to is not None and one.from_speed is None:
-            _set(table, objects, settings, one, limits, rated_nm)
+            _set(table, objects, settings, one, limits, rated_nm, own)
     for one in profile.parameters:
         if one.from_speed is not None:
-            _set(table, objects, settings, one, limits, rated_nm)
+            _set(table, objects, settings, one, limits, rated_nm, own)
     ramp_lsb = profile.quick_stop.deceleration_rpm_s_per_lsb
     if ramp_lsb is not None:
-        ramp = limits.quick_stop_rad_s2
-        _limit(table, objects, "quick-stop ramp", 0x6085, ramp, ramp_lsb * RPM, 32, "rad/s²", math.ceil)
+        ramp, lsb = limits.quick_stop_rad_s2, ramp_lsb * RPM
+        _limit(table, objects, own, QUICK_STOP, "quick-stop ramp", 0x6085, ramp, lsb, 32, "rad/s²", math.ceil)
     code = profile.quick_stop.option_code
     if code is not None:
         table.attempt(
@@ -57,23 +64,43 @@ def set_limits(
 
 
 def _set(
-    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: Limits, rated_nm: float
+    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: Limits, rated_nm: float, own: OwnLimits
 ) -> None:
     """One parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
-    where = name(one.index, one.sub)
+    where, mend = name(one.index, one.sub), one.advice or ""
+    limit, title = _LIMIT[one.set_to or ""], _TITLES[one.set_to or ""]
     unit = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s"}.get(one.unit, "")
-
-    def work() -> tuple[str, bool]:
-        per_lsb = settings.per_lsb(one)
-        wanted = encode_value(one.type, _count(settings, one, limits, rated_nm) / per_lsb, where)
-        back = objects.change_bytes(one.index, one.sub, wanted)
-        return f"{decode_value(one.type, back, where) * per_lsb:.6g}{unit}", back == wanted
-
     wished = {
         "torque_limit": f"{limits.torque_nm:g} N·m", "torque_limit_reverse": f"{-limits.torque_nm:g} N·m",
         "speed_limit": f"{limits.speed_rad_s:g} rad/s", "speed_limit_reverse": f"{-limits.speed_rad_s:g} rad/s",
     }.get(one.set_to or "", f"{limits.quick_stop_rad_s2:g} rad/s²")
-    table.attempt(_TITLES[one.set_to or ""], wished, where, work, one.advice or "")
+    try:
+        per_lsb = settings.per_lsb(one)
+        wanted = encode_value(one.type, _count(settings, one, limits, rated_nm) / per_lsb, where)
+        before = objects.read_bytes(one.index, one.sub)
+
+        def shown(data: bytes) -> float:
+            return decode_value(one.type, data, where) * per_lsb
+
+        def braking(value: float) -> float:
+            """A time that a ramp takes → its deceleration; a time of 0 is no ramp at all."""
+            if one.from_speed is None:
+                return value * (RPM if limit is QUICK_STOP else 1.0)
+            return RPM * settings.value(one.from_speed) / value if value > 0.0 else math.inf
+
+        if own.stays(limit, braking(shown(wanted)), braking(shown(before))):
+            si = abs(shown(before)) * {"rpm": RPM, "rated": rated_nm}.get(one.unit, 1.0)
+            own.keep(table, limit, title, wished, f"{shown(before):.6g}{unit}", si, where)
+            return
+        back = objects.change_bytes(one.index, one.sub, wanted)
+        own.written(
+            table, limit, title, wished, f"{shown(back):.6g}{unit}", f"{shown(before):.6g}{unit}", back == wanted,
+            where, mend, wider=own.wider(limit, braking(shown(wanted)), braking(shown(before))),
+        )
+    except PreflightRefused as error:
+        table.checks.append(
+            Check(title, wished, error.what, Outcome.REFUSED, error.where or where, mend or error.next_step)
+        )
 
 
 def _count(settings: Settings, one: Parameter, limits: Limits, rated_nm: float) -> float:
@@ -106,6 +133,8 @@ def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[f
 def _limit(
     table: Table,
     objects: Objects,
+    own: OwnLimits,
+    limit: str,
     title: str,
     index: int,
     value: float,
@@ -117,12 +146,18 @@ def _limit(
     # One part in 10^9 of slack: a limit that is a whole number of LSB must not lose one to the last bit.
     slack = 1e-9 if rounding is math.floor else -1e-9
     raw = max(1, rounding(value / per_lsb * (1.0 + slack)))
-
-    def work() -> tuple[str, bool]:
+    wanted, where = f"{raw * per_lsb:.6g} {unit}", name(index)
+    try:
+        before = objects.read(index)
+        found = f"{before * per_lsb:.6g} {unit}"
+        if own.stays(limit, raw, before):
+            own.keep(table, limit, title, wanted, found, before * per_lsb, where)
+            return
         back = objects.change(index, 0, raw, bits)
-        return f"{back * per_lsb:.6g} {unit}", back == raw
-
-    table.attempt(title, f"{raw * per_lsb:.6g} {unit}", name(index), work)
+        now, wider = f"{back * per_lsb:.6g} {unit}", own.wider(limit, raw, before)
+        own.written(table, limit, title, wanted, now, found, back == raw, where, wider=wider)
+    except PreflightRefused as error:
+        table.checks.append(Check(title, wanted, error.what, Outcome.REFUSED, error.where or where, error.next_step))
 
 
 def _same(found: int, wanted: int) -> tuple[str, bool]:

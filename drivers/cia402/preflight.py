@@ -5,7 +5,7 @@ A line that fails does not hide those after it: the whole table is worth more to
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from drivers.cia402.filters import read_filters
 from drivers.cia402.objects import MODE_NAMES, Units
@@ -14,6 +14,7 @@ from drivers.cia402.state import State, decode
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
 from drivers.table import Table
+from drivers.wider import SPEED, TORQUE
 from profiles.schema import CanopenProfile
 
 STILL_LSB, STILL_RAD_S = 5, 0.05
@@ -128,6 +129,7 @@ def report(
     rated_nm: float,
     modes: dict[Mode, int],
     watchdog_s: float,
+    kept: Mapping[str, float],
 ) -> Preflight:
     """The table and what goes with it."""
     filters = read_filters(table.note, objects, profile)
@@ -144,4 +146,6 @@ def report(
         safe_action=profile.watchdog.reaction if watchdog_s else "none",
         filters=filters,
         torque_setpoint="6071h",
+        kept_torque_nm=kept.get(TORQUE),
+        kept_speed_rad_s=kept.get(SPEED),
     )

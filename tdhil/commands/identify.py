@@ -37,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
     drive.add_argument("--accept-no-watchdog", action="store_true",
                        help="take a drive whose watchdog can't be armed: it won't stop by itself if this host dies")
+    drive.add_argument("--accept-wider-limit", action="append", choices=("torque", "speed", "quick-stop"),
+                       help="let the run widen this limit of the drive's own; otherwise a tighter one stays")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
@@ -141,7 +143,8 @@ def _run(
         ) as drive, LiveDisplay(console, show_preflight=False) as display:
             outcome = Runner(
                 drive,
-                partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog),
+                partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog,
+                        tuple(namespace.accept_wider_limit or ())),
                 log,
                 stop_request,
                 display,
@@ -177,6 +180,7 @@ def _task(
     log: RunLog,
     say: Callable[[str], None],
     accept_no_watchdog: bool,
+    accept_wider: tuple[str, ...],
     identity: Identity,
 ) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
@@ -190,7 +194,7 @@ def _task(
         log.configure(unverified=list(accepted_lines(profile, options["accept_unverified"])))
     elif text := note(profile):
         say(text)
-    limits = machine_limits(bench, accept_no_watchdog=accept_no_watchdog)
+    limits = machine_limits(bench, accept_no_watchdog=accept_no_watchdog, accept_wider=accept_wider)
     return Task(limits, excitation_request(options), facts(bench))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from drivers.drive import Identity
@@ -29,10 +30,12 @@ def bench_of(identity: Identity, rig: Rig | None) -> Rig:
     return rig
 
 
-def machine_limits(bench: Rig, *, accept_no_watchdog: bool = False) -> MachineLimits:
+def machine_limits(
+    bench: Rig, *, accept_no_watchdog: bool = False, accept_wider: Collection[str] = ()
+) -> MachineLimits:
     """The guard's limits. Raises PreflightRefused where the rig has none.
 
-    ``accept_no_watchdog`` is a run's, on its own command line: no file of the bench says it.
+    ``accept_no_watchdog`` and ``accept_wider`` are a run's, on its own command line: no file of the bench says them.
     """
     limits = require_limits(bench)
     return MachineLimits(
@@ -48,6 +51,7 @@ def machine_limits(bench: Rig, *, accept_no_watchdog: bool = False) -> MachineLi
         load=bench.load,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
         accept_no_watchdog=accept_no_watchdog,
+        accept_wider=frozenset(accept_wider),
     )
 
 

@@ -15,7 +15,7 @@ from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.braking_probe import NOT_YET, slow_down
-from tdhil.protocol.choose_mode import choose_mode, no_torque
+from tdhil.protocol.choose_mode import choose_mode, keep_within, no_torque
 from tdhil.protocol.control import MeanSpeedControl
 from tdhil.protocol.excitation import RigGuess, SwingPlan
 from tdhil.protocol.guard import Guard
@@ -175,7 +175,7 @@ class Runner:
         preflight = self._book.preflight = self._drive.preflight(
             Limits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
-                limits.accept_no_watchdog,
+                limits.accept_no_watchdog, limits.accept_wider,
             )
         )
         self._display.preflight(preflight)
@@ -186,6 +186,8 @@ class Runner:
         if preflight.refused:
             raise _refusal(preflight)
         refuse_with_string(limits, task.request, preflight)
+        limits = keep_within(limits, task.request, preflight)
+        task = replace(task, limits=limits)
         if not preflight.watched:
             self._log.configure(**no_watchdog.configuration(preflight))
             self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID)

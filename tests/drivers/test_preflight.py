@@ -1,5 +1,7 @@
 """What is refused before anything moves. Each row by itself, and never one row at the cost of those after it."""
 
+import dataclasses
+
 import pytest
 from power_machine import ENABLED, FAULT, OFF, STOPPING
 from scripted_drive import ScriptedDrive, u
@@ -360,3 +362,64 @@ def test_what_was_refused_is_given_back_on_close(make, peer):
         key: value for key, value in before.items() if key not in kept
     }
     assert not peer.operational
+
+
+# -- the drive's own limits ----------------------------------------------------------------------------------
+
+
+TIGHT = {0x6072: 100, 0x6080: 40, 0x6085: 1910}        # 100 N·m, 4.19 rad/s, 20 rad/s²; LIMITS ask 300, 10, 2
+WIDER = {"torque": 0x6072, "speed": 0x6080, "quick-stop": 0x6085}
+
+
+@pytest.fixture
+def tight(wire):
+    peer = ScriptedDrive(wire, marker=False)
+    for index, raw in TIGHT.items():
+        peer.objects[index, 0] = raw.to_bytes(len(peer.objects[index, 0]), "little")
+    return peer
+
+
+def test_a_tighter_limit_of_the_drive_s_own_stays(make, tight):
+    drive = make(MonotonicClock())
+    found = preflight(drive)
+    assert found.refused == ()
+    assert {index: tight.value(index) for index in TIGHT} == TIGHT
+    assert not [entry for entry in tight.writes if entry[0] in TIGHT]
+    assert (found.kept_torque_nm, found.kept_speed_rad_s) == (pytest.approx(100.0), pytest.approx(4.18879))
+    rows = {check.name: check for check in found.checks}
+    for row, text, flag in (("torque limit", "100 N·m", "torque"), ("speed limit", "4.18879 rad/s", "speed"),
+                            ("quick-stop ramp", "20.0015 rad/s²", "quick-stop")):
+        assert rows[row].outcome is Outcome.NOTE
+        assert text in rows[row].found
+        assert "kept" in rows[row].found
+        assert f"--accept-wider-limit {flag}" in rows[row].next_step
+
+
+@pytest.mark.parametrize("limit", sorted(WIDER))
+def test_it_is_widened_by_name_and_no_other_with_it(make, tight, limit):
+    drive = make(MonotonicClock())
+    drive.connect()
+    found = drive.preflight(dataclasses.replace(LIMITS, accept_wider=frozenset({limit})))
+    changed = {index for index, raw in TIGHT.items() if tight.value(index) != raw}
+    assert changed == {WIDER[limit]}
+    (row,) = [check for check in found.checks if "accepted by --accept-wider-limit" in check.found]
+    assert row.outcome is Outcome.NOTE
+    assert row.where == f"{WIDER[limit]:04X}h"
+    before = {"torque": "was 100 N·m", "speed": "was 4.18879 rad/s", "quick-stop": "was 20.0015 rad/s²"}[limit]
+    assert before in row.found
+    drive.close()
+    assert {index: tight.value(index) for index in TIGHT} == TIGHT
+
+
+def test_a_wider_limit_is_tightened_unasked_and_both_values_are_told(make, peer):
+    rows = {check.name: check for check in preflight(make()).checks}
+    assert rows["torque limit"].found == "300 N·m (was 900 N·m)"
+    assert rows["torque limit"].outcome is Outcome.OK
+
+
+def test_a_torque_limit_between_two_counts_is_rounded_down(make, peer):
+    """One up would let the drive give more than rig.yaml allows."""
+    drive = make()
+    drive.connect()
+    drive.preflight(dataclasses.replace(LIMITS, torque_nm=299.7))
+    assert peer.value(0x6072) == 299

@@ -112,3 +112,40 @@ def test_the_probe_goes_no_farther_than_it_may(world):
     result = here.runner().run()
     assert "without a clear direction" in str(result.cause)
     assert here.drive.speed == 0.0
+
+
+class TightDrive(FakeDrive):
+    """Its own limits were tighter than the rig's, and stayed."""
+
+    kept = (None, None)
+
+    def preflight(self, limits):
+        torque_nm, speed_rad_s = self.kept
+        return replace(super().preflight(limits), kept_torque_nm=torque_nm, kept_speed_rad_s=speed_rad_s)
+
+
+@pytest.mark.parametrize(("kept", "flag"), [
+    ((0.0, None), "--accept-wider-limit torque"),
+    ((None, 0.4), "--accept-wider-limit speed"),              # the window begins at 0.5
+])
+def test_limits_of_the_drive_that_leave_no_room(world, kept, flag):
+    here = world(TightDrive())
+    here.drive.kept = kept
+    result = here.runner().run()
+    assert int(exit_code(result.cause)) == 4
+    assert flag in result.cause.next_step
+    assert_nothing_moved(here, result)
+
+
+def test_the_run_keeps_within_the_drive_s_own_limits(world):
+    here = world(TightDrive())
+    here.drive.kept = (150.0, 4.0)
+    seen = []
+
+    def confirm(task, preflight, idle):
+        seen.append(task.limits)
+        raise PreflightRefused("seen enough")
+
+    here.runner(confirm=confirm).run()
+    (limits,) = seen
+    assert (limits.torque_nm, limits.probe_torque_nm, limits.speed_max_rad_s) == (150.0, 150.0, 4.0)
