@@ -148,6 +148,7 @@ class Preflight:
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
     kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
     kept_speed_rad_s: float | None = None        # (`drivers.wider`)
+    quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows
 
     @property
     def watched(self) -> bool:

@@ -17,6 +17,9 @@ from drivers.table import Table
 from drivers.wider import SPEED, TORQUE
 from profiles.schema import CanopenProfile
 
+_HOLDS_FROM, _LAST_OPTION = 5, 8
+"""CiA 402-2, 605Ah: codes after which quick stop active is kept; above the second they are reserved."""
+
 STILL_LSB, STILL_RAD_S = 5, 0.05
 """Velocity counts, or speed where a count is less, that are the noise of a shaft at rest."""
 
@@ -120,6 +123,21 @@ def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> No
     table.attempt("targets", "0", ", ".join(f"{index:04X}h" for index, _ in targets), work)
 
 
+def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
+    """Does the drive hold the shaft once a quick stop has brought it to rest? By the profile, and by 605Ah.
+
+    CiA 402-2, 605Ah: with 5 to 8 it stays in quick stop active, with 0 to 4 it switches its torque off; negative codes
+    are the manufacturer's. None: neither the drive nor the profile tells.
+    """
+    entry = profile.quick_stop
+    if entry.ends == "off":
+        return False
+    code = objects.read_if_there(0x605A, signed=True)
+    if code is None and entry.option_code is None:
+        return True if "ends" in entry.model_fields_set else None
+    return None if code is None or code < 0 or code > _LAST_OPTION else code >= _HOLDS_FROM
+
+
 def report(
     table: Table,
     identity: Identity,
@@ -148,4 +166,5 @@ def report(
         torque_setpoint="6071h",
         kept_torque_nm=kept.get(TORQUE),
         kept_speed_rad_s=kept.get(SPEED),
+        quick_stop_holds=quick_stop_holds(objects, profile),
     )

@@ -167,6 +167,7 @@ class ModbusDrive:
             safe_action=profile.watchdog.reaction if watched else "none",
             filters=filters,
             torque_setpoint=register_name(target.register_) if target is not None else "none",
+            quick_stop_holds=profile.quick_stop.ends == "quick_stop",
         )
 
     def _off_word(self) -> int:

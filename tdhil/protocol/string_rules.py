@@ -7,12 +7,8 @@ from drivers.errors import PreflightRefused
 from drivers.no_watchdog import FLAG
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 
-_LETS_GO = ("coast", "none")
-"""Reactions to a silent host after which nothing holds the string."""
-
-_QUICK_STOP_ROW = "quick-stop option"
-_HOLDS_FROM = 5
-"""CiA 402-2, 605Ah: with 5 to 8 the drive holds the shaft after a quick stop, below it switches its torque off."""
+_LETS_GO = ("coast", "none", "fault_reaction")
+"""Reactions to a silent host after which nothing holds the string; a drive in fault has its torque off (CiA 402)."""
 
 
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
@@ -44,11 +40,13 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
             where="watchdog of the profile",
             next_step="Choose a reaction that brakes and holds: in CiA 402 object 6007h = 3 (quick stop)",
         )
-    for check in preflight.checks:
-        if check.name == _QUICK_STOP_ROW and check.found.isdecimal() and int(check.found) < _HOLDS_FROM:
-            raise PreflightRefused(
-                f"a drill string hangs on the shaft, and after a quick stop the drive lets go of it (option"
-                f" {check.found})",
-                where=check.where,
-                next_step="Use a profile whose quick_stop.option_code is 5 or 6",
-            )
+    if not preflight.quick_stop_holds:
+        known = preflight.quick_stop_holds is not None
+        raise PreflightRefused(
+            "a drill string hangs on the shaft, and "
+            + ("the drive lets go of it after a quick stop" if known
+               else "nobody knows whether the drive holds it after a quick stop"),
+            where="quick_stop of the profile",
+            next_step="Use a drive that stays in quick stop (605Ah = 5 or 6), or run without the string"
+            if known else "Look it up in the drive's manual, and write quick_stop.ends into a profile of your own",
+        )

@@ -46,6 +46,8 @@ def test_identity_and_preflight(run):
     assert found.speed_resolution_rad_s == pytest.approx(run.bench.speed_lsb)
     assert found.watchdog_s == run.bench.limits.watchdog_s
     assert found.safe_action == "quick_stop"
+    # Where the drive stays after a quick stop was written down by hand for each bench.
+    assert found.quick_stop_holds is (run.bench.ends is PowerState.QUICK_STOP)
     assert all(check.where for check in found.checks if check.outcome is not Outcome.NOTE)
 
 

@@ -62,6 +62,25 @@ def test_what_then_stands_in_the_drive(make, peer):
     assert peer.value(0x6071) == peer.value(0x60FF) == 0
 
 
+@pytest.mark.parametrize(("option", "ends", "there", "holds"), [
+    (6, None, 6, True), (5, None, 5, True), (8, None, 8, True), (2, None, 2, False), (0, None, 0, False),
+    (4, None, 4, False), (9, None, 9, None), (-1, None, -1, None), (6, "off", 6, False), (None, None, 2, False),
+    (None, None, 6, True), (None, None, None, None), (None, "quick_stop", None, True), (None, "off", None, False),
+])
+def test_whether_a_quick_stop_holds_the_shaft(make, peer, profile, option, ends, there, holds):
+    """CiA 402-2, 605Ah: 5 to 8 stay in quick stop active. Without the object the profile's own word counts."""
+    if there is None:
+        del peer.objects[(0x605A, 0)]
+    else:
+        peer.objects[(0x605A, 0)] = u(there & 0xFFFF, 2)
+    entry = profile.quick_stop.model_dump(exclude_unset=True, exclude={"ends"}) | {"option_code": option}
+    entry |= {} if ends is None else {"ends": ends}
+    stop = type(profile.quick_stop).model_validate(entry)
+    found = preflight(make(changed=profile.model_copy(update={"quick_stop": stop})))
+    assert found.refused == ()
+    assert found.quick_stop_holds is holds
+
+
 def test_nothing_is_switched_on_meanwhile(make, peer, wire):
     preflight(make())
     assert peer.machine.state == OFF

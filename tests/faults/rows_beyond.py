@@ -15,6 +15,14 @@ UNITS: dict[int, Row] = {
 }
 
 STAGES: dict[int, Row] = {
+    85: Row("a drill string, and a drive whose quick stop lets go of it", "R", "4",
+            ("tests/faults/test_stage_rows.py::test_a_string_and_a_quick_stop_that_lets_go",
+             "tests/protocol/test_stop_string.py::test_what_a_string_forbids",
+             "tests/drivers/test_preflight.py::test_whether_a_quick_stop_holds_the_shaft")),
+    86: Row("somebody else drives the shaft on against the quick stop", "the drive is fed no more: WD", "as its cause",
+            ("tests/protocol/test_stop_looks.py::"
+             "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
+            "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
 }
 
 COMMAND_LINE: dict[int, Row] = {

@@ -44,6 +44,7 @@ class FakeDrive:
     direction: float = 1.0               # -1: encoder the wrong way round
     refused: tuple[Check, ...] = ()
     modes: frozenset[Mode] = frozenset(Mode)
+    quick_stop_holds: bool | None = True
     simulated: bool = True
     shaft_locked: bool = False
     misbehave: Misbehaviour | None = None
@@ -78,6 +79,7 @@ class FakeDrive:
             switch_while_enabled=True, quick_stop_in_torque_mode=self.quick_stop_in_torque_mode,
             rated_torque_nm=1000.0, torque_resolution_nm=TORQUE_RESOLUTION, speed_resolution_rad_s=SPEED_RESOLUTION,
             watchdog_s=limits.watchdog_s, safe_action="quick_stop",
+            quick_stop_holds=self.quick_stop_holds,
         )
 
     def reset_fault(self) -> None:
