@@ -32,11 +32,18 @@ def conclude(
     options = Options(**known)
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
-    said = (*(warnings or ()), *no_watchdog.warnings(run))
+    said = (*(warnings or ()), *_stop_warnings(run), *no_watchdog.warnings(run))
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
     stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     return result_document(identification, recording, run, log), ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
+
+
+def _stop_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+    """A run whose stop nobody saw through has no result of its own; its replay has one, and says so."""
+    stop = run.get("stop")
+    unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
+    return ("at the end of this run the shaft was NOT seen at rest: the stop was not confirmed",) if unseen else ()
 
 
 def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tdhil.commands.conclude import conclude, print_result, save_report
 from tdhil.commands.models import MODELS
 from tdhil.commands.quantities import share
 from tdhil.errors import ExitCode, UsageError
 from tdhil.record.errors import LogError, NothingRecoverable
+
+if TYPE_CHECKING:
+    from tdhil.record.ended import Ended
+    from tdhil.record.reader import Run
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
@@ -64,7 +69,9 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _run_log(namespace: argparse.Namespace, path: Path) -> int:
+    from tdhil.record.ended import find_ended
     from tdhil.record.reader import read_run
+    from tdhil.record.recording import aborted_stage
     from tdhil.report.live import stderr_console
 
     for name in _TRACE_ONLY:
@@ -74,7 +81,9 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
         found = read_run(path)
     except LogError as error:
         raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
-    configuration: dict[str, Any] = found.configuration
+    ended = find_ended(found.configuration, found.events)
+    _refuse_empty(found, ended, path)
+    configuration: dict[str, Any] = found.configuration | ({} if ended is None else {"ended": asdict(ended)})
     asked = _asked(namespace)
     if asked:
         configuration = configuration | {"identify": {**configuration.get("identify", {}), **asked}}
@@ -84,8 +93,25 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
         console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
     print_result(document, namespace.json)
     save_report(document, found.recording, namespace.report)
-    whole = found.recording.complete and all(stage.outcome != "aborted" for stage in found.recording.stages)
+    whole = found.recording.complete and aborted_stage(found.recording) is None
     return int(code if whole or code is not ExitCode.OK else ExitCode.PARTIAL)
+
+
+def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
+    """A run that was refused, or ended in setup, holds nothing to identify from: what ended it is all to be said.
+
+    Raises NothingRecorded, with that run's own exit code.
+    """
+    from tdhil.record.errors import NothingRecorded
+
+    if len(found.recording.time_s) and any(stage.name != "setup" for stage in found.stages):
+        return
+    if ended is not None:
+        in_stage = f"in stage {found.stages[-1].name}" if found.stages else "before its first stage"
+        raise NothingRecorded(
+            f"the run in this log ended {in_stage}, with nothing to identify from: {ended.message}",
+            ended.exit_code, where=str(path), next_step=ended.next_step,
+        )
 
 
 def _run_trace(namespace: argparse.Namespace, path: Path) -> int:

@@ -34,7 +34,7 @@ from tdhil.identify.record_route import identify_record
 from tdhil.identify.samples import Samples, Stretch, excited_window, stretches, usable_samples
 from tdhil.identify.stepped import with_stepping
 from tdhil.identify.verdict import Evidence, conclude, refused
-from tdhil.record.recording import Recording
+from tdhil.record.recording import Recording, Stage, aborted_stage, before_abort
 
 _ROUGH_REL_SD = 0.1
 _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
@@ -43,7 +43,22 @@ _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the i
 def identify(recording: Recording, options: Options | None = None) -> Identification:
     """Identify the inertia. Pure: the same recording gives the same bits. Never raises on bad data: it refuses."""
     options = options or Options()
-    return with_stepping(_identify(recording, options), recording, options)
+    stage, kept = aborted_stage(recording), before_abort(recording)
+    found = with_stepping(_identify(kept, options), kept, options)
+    return found if stage is None else _of_an_aborted_run(found, stage)
+
+
+def _of_an_aborted_run(found: Identification, stage: Stage) -> Identification:
+    """The abort goes before whatever the rest of the data says: without it they might have said something else."""
+    cause = f" ({stage.detail})" if stage.detail else ""
+    if found.inertia is not None:
+        said = f"the run was aborted in stage {stage.name}{cause}: the result is from what was recorded before"
+        return replace(found, warnings=(said, *found.warnings))
+    return replace(
+        found,
+        reason=f"the run was aborted in stage {stage.name}{cause}; what was recorded before can't tell: {found.reason}",
+        advice="mend what ended the run, and run it again",
+    )
 
 
 def _identify(recording: Recording, options: Options) -> Identification:

@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 
 from drivers.drive import Command, Drive, Limits, Mode, Outcome, Preflight, Sample
 from drivers.errors import PreflightRefused
-from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.braking_probe import NOT_YET, slow_down
@@ -79,6 +78,8 @@ class Runner:
         finally:
             if self._stop is not None:
                 report = self._stop.run()
+                with suppress(Exception):
+                    self._log.configure(stop={"confirmed": report.confirmed, "at_rest_s": report.at_rest_s})
                 with suppress(Exception):
                     for trouble in report.trouble:
                         self._log.event(self._drive.clock.now_s(), "stop", trouble)
@@ -250,10 +251,7 @@ class Runner:
 
     def _log_failure(self, error: BaseException) -> None:
         try:
-            if isinstance(error, Interrupted):
-                self._log.event(self._drive.clock.now_s(), "interrupted", str(error))
-            else:
-                self._log.failure(self._drive.clock.now_s(), error)
+            self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
             error.add_note(f"and the log did not take it: {also}")
 

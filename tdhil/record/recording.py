@@ -4,13 +4,21 @@ Pure data. `tdhil replay` builds it from run.mcap, a live run from its own sampl
 the last bit, and so must what is identified from them.
 """
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+ABORTED: Final = "aborted"
+"""Outcome of a stage that did not come to its end."""
+
+MARGIN_S: Final = 1.0
+"""What leads up to an abort is left out too: the fault is in the signals before anybody can have noticed it."""
 
 
 @dataclass(frozen=True)
@@ -122,3 +130,48 @@ class Recording:
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did
+
+
+def aborted_stage(recording: Recording) -> Stage | None:
+    """The first stage that did not come to its end."""
+    return next((stage for stage in recording.stages if stage.outcome == ABORTED), None)
+
+
+def before_abort(recording: Recording) -> Recording:
+    """What may be identified from: all up to a moment before the first aborted stage gave up, or all there is.
+
+    An aborted run is stopped in the same record: samples of braking and of the shaft at rest follow those of the
+    motion that was planned. Segments end with their last whole period.
+    """
+    stage = aborted_stage(recording)
+    if stage is None or not math.isfinite(stage.end_s):
+        return recording
+    end_s = stage.end_s - MARGIN_S
+    # Times that don't rise are refused later, by those who look at samples: nothing is sorted or searched here.
+    kept = recording.time_s < end_s
+    excitation = recording.excitation
+    return replace(
+        recording,
+        time_s=recording.time_s[kept],
+        speed_rad_s=recording.speed_rad_s[kept],
+        torque_nm=recording.torque_nm[kept],
+        fresh=recording.fresh[kept],
+        limited=recording.limited[kept],
+        excitation=None if excitation is None else _cut(excitation, end_s),
+        levels=tuple(Level(one.start_s, min(one.end_s, end_s)) for one in recording.levels if one.start_s < end_s),
+        ramps=tuple(Ramp(one.start_s, min(one.end_s, end_s)) for one in recording.ramps if one.start_s < end_s),
+    )
+
+
+def _cut(excitation: Excitation, end_s: float) -> Excitation | None:
+    """None where all of it was still to come: then nothing was excited."""
+    kept = tuple(_whole(one, end_s) for one in excitation.segments if one.start_s < end_s)
+    return None if excitation.segments and not kept else replace(excitation, segments=kept)
+
+
+def _whole(segment: Segment, end_s: float) -> Segment:
+    if not segment.end_s > end_s or not segment.period_s > 0.0:
+        return segment
+    periods = math.floor((end_s - segment.start_s) / segment.period_s)
+    # A segment without a whole period keeps a part of one, which counts for nothing.
+    return replace(segment, end_s=segment.start_s + periods * segment.period_s if periods else end_s)

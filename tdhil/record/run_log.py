@@ -8,8 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from drivers.drive import Command, RawFrame, Sample
+from tdhil.errors import Interrupted
 from tdhil.record.builder import RecordingBuilder
-from tdhil.record.event import Event
+from tdhil.record.ended import ended_by
+from tdhil.record.event import FAILURE, INTERRUPTED, Event
 from tdhil.record.recording import Excitation, Level, Ramp, Recording, Stage
 from tdhil.record.writer import RunWriter
 
@@ -45,8 +47,12 @@ class RunLog:
 
     def failure(self, time_s: float, error: BaseException) -> None:
         """What ended a run, with its traceback: for us, in the log; the user gets the message alone."""
+        self.configure(ended=ended_by(error, time_s))
+        if isinstance(error, Interrupted):
+            self._writer.event(Event(time_s, INTERRUPTED, str(error)))
+            return
         trace = "".join(traceback.format_exception(error))
-        self._writer.event(Event(time_s, "failure", f"{type(error).__name__}: {error}", trace))
+        self._writer.event(Event(time_s, FAILURE, f"{type(error).__name__}: {error}", trace))
 
     def stage(self, stage: Stage) -> Stage:
         """A stage that has ended; as it stands in the log: degraded where the log could not take all of it."""

@@ -48,6 +48,7 @@ def result_document(
         "warnings": list(found.warnings),
         "simulated": recording.simulated,
         "complete": recording.complete,
+        "ended": run.get("ended"),
         "log": log,
         "cycles": run.get("counters"),
         "cycle": run.get("cycle"),

@@ -35,6 +35,13 @@ COMMAND_LINE: dict[int, Row] = {
 }
 
 LOG: dict[int, Row] = {
+    105: Row("replay of a run that was aborted and came to rest", "what came before the abort counts; it is named", "3",
+             ("tests/path/test_replay_ended.py::test_an_aborted_run_is_a_partial_result",
+              "tests/identify/test_aborted.py::test_whatever_follows_the_abort_the_result_is_the_same"),
+             "result with a warning that names stage and cause"),
+    106: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
+             ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
+             "what, where, and the next step"),
 }
 
 BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG
