@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import Protocol, TypeVar
+from threading import Event, Thread
+from typing import Generic, Protocol, TypeVar
 
 from drivers.drive import Command, Drive, Mode, PowerState, Sample
 from drivers.errors import DriveFault, ModeNotConfirmed
@@ -128,27 +128,56 @@ class Bench:
         In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
         there, signs of life that move no time on are all that goes out. In real time the arithmetic has to hand over
         the interpreter sooner than usual, or cycles would come late.
-        """
-        stepped = self.drive.clock.stepped
-        usual_s = sys.getswitchinterval()
-        sys.setswitchinterval(min(usual_s, SWITCH_S))
-        try:
-            with ThreadPoolExecutor(max_workers=1) as pool:
-                future = pool.submit(work)
-                while not future.done():
-                    if stepped:
-                        self._wait_alive(future)
-                    else:
-                        cycle()
-                return future.result()
-        finally:
-            sys.setswitchinterval(usual_s)
 
-    def _wait_alive(self, future: Future[T]) -> None:
+        Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
+        may be turning without a setpoint meanwhile. It goes on by itself, beside the stop, and what comes of it is
+        dropped.
+        """
+        beside = _Beside(work)
+        while not beside.ended.is_set():
+            if self.drive.clock.stepped:
+                self._wait_alive(beside.ended)
+            else:
+                cycle()
+        return beside.result()
+
+    def _wait_alive(self, ended: Event) -> None:
         """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
         if self._stop_request.signum is not None:
             raise Interrupted(self._stop_request.signum)
-        wait([future], timeout=ALIVE_S)
         keep_alive = getattr(self.drive, "keep_alive", None)
-        if keep_alive is not None and not future.done():
+        if not ended.wait(ALIVE_S) and keep_alive is not None:
             keep_alive()
+
+
+class _Beside(Generic[T]):
+    """Work in a thread of its own, begun at once, that nobody has to wait for: neither a stop nor the process's end.
+
+    As long as it runs, whoever controls the shaft gets the interpreter sooner than usual, also once the work has been
+    left alone.
+    """
+
+    def __init__(self, work: Callable[[], T]) -> None:
+        self.ended = Event()
+        self._work = work
+        self._found: list[T] = []
+        self._failure: BaseException | None = None
+        self._usual_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._usual_s, SWITCH_S))
+        # A pool's threads are joined when the interpreter ends; a daemon is not.
+        Thread(target=self._run, name="tdhil-beside", daemon=True).start()
+
+    def result(self) -> T:
+        """Once it has ended: what it gave, or raises what it raised."""
+        if self._failure is not None:
+            raise self._failure
+        return self._found[0]
+
+    def _run(self) -> None:
+        try:
+            self._found.append(self._work())
+        except BaseException as error:         # raised where the result is asked for
+            self._failure = error
+        finally:
+            sys.setswitchinterval(self._usual_s)
+            self.ended.set()
