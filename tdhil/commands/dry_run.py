@@ -236,7 +236,8 @@ def _conclusions(planned: Planned) -> list[str]:
     stopping = planned.stopping
     if not math.isfinite(planned.half_width):
         return [NOT_PREDICTED if math.isnan(planned.half_width) else NOTHING_TO_EXPECT]
-    found = [f"expected interval of J: ±{100.0 * planned.half_width:.2g} % after {planned.duration_s:.0f} s"]
+    share = f"±{100.0 * planned.half_width:.2g} %"
+    found = [f"expected interval of J: {share} after {planned.duration_s:.0f} s (repeatability)"]
     if stopping is not None and not stopping.reachable:
         found.append(f"±{100.0 * stopping.tolerance:.3g} % is not to be expected: {stopping.advice}")
     elif stopping is not None:

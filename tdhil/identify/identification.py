@@ -39,8 +39,9 @@ class Estimate:
 class InertiaEstimate:
     """Moment of inertia at the motor shaft, kg·m².
 
-    ``low``/``high`` hold if the drive's torque scale is exact and whatever else ``conditional_on`` names;
-    ``low_total``/``high_total`` include the uncertainty of the torque scale.
+    ``low_total``/``high_total`` is the interval to quote: it includes the uncertainty of the drive's torque scale.
+    ``low``/``high`` hold if that scale is exact, and whatever else ``conditional_on`` names: how well another run on
+    this drive would repeat the value.
     """
 
     value: float

@@ -33,6 +33,7 @@ from tdhil.identify.paper_method import paper_estimate
 from tdhil.identify.record_route import identify_record
 from tdhil.identify.samples import Samples, Stretch, excited_window, stretches, usable_samples
 from tdhil.identify.stepped import with_stepping
+from tdhil.identify.torque_scale import widened_most_by_scale
 from tdhil.identify.verdict import Evidence, conclude, refused
 from tdhil.record.recording import Recording, Stage, aborted_stage, before_abort
 
@@ -45,6 +46,8 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     options = options or Options()
     stage, kept = aborted_stage(recording), before_abort(recording)
     found = with_stepping(_identify(kept, options), kept, options)
+    if found.verdict is Verdict.VALID and found.inertia is not None and widened_most_by_scale(found.inertia):
+        found = replace(found, advice="the drive's torque, checked against a known one, would sharpen this most")
     return found if stage is None else _of_an_aborted_run(found, stage)
 
 

@@ -32,4 +32,10 @@ def with_total(
 def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetLine:
     """The last line of a budget."""
     half = scale_half_width(value, rel_sd, confidence)
-    return BudgetLine("torque scale", half, "of the drive; in the total interval only")
+    return BudgetLine("torque scale", half, "of the drive; not in repeatability")
+
+
+def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
+    """Is the torque scale more of the total interval than all else together?"""
+    repeatable, total = inertia.high - inertia.low, inertia.high_total - inertia.low_total
+    return total > 0.0 and total * total > 2.0 * repeatable * repeatable

@@ -163,7 +163,7 @@ def _words(
     if verdict is Verdict.VALID:
         return fits, "identical filters on reported speed and torque, or known ones, would sharpen this further"
     advice = "excite with more amplitude or for longer" + (", and about two mean speeds" if tie is None else "")
-    return f"{fits}, but the interval is ±{relative:.2%}, wider than ±{options.tolerance:.2%}", advice
+    return f"{fits}, but the repeatability is ±{relative:.2%}, wider than ±{options.tolerance:.2%}", advice
 
 
 def _caveats(result: RigidResult, tie: ViscousTie | None, as_paper: bool) -> tuple[str, ...]:

@@ -81,7 +81,8 @@ class Planned:
         if not math.isfinite(self.half_width):
             return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
         noise = f"noise {self.known.noise.source}"
-        expected = f"expected interval of J: ±{100.0 * self.half_width:.2g} % after {self.duration_s:.0f} s ({noise})"
+        share = f"±{100.0 * self.half_width:.2g} %"
+        expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
         if self.stopping is None or self.stopping.reachable:
             return expected
         return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"

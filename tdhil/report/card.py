@@ -10,9 +10,15 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from tdhil.report.card_parts import budget_table, compliant_rows, estimate_text, friction_rows, opinion_rows
+from tdhil.report.card_parts import (
+    budget_table,
+    compliant_rows,
+    estimate_text,
+    friction_rows,
+    inertia_text,
+    opinion_rows,
+)
 from tdhil.report.document import SIMULATED
-from tdhil.report.numbers import percent, with_interval
 
 _VERDICT_STYLE = {
     "valid": "bold green",
@@ -31,15 +37,12 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
     rows.add_row("verdict", Text(verdict, style=_VERDICT_STYLE.get(verdict, "bold")))
     inertia = document["inertia_kg_m2"]
     if inertia is not None:
-        half = 0.5 * (inertia["high"] - inertia["low"])
-        shown = with_interval(inertia["value"], inertia["low"], inertia["high"], "kg·m²")
         title = f"J, {100 * inertia['confidence']:g} % interval"
-        rows.add_row(title, Text(f"{shown}  {percent(half, inertia['value'])}", style="bold"))
-        total = with_interval(inertia["value"], inertia["low_total"], inertia["high_total"], "kg·m²")
-        rows.add_row("with torque scale", total)
+        rows.add_row(title, Text(inertia_text(inertia, "_total"), style="bold"))
         if document["gear_ratio"] != 1.0:
-            main = document["inertia_main_shaft_kg_m2"]
-            rows.add_row("J at main shaft", with_interval(main["value"], main["low"], main["high"], "kg·m²"))
+            rows.add_row("J at main shaft", inertia_text(document["inertia_main_shaft_kg_m2"], "_total"))
+        if inertia["high_total"] > inertia["high"]:
+            rows.add_row("repeatability", f"{inertia_text(inertia)}, this drive")
     if document["reference_inertia_kg_m2"] is not None:
         rows.add_row("reference J", f"{document['reference_inertia_kg_m2']:g} kg·m² (rig.yaml)")
     for title, key, unit in (

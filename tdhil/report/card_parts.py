@@ -78,5 +78,11 @@ def estimate_text(part: Mapping[str, Any], unit: str) -> str:
     return with_interval(part["value"], part["low"], part["high"], unit)
 
 
+def inertia_text(part: Mapping[str, Any], kind: str = "") -> str:
+    """J with the interval that includes the torque scale (``_total``), or that of the repeatability."""
+    value, low, high = part["value"], part["low" + kind], part["high" + kind]
+    return f"{with_interval(value, low, high, 'kg·m²')}  {percent(0.5 * (high - low), value)}"
+
+
 def _plus_minus(part: Mapping[str, Any]) -> str:
     return plus_minus(part["value"], 0.5 * (part["high"] - part["low"]))

@@ -27,7 +27,7 @@ def result_document(
         "model": found.model,
         "reason": found.reason,
         "advice": found.advice,
-        "inertia_kg_m2": None if found.inertia is None else asdict(found.inertia),
+        "inertia_kg_m2": _inertia(found.inertia),
         "inertia_main_shaft_kg_m2": _at_main_shaft(found.inertia, recording.gear_ratio),
         "gear_ratio": recording.gear_ratio,
         "reference_inertia_kg_m2": run.get("reference_inertia_kg_m2"),
@@ -66,12 +66,26 @@ def result_document(
     return cleaned
 
 
+def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
+    """The interval to quote goes first, the torque scale included; then the repeatability on this drive."""
+    if inertia is None:
+        return None
+    found = asdict(inertia)
+    total, repeatability = (half / inertia.value for half in _halves(inertia))
+    first = {name: found.pop(name) for name in ("value", "low_total", "high_total")}
+    return first | {"half_width_total_rel": total} | found | {"repeatability_rel": repeatability}
+
+
+def _halves(inertia: InertiaEstimate) -> tuple[float, float]:
+    return 0.5 * (inertia.high_total - inertia.low_total), 0.5 * (inertia.high - inertia.low)
+
+
 def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[str, float] | None:
     """J·i² with i = ω_motor/ω_main."""
     if inertia is None:
         return None
     squared = gear_ratio * gear_ratio
-    names = ("value", "low", "high", "low_total", "high_total")
+    names = ("value", "low_total", "high_total", "low", "high")
     return {name: getattr(inertia, name) * squared for name in names}
 
 
@@ -82,7 +96,9 @@ def _compliant(found: Identification) -> dict[str, Any] | None:
         return None
     motor = found.inertia
     return {
-        "motor_inertia_kg_m2": None if motor is None else {n: getattr(motor, n) for n in ("value", "low", "high")},
+        "motor_inertia_kg_m2": None if motor is None else {
+            n: getattr(motor, n) for n in ("value", "low_total", "high_total", "low", "high")
+        },
         "load_inertia_kg_m2": _estimate(shaft.load_inertia),
         "total_inertia_kg_m2": _estimate(shaft.total_inertia),
         "stiffness_nm_rad": _estimate(shaft.stiffness_nm_rad),

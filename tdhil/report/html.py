@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import UsageError
 from tdhil.record.recording import Recording
-from tdhil.report.card_parts import estimate_text
+from tdhil.report.card_parts import estimate_text, inertia_text
 from tdhil.report.document import SIMULATED
 from tdhil.report.html_rows import estimate_rows, fact_rows
 from tdhil.report.html_template import TEMPLATE
@@ -55,7 +55,8 @@ def report_page(document: Mapping[str, Any], recording: Recording) -> str:
 
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters.update(minutes=minutes)
-    environment.globals.update(interval=estimate_text, plus_minus=plus_minus, percent=percent)
+    environment.globals.update(interval=estimate_text, plus_minus=plus_minus, percent=percent, inertia=inertia_text)
+    environment.globals.update(total=partial(inertia_text, kind="_total"))
     pictures = {name: Markup(svg) for name, svg in _pictures(document, recording).items()}     # our own SVG
     return environment.from_string(TEMPLATE).render(
         d=document,

@@ -37,10 +37,12 @@ def estimate_rows(document: Mapping[str, Any]) -> Estimates:
         part = document[key]
         if part is None or (key == "inertia_main_shaft_kg_m2" and document["gear_ratio"] == 1.0):
             continue
-        found.append((title, part, unit))
         if "low_total" in part:
             total = {"value": part["value"], "low": part["low_total"], "high": part["high_total"]}
-            found.append((f"{title}, torque scale included", total, unit))
+            found.append((title, total, unit))
+            found.append((f"{title}: repeatability, this drive", part, unit))
+        else:
+            found.append((title, part, unit))
     shaft = document["compliant"]
     if shaft is not None:
         found += [(title, shaft[key], unit) for title, key, unit in _COMPLIANT if shaft[key] is not None]

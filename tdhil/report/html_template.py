@@ -23,15 +23,14 @@ figure { margin: .5rem 0 } figcaption { color: #555; max-width: 54rem }
 <h1>Moment of inertia at the motor shaft</h1>
 <div class="answer {{ colour }}">
 {% if d.inertia_kg_m2 %}{% set j = d.inertia_kg_m2 %}
-<p class="big">{{ "J_r" if d.compliant else "J" }} = {{ interval(j, "kg·m²") }}</p>
+<p class="big">{{ "J_r" if d.compliant else "J" }} = {{ total(j) }}</p>
 {% if d.compliant %}<p class="half">of a compliant shaft's motor side; J_r + J_L \
 {% if d.compliant.total_inertia_kg_m2 %}= {{ interval(d.compliant.total_inertia_kg_m2, "kg·m²") }}\
 {% else %}left open by the data{% endif %}</p>{% endif %}
-<p class="half">{{ percent(0.5 * (j.high - j.low), j.value) }} at {{ "%g"|format(100 * j.confidence) }} %, if the
-drive's torque is right; with its torque scale's uncertainty \
-{{ interval({"value": j.value, "low": j.low_total, "high": j.high_total}, "kg·m²") }}</p>
+<p class="half">at {{ "%g"|format(100 * j.confidence) }} % confidence, the drive's torque scale included; \
+repeatability, this drive: {{ inertia(j) }}</p>
 {% if d.gear_ratio != 1.0 and d.inertia_main_shaft_kg_m2 %}{% set m = d.inertia_main_shaft_kg_m2 %}
-<p class="half">at the main shaft {{ interval(m, "kg·m²") }}</p>{% endif %}
+<p class="half">at the main shaft {{ total(m) }}</p>{% endif %}
 {% else %}<p class="big">No number</p>{% endif %}
 <p class="verdict">{{ verdict }}</p>
 <p>{{ d.reason[:1]|upper }}{{ d.reason[1:] }}.{% if d.advice %} <i>Advice: {{ d.advice }}.</i>{% endif %}</p>

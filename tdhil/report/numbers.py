@@ -22,8 +22,11 @@ def plus_minus(value: float, half_width: float) -> str:
 
 
 def percent(half_width: float, value: float) -> str:
-    """``±0.8 %`` of the value."""
-    return f"±{100.0 * half_width / abs(value):.2g} %" if value else "±?"
+    """``±0.80 %`` of the value: two significant digits."""
+    if not value or not math.isfinite(half_width):
+        return "±?"
+    share = 100.0 * half_width / abs(value)
+    return f"±{share:.0f} %" if share >= 9.95 else f"±{share:#.2g} %"
 
 
 def minutes(seconds: float) -> str:

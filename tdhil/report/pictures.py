@@ -78,9 +78,9 @@ def draw_opinions(figure: Figure, document: Part) -> None:
     rows: list[tuple[str, Part, str]] = []
     inertia, paper = document["inertia_kg_m2"], document["paper"]
     if inertia is not None:
-        rows.append(("result", inertia, OURS))
         total = {"value": inertia["value"], "low": inertia["low_total"], "high": inertia["high_total"]}
-        rows.append(("with torque scale", total, QUIET))
+        rows.append(("result", total, OURS))
+        rows.append(("repeatability", inertia, QUIET))
     if document["compliant"] is not None and document["compliant"]["total_inertia_kg_m2"] is not None:
         rows.append(("J_r + J_L", document["compliant"]["total_inertia_kg_m2"], OURS))
     rows += [(opinion["route"], opinion["inertia_kg_m2"], PAPER if opinion["agrees"] is False else DARK)

@@ -2,6 +2,7 @@
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from findings import bare, full, open_sided, recording
@@ -9,7 +10,7 @@ from rich.console import Console
 
 from tdhil.report.card import print_card
 from tdhil.report.document import result_document
-from tdhil.report.numbers import plus_minus, with_interval
+from tdhil.report.numbers import percent, plus_minus, with_interval
 
 
 def shown(found, width=80, **changes):
@@ -28,15 +29,30 @@ def test_no_line_is_wider_than_the_terminal(make, width):
 def test_every_part_is_shown():
     card = shown(full())
     for wanted in (
-        "104.00 (103.55 to 104.45) kg·m²  ±0.43 %", "SIMULATED", "motor's side, J_r", "J_L behind the spring",
+        "J, 95 % interval       104.0 (99.9 to 108.1) kg·m²  ±3.9 %",
+        "repeatability          104.00 (103.55 to 104.45) kg·m²  ±0.43 %, this drive",
+        "SIMULATED", "motor's side, J_r", "J_L behind the spring",
         "130.0 (128.0 to 132.0) kg·m²", "500 (480 to 520) N·m/rad", "left open by the data",
         "2.90 rad/s: 83.1 ± 1.5", "7.00 rad/s: 116.20 ± 0.80",
         "130.6 (128.3 to 132.9) kg·m²  agrees, speed change", "DOES NOT AGREE, coast-down",
         "what makes it unsure", "! friction <b>bends</b> & more",
     ):
         assert wanted in card, wanted
+    # the one to quote leads
+    assert card.index("99.9 to 108.1") < card.index("103.55 to 104.45")
     # the largest source first
     assert card.index("torque scale         ") < card.index("noise  ") < card.index("lags  ")
+
+
+def test_where_the_torque_scale_is_exact_there_is_one_interval():
+    exact = replace(full(), inertia=replace(full().inertia, low_total=103.55, high_total=104.45))
+    card = shown(exact)
+    assert "104.00 (103.55 to 104.45) kg·m²  ±0.43 %" in card
+    assert "repeatability" not in card
+
+
+def test_the_main_shaft_s_is_the_one_to_quote_too():
+    assert re.search(r"J at main shaft +416 \(400 to 432\) kg·m²  ±3.9 %", shown(full(), gear_ratio=2.0))
 
 
 def test_open_sides_are_said():
@@ -59,3 +75,4 @@ def test_digits_follow_the_half_width():
     assert plus_minus(1234.5, 120.0) == "1234 ± 120"
     assert plus_minus(5.0, float("inf")) == "5"
     assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"
+    assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±12 %", "±0.034 %"]

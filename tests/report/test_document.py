@@ -32,6 +32,16 @@ def test_every_part_is_in_it():
     assert [line["hertz"] for line in document["lines"]] == [0.1, 0.2, 0.3, 0.4]
 
 
+def test_the_interval_to_quote_goes_before_the_repeatability():
+    document = result_document(full(), recording(gear_ratio=2.0), {}, "run.mcap")
+    inertia = document["inertia_kg_m2"]
+    first = ["value", "low_total", "high_total", "half_width_total_rel", "low", "high"]
+    assert list(inertia)[: len(first)] == first
+    assert inertia["half_width_total_rel"] == pytest.approx(4.1 / 104.0)
+    assert inertia["repeatability_rel"] == pytest.approx(0.45 / 104.0)
+    assert list(document["inertia_main_shaft_kg_m2"]) == ["value", "low_total", "high_total", "low", "high"]
+
+
 def test_a_refusal_has_the_same_keys_with_nothing_in_them():
     empty = result_document(bare(), recording(), {}, "run.mcap")
     assert empty.keys() == result_document(full(), recording(), {}, "run.mcap").keys()
