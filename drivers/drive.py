@@ -99,6 +99,7 @@ class Limits:
     watchdog_s: float
     accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
     accept_wider: frozenset[str] = frozenset()     # of `drivers.wider.NAMES`: own limits that may be made wider
+    accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,7 @@ class Preflight:
     kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
     kept_speed_rad_s: float | None = None        # (`drivers.wider`)
     quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows
+    fed_by_any_client: bool = False    # requests of any other client keep the watchdog from acting, as far as is known
 
     @property
     def watched(self) -> bool:

@@ -13,6 +13,11 @@ from drivers.drive import Check, Outcome
 from drivers.table import Table
 
 FLAG = "--accept-no-watchdog"
+SHARED_FLAG = "--accept-shared-watchdog"
+ANY_CLIENT = (
+    "any other client's requests feed it, too: while one goes on asking, the drive will not stop by itself if this"
+    " computer, the program or the cable fails"
+)
 DIES = "Without it a host that dies would leave the shaft turning"
 NOTHING_STOPS_IT = "the drive will not stop by itself if this computer, the program or the cable fails"
 ACCEPTED_BY = f"accepted by {FLAG}"

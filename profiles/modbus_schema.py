@@ -194,13 +194,36 @@ class ModbusWatchdog(Entry):
     kind: Literal["timeout", "none"]
     parameter: Name | None = Field(default=None, description="the time-out; a parameter with set_to: watchdog, or one "
                                    "that is read and must not be longer than rig.yaml's watchdog_s")
-    fed_by: Literal["any_message", "writes", "control_word"] = Field(
-        default="any_message", description="what restarts the time"
+    fed_by: Literal["any_request", "requests_of_this_connection", "writes", "writes_of_this_connection",
+                    "control_word", "control_word_of_this_connection", "unknown"] = Field(
+        default="unknown",
+        description="what restarts the time: any_request = whatever any client asks, reading included; writes = to any "
+        "register; control_word = to it or a setpoint; of_this_connection = only of the client that commands; "
+        "unknown counts as any_request",
+    )
+    fed_by_confidence: Confidence = Field(
+        default="unverified", description="of fed_by alone: while nobody has verified it, it counts as any_request"
     )
     reaction: Literal["quick_stop", "ramp_stop", "fault_reaction", "coast", "none"] = Field(
         description="what the drive then does; coast = torque off and the shaft runs out"
     )
     reaction_parameter: Name | None = Field(default=None, description="parameter that chooses it, with 'require'")
+
+    request_counter: Register | None = Field(
+        default=None, description="counts the requests to this drive, whoever makes them; function 8 is tried besides"
+    )
+
+    @property
+    def fed_by_any_client(self) -> bool:
+        """Would a client that merely reads keep the drive running when this host has died, as far as anybody knows?"""
+        return self.kind != "none" and (
+            self.fed_by in ("any_request", "unknown") or self.fed_by_confidence == "unverified"
+        )
+
+    @property
+    def fed_by_us_alone(self) -> bool:
+        """Does this host's silence make it act, whatever other clients send?"""
+        return self.fed_by.endswith("_of_this_connection") and self.fed_by_confidence != "unverified"
 
 
 class ModbusFilter(Entry):
@@ -258,7 +281,9 @@ class ModbusCycle(Entry):
     speed: Signal
     torque: Signal
     torque_demand: Signal | None = None
-    functions: tuple[Literal[3, 4, 6, 16, 23], ...] = Field(min_length=1, description="function codes the drive knows")
+    functions: tuple[Literal[3, 4, 6, 8, 16, 23], ...] = Field(
+        min_length=1, description="function codes the drive knows"
+    )
     largest_gap: int = Field(
         default=0, ge=0, le=60, description="registers between two wanted ones that may be read along"
     )

@@ -44,6 +44,7 @@ class Access:
         self._order = order
         self._functions = functions
         self._tap = tap
+        self.asked = 0                 # requests sent to this unit so far
         self._undo: dict[tuple[str, int], Callable[[], None]] = {}
 
     @property
@@ -55,6 +56,7 @@ class Access:
         """One transaction, as it comes."""
         if self._tap is not None:
             self._tap(RawFrame(self.clock.now_s(), True, self._unit, pdu))
+        self.asked += 1
         reply = self._link.transact(self._unit, pdu, timeout_s)
         if self._tap is not None:
             self._tap(RawFrame(reply.received_s, False, self._unit, reply.pdu))

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 from drivers.drive import Limits
 from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus import requests
 from drivers.modbus.access import Access
 from drivers.modbus.limits import write_setting
 from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.rounds import Round
-from drivers.no_watchdog import DIES, settle
+from drivers.no_watchdog import ANY_CLIENT, DIES, SHARED_FLAG, settle
 from drivers.table import Table
 from profiles.modbus_schema import ModbusProfile, Parameter
 
@@ -22,6 +23,8 @@ MEASURED_ROUNDS = 20
 CARRIES, MARGIN = 1.02, 1.1
 """The line carries a period that is this much longer than its slowest usual round; where it doesn't carry what was
 asked for, the period is longer by the second."""
+COUNT_S, COUNT_EVERY_S = 3.0, 0.2
+"""How long a drive that counts its requests is asked for other clients', and how often at least."""
 LEAST_TIMEOUT_S = 0.05
 """For a reply in the cycle. A little late is better than lost: the sample then says how uncertain its time is."""
 
@@ -109,6 +112,63 @@ def arm_watchdog(
         wanted = f"{LEAST_CYCLES * period_s:.2g} to {limits.watchdog_s:g} s"
         tried.row("watchdog", wanted, show(value, parameter), good, where_of(parameter), parameter.advice or DIES)
     return settle(table, tried, accepted, lambda: is_off(access, parameter, found.values))
+
+
+def check_who_feeds(
+    table: Table, access: Access, profile: ModbusProfile, limits: Limits, feed: Callable[[], object], *, simulated: bool
+) -> bool:
+    """A row of what feeds an armed watchdog; whether any other client does.
+
+    Then it is no answer to a dead host, so that is taken by name only: refused otherwise, but of a simulated peer.
+    Where the drive counts its requests, others' are told.
+    """
+    entry = profile.watchdog
+    sure = f"{entry.fed_by.replace('_', ' ')} ({entry.fed_by_confidence})"
+    if not entry.fed_by_any_client:
+        table.note("watchdog fed by", sure, "profile, watchdog.fed_by")
+        return False
+    accepted = limits.accept_shared_watchdog
+    others = _others_requests(access, profile, min(COUNT_EVERY_S, 0.25 * limits.watchdog_s), feed)
+    found = f"{sure}: {ANY_CLIENT}"
+    if others:
+        found += f". Another client is there: {others} requests of others in {COUNT_S:g} s"
+    elif others is None:
+        found += ". Whether one is there can't be known: this drive counts no requests"
+    else:
+        found += f". None asked it anything for {COUNT_S:g} s"
+    if accepted:
+        found += f"; accepted by {SHARED_FLAG}"
+    if simulated or accepted:
+        table.note("watchdog fed by", found, "profile, watchdog.fed_by")
+    else:
+        table.row(
+            "watchdog fed by", "this host alone, or its control word", found, False, "profile, watchdog.fed_by",
+            "Take every other client off the drive (PLC, panel, historian, gateway with several connections); then this"
+            f" drive is taken by name only: {SHARED_FLAG}. If its manual says what feeds its time-out, correct the"
+            " profile",
+        )
+    return True
+
+
+def _others_requests(
+    access: Access, profile: ModbusProfile, every_s: float, feed: Callable[[], object]
+) -> int | None:
+    """How many requests of others came in `COUNT_S`; None where the drive doesn't count them."""
+    def count() -> int:
+        register = profile.watchdog.request_counter
+        return access.read(register) if register is not None else access.once(requests.count_requests(), 1.0).words[0]
+
+    try:
+        first, asked, clock = count(), access.asked, access.clock
+        last = first
+        until_s = clock.now_s() + COUNT_S
+        while clock.now_s() < until_s:
+            clock.wait_until(clock.now_s() + every_s)
+            feed()                     # it is armed already
+            last = count()
+    except (CommunicationLost, PreflightRefused):
+        return None
+    return max(0, (last - first) % 0x1_0000 - (access.asked - asked))
 
 
 def _write(

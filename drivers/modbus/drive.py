@@ -17,7 +17,7 @@ from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, P
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.modbus import preflight as checks
 from drivers.modbus.access import Access
-from drivers.modbus.arming import arm_watchdog, measure_pace
+from drivers.modbus.arming import arm_watchdog, check_who_feeds, measure_pace
 from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
 from drivers.modbus.echoes import check_setpoints, clear_setpoints
 from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
@@ -132,7 +132,7 @@ class ModbusDrive:
             table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm,
             limits.accept_no_watchdog,
         )
-        watched = True
+        watched, shared = True, False
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
@@ -147,6 +147,9 @@ class ModbusDrive:
             watched = arm_watchdog(
                 table, access, profile, limits, rated_nm, found, self.period_s, self._idle_round
             )
+            if watched:
+                simulated = self._identity.simulated
+                shared = check_who_feeds(table, access, profile, limits, self._idle_round, simulated=simulated)
             self._watchdog_s = limits.watchdog_s
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
@@ -168,6 +171,7 @@ class ModbusDrive:
             filters=filters,
             torque_setpoint=register_name(target.register_) if target is not None else "none",
             quick_stop_holds=profile.quick_stop.ends == "quick_stop",
+            fed_by_any_client=shared,
         )
 
     def _off_word(self) -> int:

@@ -1,7 +1,8 @@
-"""Request and reply PDUs of the five functions that are used, pure.
+"""Request and reply PDUs of the functions that are used, pure.
 
 Modbus Application Protocol V1.1b3: 3 read holding registers (section 6.3), 4 read input registers (6.4), 6 write
-single register (6.6), 16 write multiple registers (6.12), 23 read/write multiple registers (6.17), exceptions (7).
+single register (6.6), 8 diagnostics (6.8), 16 write multiple registers (6.12), 23 read/write multiple registers (6.17),
+exceptions (7).
 """
 
 import struct
@@ -9,7 +10,9 @@ from collections.abc import Sequence
 
 from drivers.modbus.errors import BadReply, RegisterRefused
 
-READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY, READ_WRITE = 3, 4, 6, 16, 23
+READ_HOLDING, READ_INPUT, WRITE_ONE, DIAGNOSTICS, WRITE_MANY, READ_WRITE = 3, 4, 6, 8, 16, 23
+REQUESTS_SO_FAR = 0x000E
+"""Sub-function of 8: how many requests were addressed to this server since it was switched on, modulo 65536."""
 EXCEPTION = 0x80
 MOST_READ, MOST_WRITTEN, MOST_WRITTEN_WITH_READ = 125, 123, 121
 
@@ -23,6 +26,11 @@ def read(function: int, address: int, count: int) -> bytes:
 def write_one(address: int, word: int) -> bytes:
     """Function 6."""
     return struct.pack(">BHH", WRITE_ONE, address, word)
+
+
+def count_requests() -> bytes:
+    """Function 8, server message count."""
+    return struct.pack(">BHH", DIAGNOSTICS, REQUESTS_SO_FAR, 0)
 
 
 def write_many(address: int, words: Sequence[int]) -> bytes:
@@ -56,6 +64,10 @@ def words_of(request: bytes, reply: bytes, where: str = "") -> tuple[int, ...]:
         if reply != request[:5]:
             raise _bad(f"the drive acknowledged {reply[:8].hex(' ')}, not {request[:5].hex(' ')}", where)
         return ()
+    if function == DIAGNOSTICS:
+        if len(reply) != 5 or reply[:3] != request[:3]:
+            raise _bad(f"{reply[:8].hex(' ')} to diagnostics {request[:3].hex(' ')}", where)
+        return (int.from_bytes(reply[3:], "big"),)
     count = struct.unpack_from(">H", request, 3)[0]
     if len(reply) != 2 + 2 * count or reply[1] != 2 * count:
         said = f", its own count says {reply[1]}" if len(reply) > 1 else ""
@@ -75,7 +87,7 @@ def reply_length(head: bytes) -> int | None:
     function = head[0]
     if function & EXCEPTION:
         return 2
-    if function in (WRITE_ONE, WRITE_MANY):
+    if function in (WRITE_ONE, WRITE_MANY, DIAGNOSTICS):
         return 5
     if function in (READ_HOLDING, READ_INPUT, READ_WRITE) and len(head) > 1:
         return 2 + head[1]

@@ -4,6 +4,7 @@
 
     03, 04  address count                                     → bytes, words
     06      address word                                      → the same
+    08      000Eh 0 (requests to this drive so far)           → the same, the count
     16      address count bytes words                         → address count
     23      read address count, write address count bytes …   → bytes, words; the writing comes first
     else    exception 1; unknown address 2; bad count or value 3; not now 4
@@ -18,6 +19,7 @@ from typing import NamedTuple
 from sim_bus.modbus.errors import IllegalAddress, IllegalFunction, IllegalValue, Refused
 from sim_bus.modbus.slots import Slot
 
+_REQUESTS_SO_FAR = 0x000E
 _PAIR = Struct(">HH")
 _WRITE = Struct(">HHB")
 _BOTH = Struct(">HHHHB")
@@ -45,14 +47,17 @@ class Bank:
             3: lambda data: Answer(self._read("holding", data)),
             4: lambda data: Answer(self._read("input", data)),
             6: self._write_one,
+            8: self._diagnostics,
             16: self._write_many,
             23: self._read_and_write,
         }
+        self._asked = 0
         self._known = {code: known[code] for code in {3, *functions}}
 
     def answer(self, pdu: bytes) -> Answer:
         """The reply to one request; never raises."""
         code = pdu[0] if pdu else 0
+        self._asked += 1
         try:
             if code not in self._known:
                 raise IllegalFunction
@@ -60,6 +65,11 @@ class Bank:
         except Refused as refused:
             return Answer(bytes((code | 0x80, refused.code)))
         return answer._replace(pdu=pdu[:1] + answer.pdu)
+
+    def _diagnostics(self, data: bytes) -> Answer:
+        if len(data) != _PAIR.size or _PAIR.unpack(data) != (_REQUESTS_SO_FAR, 0):
+            raise IllegalValue
+        return Answer(_PAIR.pack(_REQUESTS_SO_FAR, self._asked & 0xFFFF))
 
     def _read(self, table: str, data: bytes) -> bytes:
         if len(data) != _PAIR.size:

@@ -67,8 +67,12 @@ class EmbeddedModbusDrive:
         """Values of the parameters that have no register: what rig.yaml would have to state."""
         return self.machine.parameters.untold
 
-    def serve(self, unit: int, pdu: bytes, now_s: float) -> tuple[bytes | None, float]:
+    def serve(
+        self, unit: int, pdu: bytes, now_s: float, connection: int = 0
+    ) -> tuple[bytes | None, float]:
         """A request sent at ``now_s``: its reply, and when that is complete; None where nobody answers.
+
+        ``connection`` tells clients apart, where several talk to it.
 
         The plant has then run up to the moment at which the drive acted. A line that isn't free yet delays the request.
         """
@@ -81,7 +85,7 @@ class EmbeddedModbusDrive:
         if unit not in {self.unit, _BROADCAST}:
             self._free_s = acts_s
             return None, acts_s
-        reply = self._faults.request(pdu)
+        reply = self._faults.request(pdu, connection)
         heard = _heard(reply)
         if unit == _BROADCAST or heard is None:
             self._free_s = acts_s

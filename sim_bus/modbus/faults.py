@@ -46,17 +46,17 @@ class Faults:
         if self._cast.moved(now_us, self._machine.note):
             self._machine.application.regulate()
 
-    def request(self, pdu: bytes) -> Reply:
+    def request(self, pdu: bytes, connection: int = 0) -> Reply:
         """A request for the drive, at the time that it is: what comes back."""
-        ask: Ask = self._ask
+        ask: Ask = partial(self._ask, connection=connection)
         if tells_stage(pdu):
             return ask(pdu)
         for fault in self._cast.active:
             ask = partial(fault.asked, ask=ask)
         return ask(pdu)
 
-    def _ask(self, pdu: bytes) -> Reply:
-        return Reply(self._machine.request(pdu))
+    def _ask(self, pdu: bytes, connection: int) -> Reply:
+        return Reply(self._machine.request(pdu, connection))
 
     def _on_stage(self, number: int) -> None:
         now_us = round(1e6 * self._machine.time_s)

@@ -18,17 +18,18 @@ _LONGEST_TCP = 260
 _LONGEST_RTU = 256
 _SILENCE_S = 0.05
 """A pty has no bit rate, and a host may be held up between two bytes: far more than the 1.75 ms of a line."""
-_FIXED = dict.fromkeys((1, 2, 3, 4, 5, 6), 8)
+_FIXED = dict.fromkeys((1, 2, 3, 4, 5, 6, 8), 8)
 _COUNTED = {15: (6, 9), 16: (6, 9), 23: (10, 13)}
 """function: (where its byte count stands, length without what it counts)."""
 
 
 class Request(NamedTuple):
-    """To whom, what, and the transaction that the reply repeats."""
+    """To whom, what, and the transaction that the reply repeats; ``connection`` tells clients apart."""
 
     unit: int
     pdu: bytes
     transaction: int = 0
+    connection: int = 0
 
 
 class NotModbus(Exception):

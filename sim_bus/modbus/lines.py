@@ -54,7 +54,8 @@ class TcpListener:
                 f"can't listen: {getattr(error, 'strerror', None) or error}", where=f"--tcp {host}:{port}",
                 next_step="Take another port (0 takes any free one), or end what listens there",
             ) from error
-        self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
+        self._clients: dict[int, tuple[socket.socket, bytearray, int]] = {}
+        self._accepted = 0             # so many clients so far: the last one's number
         self._silent: list[socket.socket] = []     # half open: never looked at again
         self._late: Late[socket.socket] = Late()
 
@@ -70,14 +71,14 @@ class TcpListener:
         if source == self._server.fileno():
             self._accept()
             return
-        client, buffer = self._clients[source]
+        client, buffer, number = self._clients[source]
         try:
             data = client.recv(4096)
             if not data:
                 raise ConnectionResetError
             buffer += data
             for request in tcp_requests(buffer):
-                reply = serve(request)
+                reply = serve(request._replace(connection=number))
                 if reply.connection:
                     self._let_go(source, reset=reply.connection == "reset")
                     return
@@ -96,7 +97,7 @@ class TcpListener:
                 client.sendall(frame)
 
     def close(self) -> None:
-        for client in [*self._silent, *(client for client, _ in self._clients.values())]:
+        for client in [*self._silent, *(client for client, _, _ in self._clients.values())]:
             client.close()
         self._silent.clear()
         self._clients.clear()
@@ -104,7 +105,7 @@ class TcpListener:
 
     def _let_go(self, source: int, *, reset: bool) -> None:
         """A connection dies: by a reset, or in silence and without an end."""
-        client, _ = self._clients.pop(source)
+        client, _, _ = self._clients.pop(source)
         if reset:
             client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             client.close()
@@ -119,7 +120,8 @@ class TcpListener:
                 return
             client.settimeout(_SEND_TIMEOUT_S)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._clients[client.fileno()] = (client, bytearray())
+            self._accepted += 1
+            self._clients[client.fileno()] = (client, bytearray(), self._accepted)
 
 
 class RtuListener:

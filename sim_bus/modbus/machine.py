@@ -55,6 +55,7 @@ class Machine:
         self._steps = 0
         self._next_row_us = 0
         self._torque_share = 1.0
+        self._connection = 0
         self._was_told = False         # the request that is being answered says which stage has begun
         self.on_time: Callable[[int], None] | None = None      # plant time in µs, after each step
         self.on_stage: Callable[[int], None] = lambda _number: None
@@ -67,8 +68,9 @@ class Machine:
         """Plant time."""
         return self._steps * self._period_s
 
-    def request(self, pdu: bytes) -> bytes:
-        """A request for this drive, at the time that it is."""
+    def request(self, pdu: bytes, connection: int = 0) -> bytes:
+        """A request for this drive, at the time that it is; ``connection`` tells clients apart."""
+        self._connection = connection
         self._was_told = False
         answer = self._bank.answer(pdu)
         if not self._was_told:          # the marker isn't the drive's: what is said there feeds no watchdog
@@ -153,7 +155,8 @@ class Machine:
 
     def _fed(self, answer: Answer) -> None:
         lost = self.watchdog.lost
-        self.watchdog.heard(self.time_s, wrote=answer.wrote, commanded=answer.commanded)
+        self.watchdog.heard(self.time_s, wrote=answer.wrote, commanded=answer.commanded,
+                            connection=self._connection)
         if lost and not self.watchdog.lost:
             self.application.warning = False
             self.note("host is back")

@@ -24,7 +24,9 @@ class Server:
         self._machine = machine
         self._unit = unit
         self._listener = listener
-        self._ask = (lambda pdu: Reply(machine.request(pdu))) if faults is None else faults.request
+        self._ask = (
+            (lambda pdu, connection: Reply(machine.request(pdu, connection))) if faults is None else faults.request
+        )
         self._whole = (unit, _BROADCAST, _ANY_UNIT) if gateway else (unit,)
         self._began_s = time.monotonic()
 
@@ -42,9 +44,9 @@ class Server:
     def _serve(self, request: Request) -> Reply:
         self._catch_up()
         if request.unit in self._whole:
-            return self._ask(request.pdu)
+            return self._ask(request.pdu, request.connection)
         if request.unit == _BROADCAST:
-            self._ask(request.pdu)
+            self._ask(request.pdu, request.connection)
         return NONE
 
     def _catch_up(self) -> None:

@@ -2,19 +2,27 @@
 
 from profiles.modbus_schema import ModbusWatchdog
 
+_OWN = "_of_this_connection"
+
 
 class Watchdog:
     """What feeds it, and for how long it waits."""
 
     def __init__(self, watchdog: ModbusWatchdog) -> None:
-        self._fed_by = watchdog.fed_by
+        self._fed_by = watchdog.fed_by.removesuffix(_OWN)
+        self._own_only = watchdog.fed_by.endswith(_OWN)
+        self._commander: int | None = None
         self._fed_s: float | None = None
         self.lost = False
         """The host has been found silent, and hasn't been heard since."""
 
-    def heard(self, time_s: float, *, wrote: bool, commanded: bool) -> None:
-        """A request for this drive came."""
-        if self._fed_by == "any_message" or (wrote if self._fed_by == "writes" else commanded):
+    def heard(self, time_s: float, *, wrote: bool, commanded: bool, connection: int = 0) -> None:
+        """A request for this drive came; ``connection`` tells clients apart: the first that commands is the host."""
+        if commanded and (self._commander is None or self.lost):
+            self._commander = connection
+        if self._own_only and connection != self._commander:
+            return
+        if {"writes": wrote, "control_word": commanded}.get(self._fed_by, True):
             self._fed_s = time_s
             self.lost = False
 

@@ -11,13 +11,18 @@ from rich.console import Console
 
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
-from drivers.no_watchdog import ACCEPTED_BY, NOTHING_STOPS_IT
+from drivers.no_watchdog import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
 
 WORD = "MOVE"
 _UNWATCHED = "  [ ] somebody stands at that stop for the whole run: nothing else stops the shaft if this host fails\n"
+
+_SHARED = (
+    "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway), and somebody stands at\n"
+    "      that stop for the whole run\n"
+)
 
 
 def confirm_motion(
@@ -58,6 +63,8 @@ def summary(
     """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
     silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
     watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
+    if preflight.watched and preflight.fed_by_any_client:
+        watchdog, seen_to = f"{silent}; but {ANY_CLIENT}", _SHARED
     return (
         f"\nThis run will move {preflight.identity.name}:\n"
         f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"

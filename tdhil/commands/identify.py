@@ -37,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
     drive.add_argument("--accept-no-watchdog", action="store_true",
                        help="take a drive whose watchdog can't be armed: it won't stop by itself if this host dies")
+    drive.add_argument("--accept-shared-watchdog", action="store_true",
+                       help="Modbus: take a drive whose watchdog other clients feed, too: it won't stop by itself if "
+                       "this host dies while one of them goes on asking")
     drive.add_argument("--accept-wider-limit", action="append", choices=("torque", "speed", "quick-stop"),
                        help="let the run widen this limit of the drive's own; otherwise a tighter one stays")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
@@ -144,7 +147,7 @@ def _run(
             outcome = Runner(
                 drive,
                 partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog,
-                        tuple(namespace.accept_wider_limit or ())),
+                        namespace.accept_shared_watchdog, tuple(namespace.accept_wider_limit or ())),
                 log,
                 stop_request,
                 display,
@@ -180,6 +183,7 @@ def _task(
     log: RunLog,
     say: Callable[[str], None],
     accept_no_watchdog: bool,
+    accept_shared_watchdog: bool,
     accept_wider: tuple[str, ...],
     identity: Identity,
 ) -> Task:
@@ -194,7 +198,10 @@ def _task(
         log.configure(unverified=list(accepted_lines(profile, options["accept_unverified"])))
     elif text := note(profile):
         say(text)
-    limits = machine_limits(bench, accept_no_watchdog=accept_no_watchdog, accept_wider=accept_wider)
+    limits = machine_limits(
+        bench, accept_no_watchdog=accept_no_watchdog, accept_shared_watchdog=accept_shared_watchdog,
+        accept_wider=accept_wider,
+    )
     return Task(limits, excitation_request(options), facts(bench))
 
 

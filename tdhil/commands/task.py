@@ -31,11 +31,12 @@ def bench_of(identity: Identity, rig: Rig | None) -> Rig:
 
 
 def machine_limits(
-    bench: Rig, *, accept_no_watchdog: bool = False, accept_wider: Collection[str] = ()
+    bench: Rig, *, accept_no_watchdog: bool = False, accept_shared_watchdog: bool = False,
+    accept_wider: Collection[str] = (),
 ) -> MachineLimits:
     """The guard's limits. Raises PreflightRefused where the rig has none.
 
-    ``accept_no_watchdog`` and ``accept_wider`` are a run's, on its own command line: no file of the bench says them.
+    What is accepted is a run's, on its own command line: no file of the bench says it.
     """
     limits = require_limits(bench)
     return MachineLimits(
@@ -51,6 +52,7 @@ def machine_limits(
         load=bench.load,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
         accept_no_watchdog=accept_no_watchdog,
+        accept_shared_watchdog=accept_shared_watchdog,
         accept_wider=frozenset(accept_wider),
     )
 

@@ -176,7 +176,7 @@ class Runner:
         preflight = self._book.preflight = self._drive.preflight(
             Limits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
-                limits.accept_no_watchdog, limits.accept_wider,
+                limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
             )
         )
         self._display.preflight(preflight)
@@ -193,6 +193,10 @@ class Runner:
             self._log.configure(**no_watchdog.configuration(preflight))
             self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID)
             self._say(no_watchdog.SAID)
+        elif preflight.fed_by_any_client and not identity.simulated:
+            self._log.configure(**no_watchdog.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID_SHARED)
+            self._say(no_watchdog.SAID_SHARED)
         # What the line carries is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s
         task = replace(task, assumptions=task.assumptions.at_period(period_s))

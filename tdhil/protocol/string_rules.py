@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
-from drivers.no_watchdog import FLAG
+from drivers.no_watchdog import FLAG, SHARED_FLAG
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 
 _LETS_GO = ("coast", "none", "fault_reaction")
@@ -32,6 +32,13 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
             f"a drill string hangs on the shaft, and no watchdog is armed in the drive: {FLAG} is not for strings",
             where="load in rig.yaml",
             next_step="Only the drive's own stop is left for a wound-up string when the host fails: arm its watchdog",
+        )
+    if preflight.fed_by_any_client and not preflight.identity.simulated:
+        raise PreflightRefused(
+            f"a drill string hangs on the shaft, and any client feeds the drive's watchdog: {SHARED_FLAG} is not for"
+            " strings",
+            where="load in rig.yaml",
+            next_step="Use a drive, or a setting of this one, whose watchdog only its commanding host feeds",
         )
     if preflight.safe_action in _LETS_GO:
         raise PreflightRefused(

@@ -2,7 +2,7 @@
 
 patient   a host that is silent for less than a minute of wall time is waited for: on a loaded machine a second is
           nothing, and the runs here must repeat. The end of a connection acts at once all the same.
-real      without the simulator's marker object: what the host then sees can't be told from a real drive.
+real      without the simulator's marker object or registers: what the host then sees can't be told from a real drive.
 """
 
 import functools
@@ -10,6 +10,7 @@ import sys
 
 from profiles.marker import MARKER_INDEX
 from sim_bus import cia402_node, command, simulator
+from sim_bus.modbus import slots
 
 
 def be_patient() -> None:
@@ -24,6 +25,7 @@ def be_real() -> None:
         del self.store.object_dictionary[MARKER_INDEX]
 
     cia402_node.Cia402Node.__init__ = without_marker
+    slots._marker = lambda stepped: ()  # type: ignore[attr-defined]
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def test_reactions(reaction: str, state: int, braking: bool, at_rest: bool) -> N
 
 
 @pytest.mark.parametrize(("fed_by", "reads", "parameters", "commands"), [
-    ("any_message", True, True, True), ("writes", False, True, True), ("control_word", False, False, True),
+    ("any_request", True, True, True), ("writes", False, True, True), ("control_word", False, False, True),
 ])
 def test_what_feeds_the_watchdog(fed_by: str, reads: bool, parameters: bool, commands: bool) -> None:
     feeds = {
