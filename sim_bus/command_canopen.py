@@ -13,6 +13,7 @@ from sim_bus.command_common import (
     add_fault_argument,
     add_rig_arguments,
     host_and_port,
+    never_came,
     number_from,
     ready,
     until_stopped,
@@ -64,6 +65,7 @@ def run(namespace: argparse.Namespace) -> int:
             worn = f" profile {profile.name}" if profile is not None else ""
             ready(f"{reached_by} node {namespace.node}{worn}")
             simulator.run(stop)
+            never_came(simulator.faults_waiting)
 
     return until_stopped(simulate)
 

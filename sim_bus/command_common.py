@@ -5,7 +5,7 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -47,6 +47,12 @@ def until_stopped(simulate: Callable[[threading.Event], None]) -> int:
 def ready(text: str) -> None:
     """Tells whoever started the simulator how to reach it."""
     print(f"ready: {text}", flush=True)  # noqa: T201
+
+
+def never_came(faults: Iterable[str]) -> None:
+    """Tells, at the end, which scripted faults had nobody to happen to."""
+    for fault in faults:
+        print(f"simulate: the fault {fault} never came: its moment was not reached", file=sys.stderr)  # noqa: T201
 
 
 def host_and_port(text: str) -> tuple[str, int]:

@@ -9,6 +9,7 @@ from sim_bus.command_common import (
     add_fault_argument,
     add_rig_arguments,
     host_and_port,
+    never_came,
     number_from,
     ready,
     until_stopped,
@@ -79,6 +80,7 @@ def run(namespace: argparse.Namespace) -> int:
                 server = Server(machine, unit, listener, gateway=namespace.tcp is not None, faults=faults)
                 ready(f"modbus {listener.reached_by} unit {unit} profile {profile.name}")
                 server.run(stop)
+                never_came(faults.waiting)
             finally:
                 listener.close()
 

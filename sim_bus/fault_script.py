@@ -63,6 +63,11 @@ class Schedule:
         self._stages_us.setdefault(number, now_us)
         self._next_us = 0
 
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Those whose moment hasn't come, as they were written."""
+        return tuple(fault.text for _, fault in self._waiting)
+
     def due(self, now_us: int) -> tuple[list[int], list[int]]:
         """The numbers of the faults that begin now, and of those that end now."""
         if now_us < self._next_us:
@@ -100,6 +105,11 @@ class Cast(Generic[F]):
         self._schedule = Schedule(script)
         self.all = [make(fault) for fault in script]
         self.active: list[F] = []
+
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Those whose moment hasn't come, as they were written."""
+        return self._schedule.waiting
 
     def stage(self, number: int, now_us: int) -> None:
         """A stage has begun."""

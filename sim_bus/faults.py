@@ -39,6 +39,11 @@ class Faults:
         node.on_time = self.moved
         node.on_stage = self._on_stage
 
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Faults whose moment hasn't come, as they were written."""
+        return self._cast.waiting
+
     def moved(self, now_us: int) -> None:
         """Plant time has come so far."""
         self._cast.moved(now_us, self._node.note)

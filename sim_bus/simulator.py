@@ -63,6 +63,11 @@ class Simulator:
         """Plant time."""
         return self.node.time_us * 1e-6
 
+    @property
+    def faults_waiting(self) -> tuple[str, ...]:
+        """Scripted faults whose moment hasn't come, as they were written."""
+        return self._faults.waiting if self._faults is not None else ()
+
     def run(self, stop: threading.Event) -> None:
         """Serves the bus until ``stop`` is set. The trace is closed at the end."""
         with self._trace:

@@ -17,7 +17,7 @@
     │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
     │   ├── LogRefused              too little space to begin with; nothing moved                4
     │   └── NothingRecoverable      not one message of the file can be read                     10
-    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP (143)
+    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT (143)
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
 broke off ends with 3 as well, since what it holds can be replayed.
@@ -55,7 +55,7 @@ class ExitCode(IntEnum):
     NOT_IDENTIFIABLE = 9        # not identifiable, or the model was rejected
     NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
-    TERMINATED = 143            # SIGTERM, SIGHUP
+    TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\)
 
 
 class UsageError(TdhilError):

@@ -58,6 +58,11 @@ class EmbeddedModbusDrive:
         return self.machine.inverter.speed_rad_s
 
     @property
+    def faults_waiting(self) -> tuple[str, ...]:
+        """Scripted faults whose moment hasn't come, as they were written."""
+        return self._faults.waiting
+
+    @property
     def rated_torque_nm(self) -> float:
         """100 % torque."""
         return self.machine.parameters.rated_torque_nm

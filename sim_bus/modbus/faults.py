@@ -41,6 +41,11 @@ class Faults:
             machine.on_stage = self._on_stage
             self.moved(0)
 
+    @property
+    def waiting(self) -> tuple[str, ...]:
+        """Faults whose moment hasn't come, as they were written."""
+        return self._cast.waiting
+
     def moved(self, now_us: int) -> None:
         """Plant time has come so far."""
         if self._cast.moved(now_us, self._machine.note):

@@ -161,6 +161,11 @@ def _run(
                 reset_fault=namespace.reset_fault,
                 say=display.say,
             ).run()
+        for fault in peer.never_came:
+            with suppress(LogError):
+                log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
+            console.print(f"tdhil: --fault {fault} never came: this run did not reach its moment", style="yellow",
+                          markup=False, soft_wrap=True)
         code = _finish(outcome, log, str(path), bool(options["json"]), console, namespace.report)
     except BaseException:
         with suppress(LogError):  # the first cause stays the cause
@@ -227,7 +232,6 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     """The first cause, how the stop went, and where the log is."""
     import traceback
 
-    from drivers.errors import CommunicationLost
     from tdhil.errors import ExitCode, TdhilError, exit_code
     from tdhil.protocol.stop import not_confirmed
 
@@ -244,10 +248,8 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         loud = not_confirmed(stop)
         console.print(f"tdhil: {loud}", style="bold white on red", markup=False, soft_wrap=True)
         said = str(loud)
-        # Without a bus nothing can be confirmed: then the lost communication is the cause and the watchdog acts.
-        watched = outcome.preflight is None or outcome.preflight.watched
-        if not (isinstance(cause, CommunicationLost) and watched):
-            code = ExitCode.STOP_NOT_CONFIRMED
+        # Whatever came first: a script that reads the code alone must learn that the shaft may still turn.
+        code = ExitCode.STOP_NOT_CONFIRMED
     if stop is None or stop.confirmed:
         console.print(f"tdhil: {said}", markup=False, soft_wrap=True)
     console.print(f"tdhil: log: {path} (tdhil replay {path})", markup=False, soft_wrap=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ class PeerPlan:
     seed: int | None
     plant: Any
     faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
+    never_came: list[str] = field(default_factory=list)    # those of them whose moment the run did not reach
 
     @property
     def epoch_ns(self) -> int:

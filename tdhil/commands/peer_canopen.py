@@ -68,6 +68,8 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
                 )
             )
             channel = can.Bus(interface="virtual", channel=simulator.channel)
+            # Before the simulator runs out by itself: what comes then is no part of the run.
+            stack.callback(lambda: plan.never_came.extend(simulator.simulator.faults_waiting))
         else:
             from tdhil.bus_open import open_bus
 

@@ -103,6 +103,8 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
         rated_nm = drive.rated_torque_nm
 
     def ended() -> None:
+        if not plan.never_came:             # closed more than once, by whoever ends first
+            plan.never_came.extend(drive.faults_waiting)
         drive.run_until(clock.now_s())      # the shaft's trace goes up to now, and on to rest
         drive.run_on()
         drive.close()

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP become a wish to stop, which the control loop sees in its next cycle."""
+"""Ctrl-C, SIGQUIT, SIGTERM and SIGHUP become a wish to stop, which the control loop sees in its next cycle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import FrameType
 
 from tdhil.protocol.settings import StopRequest
 
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # SIGHUP doesn't exist everywhere
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")  # the last three don't exist everywhere
 
 
 @contextmanager

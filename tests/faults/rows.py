@@ -1,7 +1,7 @@
 """The faults that a run must survive, the fifty and those beyond: what each is, what must happen, and its tests.
 
 R refuse before the shaft has moved · QS the stop sequence · WD the drive's own watchdog stops the shaft · M finish, but
-mark what was degraded.
+mark what was degraded. The code is that of the cause, and 8 wherever the host could not see the shaft at rest.
 """
 
 from row import HERE, Row
@@ -57,11 +57,11 @@ FIFTY = {
              "tests/record/test_writer.py::test_a_full_queue_makes_stepped_time_wait",
              "tests/record/test_writer.py::test_a_stage_that_lost_records_is_marked_so_in_the_log"),
             "drops are counted, stand in the log, and the stage is degraded"),
-    12: Row("adapter unplugged", "WD", "5", (f"{ADAPTER}test_row_12_adapter_unplugged", SCRIPTED)),
-    13: Row("bus-off", "stop sending, no automatic restart; WD", "5", (f"{ADAPTER}test_row_13_bus_off",)),
+    12: Row("adapter unplugged", "WD", "8", (f"{ADAPTER}test_row_12_adapter_unplugged", SCRIPTED)),
+    13: Row("bus-off", "stop sending, no automatic restart; WD", "8", (f"{ADAPTER}test_row_13_bus_off",)),
     14: Row("error-passive", "warn, M", "0, 9", (f"{ADAPTER}test_row_14_error_passive",)),
-    15: Row("transmit queue full (ENOBUFS)", "stop sending; WD", "5", (f"{ADAPTER}test_row_15_transmit_queue_full",)),
-    16: Row("bus comes back with queued setpoints", "none is acted on; a new enable is needed", "5",
+    15: Row("transmit queue full (ENOBUFS)", "stop sending; WD", "8", (f"{ADAPTER}test_row_15_transmit_queue_full",)),
+    16: Row("bus comes back with queued setpoints", "none is acted on; a new enable is needed", "8",
             (f"{ADAPTER}test_row_16_a_bus_that_comes_back_with_queued_setpoints",)),
     17: Row("1-10 % of the frames lost", "gaps found, uncertainty widens, M", "0, 9",
             (f"{HERE}test_rows_scripted.py::test_row_with_a_run_that_goes_on", f"{GUARD}test_row_17_lost_frames")),
@@ -81,7 +81,7 @@ FIFTY = {
                   "tests/drivers/test_sdo.py::test_an_abort_names_object_and_code"),
     25: _scripted("SDO time-out", "bounded retry, then abort", "5",
                   "tests/drivers/test_sdo.py::test_a_silent_node_is_given_up_after_a_bounded_time"),
-    26: _scripted("a second master, a duplicate node-ID", "R; QS in motion", "4, 5, 6"),
+    26: _scripted("a second master, a duplicate node-ID", "R; QS in motion", "4, 5, 6, 8"),
     27: Row("wrong bit rate, wrong node-ID", "R with the likely cause", "4",
             (f"{HOST}test_row_27_a_wrong_node_id", "tests/path/test_scan.py::test_a_wrong_bit_rate")),
     28: Row("malformed EDS or profile", "one line with file and line", "2",
@@ -101,12 +101,12 @@ FIFTY = {
     37: Row("NaN, Inf, out-of-range setpoint", "rejected before the bus", "1",
             (f"{HOST}test_row_37_a_setpoint_that_is_none",
              f"{GUARD}test_row_37_a_setpoint_that_is_none_never_reaches_the_bus")),
-    38: Row("Modbus exceptions 1-4, 6", "typed error; 6 is retried", "6, 5",
+    38: Row("Modbus exceptions 1-4, 6", "typed error; 6 is retried", "6, 8",
             ("tests/drivers/test_modbus_drive.py::test_an_exception_in_the_cycle_is_raised_once",
              "tests/drivers/test_modbus_drive.py::test_busy_is_asked_again_within_the_cycle",
              "tests/drivers/test_modbus_drive.py::test_busy_for_good_counts_as_lost"),
             "each is typed and names the register; busy is asked again, for good it counts as lost"),
-    39: Row("Modbus time-out", "retry within the watchdog's time, then QS", "5",
+    39: Row("Modbus time-out", "retry within the watchdog's time, then QS", "8",
             ("tests/drivers/test_modbus_drive.py::test_silence_ends_within_half_the_watchdogs_time_and_is_said_once",),
             "given up within half the watchdog's time"),
     40: Row("late RTU reply taken for the next", "drained and resynchronised", "0",
@@ -121,7 +121,7 @@ FIFTY = {
              "tests/drivers/test_modbus_links.py::test_a_reply_in_pieces",
              "tests/drivers/test_modbus_links.py::test_a_short_reply_on_the_line"),
             "dropped and counted; pieces are put together"),
-    43: Row("TCP reset, half-open connection", "WD; no blind reconnect while enabled", "5",
+    43: Row("TCP reset, half-open connection", "WD; no blind reconnect while enabled", "8",
             ("tests/drivers/test_modbus_links.py::test_a_connection_that_ends_is_not_opened_again",
              "tests/drivers/test_modbus_links.py::test_nothing_queues_up_on_a_connection_that_takes_nothing"),
             "not opened again in this run"),

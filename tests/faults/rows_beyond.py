@@ -28,6 +28,8 @@ STAGES: dict[int, Row] = {
             ("tests/protocol/test_stop_looks.py::"
              "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
+    87: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",
+            ("tests/faults/test_stage_rows.py::test_a_fault_that_never_comes_is_said",)),
 }
 
 COMMAND_LINE: dict[int, Row] = {

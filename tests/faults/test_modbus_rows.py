@@ -74,10 +74,10 @@ ENDS = [
     (38, "exception 4", refusing(4), 1, 6, ("exception 4", "panel")),
     # It answers, and can't be stopped: the hard-wired stop is asked for.
     (38, "exception 2 for good", refusing(2), 10**9, 8, ("exception 2", "address")),
-    (38, "busy for good", refusing(6), 10**9, 5, ("no ", "watchdog")),
-    (39, "silence", silent, 10**9, 5, ("no ", "watchdog")),
-    (40, "every reply late", late, 10**9, 5, ("no ", "watchdog")),
-    (42, "every reply cut short", cut, 10**9, 5, ("no ", "watchdog")),
+    (38, "busy for good", refusing(6), 10**9, 8, ("no ", "watchdog")),
+    (39, "silence", silent, 10**9, 8, ("no ", "watchdog")),
+    (40, "every reply late", late, 10**9, 8, ("no ", "watchdog")),
+    (42, "every reply cut short", cut, 10**9, 8, ("no ", "watchdog")),
 ]
 
 

@@ -148,14 +148,14 @@ def test_a_connection_that_dies(bench, fault, seen):
         out, err = bench.host.communicate(timeout=60.0)
         connections = relay.connections
     standstill_s = bench.wait_at_rest(at_s)
-    assert bench.host.returncode == 5, err
+    assert bench.host.returncode == 8, err
     assert connections == 1, "connected anew while the drive was enabled"
     error = json.loads(out)["error"]
     assert error["kind"] in ("LinkLost", "CommunicationLost", "NoReply")
     assert "127.0.0.1" in error["message"] or "no feedback" in error["message"]
     assert "Traceback" not in err
     assert bench.shaft.events("host silent")
-    seen(43, f"{fault}: {error['message']}", standstill_s, code=5)
+    seen(43, f"{fault}: {error['message']}", standstill_s, code=8)
 
 
 def test_a_foreign_transaction_id_costs_a_sample_and_the_connection(bench, seen):

@@ -35,7 +35,7 @@ def run_with(rehearse, monkeypatch, after_s, act, *arguments):
 
 
 def assert_left_to_the_watchdog(run, acted, seen, row, *words):
-    run.assert_ended(5, *words)
+    run.assert_ended(8, *words)
     standstill_s = run.assert_stopped(acted[0], WATCHDOG_S)
     assert run.shaft.events("host heartbeat lost")
     assert run.shaft.state[-1] == "quick stop active"
@@ -110,7 +110,7 @@ def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, m
         bus.shutdown = shut_down
 
     run, acted = run_with(rehearse, monkeypatch, 15.0, act)
-    run.assert_ended(5)
+    run.assert_ended(8)
     assert {message.arbitration_id for message in late} >= {0x201, 0x080}
     (lost_s,) = run.shaft.events("host heartbeat lost")
     assert lost_s - acted[0] <= WATCHDOG_S

@@ -33,7 +33,8 @@ class Case:
 
 
 CASES = (
-    Case(12, "bus-dead" + IN_MOTION, 5, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S, confirmed=False),
+    Case(12, "bus-dead" + IN_MOTION, 8, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S, confirmed=False),
+    Case(12, "bus-dead@acquire+5s", 8, ("no feedback", "drive's own watchdog"), notice_s=WATCHDOG_S, confirmed=False),
     Case(19, "feedback-lost" + IN_MOTION, 5, ("no feedback for", "supply and the bus"), notice_s=FEEDBACK_S),
     Case(19, "frozen-feedback@acquire+2s", 5, ("frozen", "gateway"), notice_s=2.0),
     Case(20, "heartbeat-lost" + IN_MOTION, 5, ("1017h", "heartbeat has been missing"), notice_s=HEARTBEAT_S),
@@ -46,7 +47,7 @@ CASES = (
     Case(24, "sdo-abort", 4, ("6072h", "0x08000020"), "refused"),
     Case(25, "sdo-timeout", 5, ("6072h", "does not answer", "bit rate"), "refused"),
     Case(26, "second-master", 4, ("6041h", "another master", "nothing was written"), "refused"),
-    Case(26, "second-master" + IN_MOTION, 5, ("second master", "Take it off"), confirmed=False),
+    Case(26, "second-master" + IN_MOTION, 8, ("second master", "Take it off"), confirmed=False),
     Case(26, "duplicate-node", 4, ("node 1", "answered twice", "node-ID of its own"), "refused"),
     Case(26, "duplicate-node" + IN_MOTION, 6, ("boot-up",)),
     Case(26, "replayed-feedback" + IN_MOTION, 5, ("TPDO1", "somebody else")),
@@ -81,6 +82,7 @@ def test_row(case, rehearse, seen):
     assert ("NOT confirmed" in run.done.document["stop"]) is not case.confirmed
     if not case.confirmed:
         assert "hard-wired emergency stop" in run.done.err
+        assert case.code == 8
     seen(case.row, f"`{case.fault}`: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
 
 
@@ -90,7 +92,7 @@ SOONEST = {"setup": "setup+3s", "torque": "torque+2s", "hold": "hold+2s", "acqui
 @pytest.mark.parametrize(("fault", "stage"), [*product(["bus-dead", "emcy", "heartbeat-lost", "sto"], SOONEST)])
 def test_the_other_stages(fault, stage, rehearse):
     run = rehearse("--fault", f"{fault}@{SOONEST[stage]}")
-    run.assert_ended({"emcy": 6, "sto": 6}.get(fault, 5))
+    run.assert_ended({"emcy": 6, "sto": 6, "bus-dead": 8}.get(fault, 5))
     run.assert_stopped(run.fault_s, HEARTBEAT_S, held=fault != "sto")
     assert run.done.outcomes[-1] == (stage, "aborted")
     run.assert_log_whole()

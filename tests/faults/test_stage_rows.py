@@ -2,6 +2,8 @@
 
 import pytest
 
+from tdhil.record.reader import read_run
+
 RIG = """
 load: string
 make_up_torque_nm: 29000
@@ -19,3 +21,18 @@ def test_a_string_and_a_quick_stop_that_lets_go(drive, profile, rehearse, tmp_pa
     run.assert_ended(4, "drill string", "lets go of it after a quick stop", "quick_stop of the profile")
     run.assert_nothing_moved()
     seen(85, f"`load: string` with {profile}: {run.message}", None, run.assert_log_whole(), run.done.code)
+
+
+@pytest.mark.parametrize(("drive", "first", "never", "code"), [
+    ("canopen", "emcy@speed+1s", "sto@acquire+7s", 6), ("modbus", "drive-fault@speed+1s", "sto@9999s", 6),
+    ("canopen", "write-not-kept", "sto@speed", 4), ("modbus", "write-not-kept", "drive-fault@speed", 4),
+])
+def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, seen):
+    """Those that came aren't; those from the start came also where the run was refused."""
+    run = rehearse("--drive", drive, "--fault", first, "--fault", never)
+    assert run.done.code == code, run.done.err
+    (said,) = [line for line in run.done.err.splitlines() if "never came" in line]
+    assert said.startswith(f"tdhil: --fault {never} never came")
+    events = [event.text for event in read_run(run.log).events if event.kind == "fault"]
+    assert events == [f"--fault {never} never came"]
+    seen(87, said, None, run.assert_log_whole(), run.done.code)

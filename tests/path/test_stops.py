@@ -276,7 +276,7 @@ def test_a_dead_simulator_ends_the_host(tmp_path):
         assert reached(drive, running, "speed"), running.err
         os.kill(drive.child.pid, signal.SIGKILL)
         done = running.finish()
-    assert done.code == 5, done.err
+    assert done.code == 8, done.err
     assert done.document["error"]["kind"] == "CommunicationLost"
     assert "hard-wired emergency stop" in done.err
     assert tdhil("replay", done.log).code in (3, 9)
