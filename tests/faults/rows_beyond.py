@@ -39,6 +39,16 @@ COMMAND_LINE: dict[int, Row] = {
              "tests/tdhil/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
              "tests/tdhil/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
             "the key is named with its line, nothing is connected to"),
+    96: Row("a quantity in rig.yaml in another unit than the key's (speed_max_rad_s: 100 rpm, speed_max_rpm)",
+            "converted and shown both ways, or refused without offering a number; both forms of a key are refused",
+            "0, 2", ("tests/tdhil/test_rig_units.py::test_a_value_with_its_unit_is_converted_and_both_are_told",
+             "tests/tdhil/test_rig_units.py::test_a_key_in_the_manual_s_unit",
+             "tests/tdhil/test_rig_units.py::test_what_is_refused_offers_no_wrong_number"),
+            "100 rpm = 10.47 rad/s in settings, dry run and prompt"),
+    97: Row("a bit rate that CAN doesn't have (500 for 500k)", "refused wherever it stands; the nearest is named", "2",
+            ("tests/tdhil/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
+             "tests/tdhil/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
+            "500 bit/s is none of CAN's; 500k is one"),
 }
 
 LOG: dict[int, Row] = {
