@@ -59,6 +59,10 @@ LOG: dict[int, Row] = {
     106: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
              ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
              "what, where, and the next step"),
+    107: Row("replay on another kind of processor", "numbers the same to 1e-9, words the same", "the run's own",
+             ("tests/path/test_two_kernels.py::test_a_replay_under_other_kernels",
+              "tests/identify/test_quality.py::test_rounding_does_not_decide_whether_a_period_is_wrong"),
+             "the same result"),
 }
 
 BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG
