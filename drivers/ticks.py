@@ -1,9 +1,39 @@
 """The beat of the cycle: when each one begins, which began late, and whether this loop itself stood still."""
 
-from collections.abc import Callable
+import math
+from collections import deque
+from collections.abc import Callable, Iterable
 
 from drivers.clock import Clock
 from drivers.errors import CommunicationLost
+
+LOWER_THE_RATE = "Lower --rate, or give --real-time-priority"
+"""What to do where this computer, or its adapter, doesn't keep up."""
+
+RECENT = 1000
+"""So many cycles are looked at when it is asked how late they were."""
+LATE_SHARE = 0.02
+"""Of those: so many late ones are an ordinary scheduler's."""
+STALL_S, STALL_CYCLES = 0.05, 3.0
+"""Whoever was away for longer than both has stood still."""
+
+
+def how_late(late_s: Iterable[float], period_s: float) -> str:
+    """`host or adapter late (n of m cycles, p99 …)`, or nothing where few of these cycles were.
+
+    ``late_s``: by how much each cycle began late, or each answer came after its cycle, s.
+    """
+    ordered = sorted(late_s)
+    late = sum(one > 0.5 * period_s for one in ordered)
+    if late <= LATE_SHARE * len(ordered):
+        return ""
+    p99_s = quantile(ordered, 0.99)
+    return f"host or adapter late ({late} of {len(ordered)} cycles, p99 {1e3 * p99_s:.3g} ms)"
+
+
+def quantile(ordered: list[float], share: float) -> float:
+    """The smallest of these, in order, that so large a share doesn't exceed."""
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else 0.0
 
 
 class Ticks:
@@ -16,6 +46,8 @@ class Ticks:
         self._ended_s = self._began_s = clock.now_s()
         self._next_s = self._ended_s + period_s
         self.overruns = 0
+        self.late_s: deque[float] = deque(maxlen=RECENT)       # by how much the last cycles began late
+        self._stalls: deque[tuple[float, float]] = deque(maxlen=RECENT)    # when this loop was back, how long away
 
     def wait(self, until: Callable[[float], None] | None = None) -> None:
         """Until the next tick; ``until`` waits for a control time, s, in its own way.
@@ -28,6 +60,7 @@ class Ticks:
         clock, due_s = self._clock, self._next_s
         (until or clock.wait_until)(due_s)
         now_s = clock.now_s()
+        self.late_s.append(now_s - due_s)
         if now_s - due_s > 0.5 * self._period_s:
             self.overruns += 1
         self._next_s = max(due_s + self._period_s, now_s + 0.5 * self._period_s)
@@ -43,12 +76,29 @@ class Ticks:
         now_s = self._clock.now_s()
         self._refuse_stall(now_s - self._began_s, now_s)
 
-    def _refuse_stall(self, stood_still_s: float, now_s: float) -> None:
+    def check_end(self) -> None:
+        """When the cycle's frames are in: whoever was frozen in waiting for them must not judge the drive's silence.
+
+        Raises CommunicationLost like `wait`.
+        """
+        now_s = self._clock.now_s()
+        self._refuse_stall(now_s - self._began_s, now_s, "")
+
+    def stood_still_s(self, within_s: float) -> float:
+        """The longest that this loop was away for and came back from within the last ``within_s``, s; 0: never."""
+        since_s = self._clock.now_s() - within_s
+        return max((away_s for back_s, away_s in self._stalls if back_s >= since_s), default=0.0)
+
+    def _refuse_stall(
+        self, stood_still_s: float, now_s: float, then: str = "; the setpoint it had in hand was not sent"
+    ) -> None:
+        if stood_still_s > max(STALL_S, STALL_CYCLES * self._period_s):
+            self._stalls.append((now_s, stood_still_s))
         if 0.0 < self._longest_stall_s < stood_still_s:
             self._next_s = now_s + self._period_s
             self._ended_s = self._began_s = now_s
             raise CommunicationLost(
-                f"the control loop stood still for {stood_still_s:.2f} s; the setpoint it had in hand was not sent",
+                f"the control loop stood still for {stood_still_s:.2f} s{then}",
                 where="host",
                 next_step="Was the laptop asleep, the process frozen? The drive's watchdog may have stopped the shaft",
             )

@@ -46,8 +46,7 @@ class Tree:
     """One document.
 
     ``lines`` holds the line of each key (of each item in a list), ``value_lines`` the line where its value
-    begins, ``refused`` the paths whose value was replaced by None because it already has its problem,
-    ``written`` what stood there where a value was converted (`yaml_units`).
+    begins, ``refused`` the paths whose value was replaced by None because it already has its problem.
     """
 
     file: str
@@ -55,7 +54,6 @@ class Tree:
     lines: dict[Path, int] = field(default_factory=dict)
     value_lines: dict[Path, int] = field(default_factory=dict)
     refused: set[Path] = field(default_factory=set)
-    written: dict[Path, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
     def line(self, path: Path) -> int:

@@ -35,7 +35,7 @@ from drivers.clock import Clock
 from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
 from drivers.table import Table
-from drivers.ticks import Ticks
+from drivers.ticks import Ticks, how_late
 from drivers.wider import OwnLimits
 from profiles.marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.schema import CanopenProfile
@@ -47,6 +47,8 @@ HOST_NODE = 127
 SYNC = 0x080
 NMT = 0x000
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
+"""The first SYNCs, at standstill, are given so long: how soon this drive answers is then known, and what is late."""
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
 STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
@@ -101,10 +103,7 @@ class Cia402Drive:
         self._shape = shape_of(profile)
         self._layout = self._shape.feedback
         self._wide = self._shape.wide
-        self._feedback = Feedback(self._shape)
-        self._link.handlers[self._tpdo1_id] = self._feedback.on_tpdo1
-        if clock.stepped:
-            self._link.handlers[CYCLE_ID] = self._feedback.on_cycle_end
+        self._feedback = self._new_feedback()
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
         self._watchdog_s = 0.0
@@ -116,14 +115,36 @@ class Cia402Drive:
         self._contradictions = 0
         self._heard = True
         self._ticks = Ticks(clock, self.period_s)
+        self._watch.host_stood_still = self._stood_still
         self._cycles = self._missed = self._late = 0
+
+    def _new_feedback(self) -> Feedback:
+        feedback = Feedback(self._shape, None if self.clock.stepped else self.clock.now_s, self.period_s)
+        self._link.handlers[self._tpdo1_id] = feedback.on_tpdo1
+        if self.clock.stepped:
+            self._link.handlers[CYCLE_ID] = feedback.on_cycle_end
+        return feedback
+
+    def host_late(self) -> str:
+        """How late this computer or its adapter has been of late, in words; empty where it keeps up."""
+        begun = list(self._ticks.late_s)
+        since_s = self.clock.now_s() - len(begun) * self.period_s
+        # What an answer was late by comes in place of the cycle's own beginning, which was in time most often.
+        answered = [self.period_s + late_s for late_s in self._feedback.late_since(since_s)]
+        late_s = answered + begun[: max(0, len(begun) - len(answered))]
+        return self._stood_still() or how_late(late_s, self.period_s)
+
+    def _stood_still(self) -> str:
+        away_s = self._ticks.stood_still_s(DRIVE_SILENT_S + self._watchdog_s)
+        return f"this computer was late: its control loop stood still for {away_s:.2f} s" if away_s else ""
 
     @property
     def counters(self) -> Counters:
         """What went wrong on the bus so far."""
         stamps = self._link.stamps
         return Counters(
-            self._cycles, self._missed, self._late + self._feedback.second, self._ticks.overruns,
+            self._cycles, self._missed, self._late + self._feedback.second + self._feedback.older,
+            self._ticks.overruns,
             error_frames=self._link.error_frames, passive=self._link.passive,
             wall_offset_s=stamps.offset_s, wall_jumps=stamps.jumps,
         )
@@ -242,7 +263,7 @@ class Cia402Drive:
         torque_raw = encode_torque(command.torque_nm, self._units)
         self._ticks.wait(self._listen_until)
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
-        self._watch.check()
+        self._check()
         now_s = self.clock.now_s()
         self._life.feed_when_due(now_s)
         code, shown_code = self._codes[command.mode], self._reported.shown_code
@@ -258,7 +279,7 @@ class Cia402Drive:
             self._ticks.check,
         )
         feedback = self._feedback
-        feedback.begin()
+        feedback.begin(now_s)
         self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
@@ -275,8 +296,15 @@ class Cia402Drive:
         while self._contradictions < feedback.contradictions:
             self._contradictions += 1
             self._watch.on_contradiction()
-        self._watch.check()
+        self._ticks.check_end()
+        self._check()
         return self._sample(now_s, age_s, fresh)
+
+    def _check(self) -> None:
+        """Raise what is wrong with the drive; a sign of life that hasn't been read yet isn't missing."""
+        if self._watch.overdue:
+            self._link.drain()
+        self._watch.check()
 
     def look(self) -> Sample | None:
         """Status, speed and torque by SDO, for a stop whose cyclic feedback is not to be had; None without an answer.
@@ -316,7 +344,8 @@ class Cia402Drive:
 
     def _listen_until(self, tick_s: float) -> None:
         """Wait for the next tick, and take what comes meanwhile; feedback among it is late."""
-        clock, before = self.clock, self._feedback.arrived
+        clock, feedback = self.clock, self._feedback
+        before = feedback.arrived - feedback.older
         if clock.stepped:
             clock.wait_until(tick_s)
         else:
@@ -324,7 +353,7 @@ class Cia402Drive:
                 if self._link.receive(left_s) is None:
                     break
         self._link.drain()
-        self._late += self._feedback.arrived > before
+        self._late += feedback.arrived - feedback.older > before
 
     def _await_feedback(self, sync_s: float) -> float:
         """Take frames until TPDO1 is there; its age in seconds of control time."""
@@ -336,9 +365,17 @@ class Cia402Drive:
             while not self._feedback.done and (left_s := deadline_s - time.monotonic()) > 0.0:
                 link.receive(left_s)
             return 0.0
-        deadline_s = sync_s + 0.8 * self.period_s
-        while not self._feedback.data and (left_s := deadline_s - clock.now_s()) > 0.0:
+        feedback = self._feedback
+        first = not feedback.arrived and self._cycles < FIRST_ANSWERS
+        patience_s = min(FIRST_ANSWER_S, 0.1 * self._watchdog_s) if first else 0.0
+        deadline_s = sync_s + max(0.8 * self.period_s, patience_s)
+        while not feedback.done and (left_s := deadline_s - clock.now_s()) > 0.0:
             link.receive(left_s)
+        if not feedback.done:
+            link.drain()               # a loop that comes back late finds in time what came in time
+            feedback.settle()
+        if first:
+            self._ticks.put_off()
         return clock.now_s() - sync_s
 
     def keep_alive(self) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from drivers.clock import Clock
 from drivers.errors import CommunicationLost, DriveFault, TdhilError
+from drivers.ticks import LOWER_THE_RATE
 
 BOOT_UP = 0x00
 STOPPED = 0x04
@@ -26,6 +27,10 @@ START_GRACE_S = 0.5
 
 HOST_LOST = 0x8130
 """EMCY of a drive that lost its host: life guard or heartbeat error (CiA 301)."""
+
+HOST_SILENT = "host silent"
+OF_A_SILENT_HOST = ("heartbeat", "nmt", HOST_SILENT)
+"""Kinds of trouble that a host which was away brings about, or takes for the drive's."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
 _EMCY_CLASSES = {
@@ -73,7 +78,7 @@ class Watch:
         self._node = node
         self._clock = clock
         self._heard_s: float | None = None
-        self._troubles: list[TdhilError] = []
+        self._troubles: list[tuple[str, TdhilError]] = []
         self._raised: set[str] = set()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
@@ -84,6 +89,8 @@ class Watch:
         self.emcy_code = 0
         self.nmt_state: int | None = None      # as the drive last told it; None before
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
+        self.host_stood_still: Callable[[], str] = lambda: ""
+        """What is to be said of this host first, where it was away itself; empty: it wasn't."""
 
     def on_heartbeat(self, data: bytes) -> None:
         """700h + node: the NMT state, or 0 for boot-up."""
@@ -123,7 +130,7 @@ class Watch:
         self.emcy_code = code
         if code == HOST_LOST and self.expect_operational:
             self._keep(
-                "emcy",
+                HOST_SILENT,
                 CommunicationLost(
                     f"the drive's watchdog has acted: {emcy_text(code)}",
                     where=f"node {self._node}",
@@ -167,20 +174,34 @@ class Watch:
 
     def check(self) -> None:
         """Raise the oldest trouble not raised yet."""
-        if self.allowed_silence_s and self._heard_s is not None:
-            silent_s = self._clock.now_s() - self._heard_s
-            if silent_s > self.allowed_silence_s:
-                missing, where = self.sign_of_life()
-                self._keep(
-                    "heartbeat",
-                    CommunicationLost(
-                        f"the drive's {missing} for {silent_s:.2f} s",
-                        where=f"node {self._node}, {where}",
-                        next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
-                    ),
-                )
+        if self.overdue and self._heard_s is not None:
+            missing, where = self.sign_of_life()
+            self._keep(
+                "heartbeat",
+                CommunicationLost(
+                    f"the drive's {missing} for {self._clock.now_s() - self._heard_s:.2f} s",
+                    where=f"node {self._node}, {where}",
+                    next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
+                ),
+            )
         if self._troubles:
-            raise self._troubles.pop(0)
+            kind, trouble = self._troubles.pop(0)
+            raise self._of_host(trouble) if kind in OF_A_SILENT_HOST else trouble
+
+    @property
+    def overdue(self) -> bool:
+        """Has the drive's sign of life been missing for too long, as far as its frames have been read?"""
+        silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
+        return 0.0 < self.allowed_silence_s < silent_s
+
+    def _of_host(self, trouble: TdhilError) -> TdhilError:
+        """The same, where this host was away: that comes first, and may be all there is to it."""
+        away = self.host_stood_still()
+        if not away:
+            return trouble
+        return CommunicationLost(
+            f"{away}; after that: {trouble.what}", where=f"host; {trouble.where}", next_step=LOWER_THE_RATE
+        )
 
     def start(self, allowed_silence_s: float) -> None:
         """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
@@ -203,4 +224,4 @@ class Watch:
     def _keep(self, kind: str, trouble: TdhilError) -> None:
         if kind not in self._raised:
             self._raised.add(kind)
-            self._troubles.append(trouble)
+            self._troubles.append((kind, trouble))

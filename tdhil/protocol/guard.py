@@ -15,9 +15,11 @@ the window's lower end nothing comes to harm: that end is held by the reported s
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from drivers.drive import Command, Counters, Mode, PowerState, Sample
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit
+from drivers.ticks import LOWER_THE_RATE
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
 
@@ -72,6 +74,8 @@ class Guard:
         """Why no torque below zero may be commanded in torque mode; empty: it may. Set by whoever runs the stages."""
         self.to_brake = ""
         """What would change that."""
+        self.host_late: Callable[[], str] = lambda: ""
+        """How late this computer has been, in words, where it doesn't keep up (`drivers.ticks.how_late`)."""
 
     def check_command(self, command: Command) -> None:
         """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""
@@ -112,10 +116,11 @@ class Guard:
         self._pace_from = counters
         late = counters.overruns - before.overruns
         if late > LATE_SHARE * cycles:
+            words = self.host_late()
             raise CommunicationLost(
-                f"the control loop was late in {late} of {cycles} cycles",
+                f"the control loop was late in {late} of {cycles} cycles" + (f": {words}" if words else ""),
                 where="host",
-                next_step="Ask for a lower --rate, or end what else keeps this computer busy",
+                next_step=f"{LOWER_THE_RATE}; or end what else keeps this computer busy",
             )
 
     def check_sample(self, command: Command, sample: Sample) -> None:
@@ -215,10 +220,13 @@ class Guard:
             return
         self._stale += 1
         if self._stale >= self._stale_limit:
+            late, missing = self.host_late(), f"no feedback for {self._stale} cycles"
             raise CommunicationLost(
-                f"no feedback for {self._stale} cycles",
-                where=where,
-                next_step="Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
+                f"{late}; {missing}" if late else missing,
+                where=f"host, and {where}" if late else where,
+                next_step=LOWER_THE_RATE
+                if late
+                else "Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
             )
 
     def _check_frozen(self, command: Command, sample: Sample, where: str) -> None:

@@ -218,6 +218,7 @@ class Runner:
             task.assumptions,
         )
         guard.no_braking = NOT_YET
+        guard.host_late = getattr(self._drive, "host_late", guard.host_late)
         return task, Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle), preflight
 
     def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:

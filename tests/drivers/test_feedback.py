@@ -51,7 +51,10 @@ def test_one_that_comes_after_its_cycle_is_doubted_in_the_next():
     ([[NEW, OLD, OTHER]], 2),
     ([[NEW], [], [OTHER, NEW]], 0),             # the one that was missing came late
     ([[NEW], [], [OTHER, NEW, NEW], [NEW, OLD]], 2),
-    ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD]], 1),
+    ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD]], 0),      # the answers of five SYNCs
+    ([[], [], [], [], [NEW, OLD, OLD, OLD, OLD, OTHER]], 1),
+    ([[]] * 60 + [[OLD] * 60 + [NEW]], 0),
+    ([[]] * 60 + [[OLD] * 60 + [NEW, OTHER]], 1),
 ])
 def test_contradictions(frames, contradictions):
     _, feedback = cycles([NEW], *frames)
@@ -131,3 +134,134 @@ def test_while_a_peer_tells_where_cycles_end_they_are_waited_for():
     assert not feedback.done
     feedback.on_tpdo1(NEW)
     assert feedback.done
+
+
+# -- in real time: answers may come after their cycle, and belong to SYNCs in their order --------------------------
+
+PERIOD_S, ANSWER_S = 0.004, 0.0003
+
+
+class Wire:
+    """Cycles in real time: each SYNC bears its number, and its answer arrives when ``fates`` say (None: lost).
+
+    `given`: the number that was taken of each cycle, None where none was.
+    """
+
+    def __init__(self):
+        self.now_s = 0.0
+        self.feedback = Feedback(STANDARD, lambda: self.now_s, PERIOD_S)
+        self.given = []
+        self._coming = []
+        self._last_s = 0.0
+
+    def cycle(self, answer_s=ANSWER_S, foreign=()):
+        number, begun_s = len(self.given), self.now_s
+        if answer_s is not None:
+            self._last_s = max(self._last_s, begun_s + answer_s)       # a queue keeps its order
+            self._coming.append((self._last_s, number.to_bytes(8, "little")))
+        self._coming += [(begun_s + after_s, data) for after_s, data in foreign]
+        self._coming.sort(key=lambda entry: entry[0])
+        self.feedback.begin(begun_s)
+        self._listen(begun_s + 0.8 * PERIOD_S, in_cycle=True)
+        if not self.feedback.done:
+            self.feedback.settle()
+        data = self.feedback.data
+        self.given.append(int.from_bytes(data, "little") if data else None)
+        self._listen(begun_s + PERIOD_S)
+        self.now_s = begun_s + PERIOD_S
+
+    def _listen(self, until_s, in_cycle=False):
+        while self._coming and self._coming[0][0] <= until_s and not (in_cycle and self.feedback.done):
+            self.now_s, data = max(self.now_s, self._coming[0][0]), self._coming.pop(0)[1]
+            self.feedback.on_tpdo1(data)
+        self.now_s = max(self.now_s, until_s if not (in_cycle and self.feedback.done) else self.now_s)
+
+
+def held_back(wire, cycles):
+    """An adapter that hands nothing on for so many cycles, and then everything at once, in order."""
+    for number in range(cycles):
+        wire.cycle((cycles - number) * PERIOD_S + ANSWER_S)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 5, 30, 60])
+def test_a_burst_after_a_late_adapter_is_given_to_its_syncs(cycles):
+    wire = Wire()
+    for _ in range(5):
+        wire.cycle()
+    held_back(wire, cycles)
+    wire.cycle(ANSWER_S + 1e-4)
+    assert wire.feedback.contradictions == 0
+    assert wire.given[5:] == [None] * cycles + [5 + cycles]
+    assert wire.feedback.older == cycles
+    wire.cycle()
+    assert wire.given[-1] == 6 + cycles
+
+
+@pytest.mark.parametrize("lost", [1, 2, 30])
+def test_after_answers_that_were_lost_one_more_cycle_is_doubtful(lost):
+    wire = Wire()
+    for fate in [ANSWER_S] * 5 + [None] * lost + [ANSWER_S] * 5:
+        wire.cycle(fate)
+    assert wire.given == [*range(5)] + [None] * (lost + 1) + [*range(6 + lost, 10 + lost)]
+    assert wire.feedback.contradictions == 0
+
+
+def test_a_drive_that_is_always_a_cycle_late_is_never_paired_with_the_wrong_sync():
+    """How soon it answers is known from the first SYNC, which is given its time (`Cia402Drive`)."""
+    wire = Wire()
+    wire.feedback.begin(0.0)
+    wire.now_s = 1.2 * PERIOD_S
+    wire.feedback.on_tpdo1(NEW)
+    assert wire.feedback.data == NEW
+    for _ in range(200):
+        wire.cycle(1.2 * PERIOD_S)
+    assert wire.given == [None] * 200
+    assert wire.feedback.contradictions == 0
+
+
+@given(st.lists(st.tuples(st.integers(1, 5), st.floats(0.0, 12.0)), max_size=12), st.floats(0.05, 0.7))
+def test_a_late_answer_is_never_another_syncs(holds, answer):
+    """Whatever holds answers back hands them on together: (cycles in time, how many more are held) again and again."""
+    wire, until_s = Wire(), 0.0
+    for in_time, held in [(3, 0.0), *holds]:
+        for _ in range(in_time):
+            wire.cycle(max(answer * PERIOD_S, until_s - wire.now_s))
+        until_s = wire.now_s + held * PERIOD_S
+        while wire.now_s < until_s:
+            wire.cycle(max(answer * PERIOD_S, until_s - wire.now_s))
+    assert wire.feedback.contradictions == 0
+    assert all(given in (None, number) for number, given in enumerate(wire.given)), wire.given
+    assert wire.given[:3] == [0, 1, 2]
+
+
+@given(st.lists(st.sampled_from([ANSWER_S, 0.001, 0.0012, None]), max_size=120))
+def test_whatever_is_lost_no_sample_is_another_syncs(fates):
+    wire = Wire()
+    for fate in [0.001] * 3 + fates:
+        wire.cycle(fate)
+    assert wire.feedback.contradictions == 0
+    assert all(given in (None, number) for number, given in enumerate(wire.given))
+
+
+def test_somebody_who_sends_too_is_found_however_late_the_host_was():
+    wire = Wire()
+    for _ in range(3):
+        wire.cycle()
+    held_back(wire, 40)
+    for _ in range(5):
+        wire.cycle(ANSWER_S + 1e-4, foreign=[(0.0, OTHER)])
+    assert wire.feedback.contradictions >= 3
+
+
+def test_halves_of_a_burst_keep_together():
+    now = [0.0]
+    feedback = Feedback(WIDE, lambda: now[0], PERIOD_S)
+    size = WIDE.data_size()
+    for _ in range(3):
+        feedback.begin(now[0])
+        now[0] += PERIOD_S
+    for number in range(3):
+        feedback.on_tpdo1(bytes([number]) * size)
+        feedback.on_status(bytes([number]) * 2)
+    assert feedback.data == bytes([2]) * (2 + size)
+    assert feedback.older == 2

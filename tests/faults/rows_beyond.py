@@ -3,6 +3,21 @@
 from row import HERE, Row
 
 LATE: dict[int, Row] = {
+    51: Row("adapter or host late: the answers of many SYNCs come in a burst", "counted as late; nobody else is blamed",
+            "0, 5", ("tests/drivers/test_late_host.py::test_an_adapter_that_hands_everything_on_at_once_is_nobody_else",
+                     "tests/drivers/test_feedback.py::test_a_late_answer_is_never_another_syncs",
+                     "tests/drivers/test_feedback.py::test_somebody_who_sends_too_is_found_however_late_the_host_was"),
+            "each answer is given to its own SYNC, or the cycle has no sample; more answers than SYNCs are foreign"),
+    52: Row("host stood still (SIGSTOP, load): the drive's silence and its watchdog's word follow",
+            "the stall is told first", "5",
+            ("tests/drivers/test_late_host.py::test_a_stall_is_told_before_what_the_drive_did_meanwhile",
+             "tests/drivers/test_late_host.py::test_a_short_stall_is_told_before_a_heartbeat_that_is_missing",
+             "tests/drivers/test_late_host.py::test_half_of_the_watchdogs_time_is_the_longest_stall"),
+            "\"this computer was late: its control loop stood still for …\" comes before what was seen on the bus"),
+    53: Row("Ctrl-C, or a trip of the guard, while the rest of the run is planned", "QS in the next cycle", "130, 7",
+            ("tests/protocol/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
+             "tests/protocol/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
+            "the plan is dropped, not waited for; it was before, and nothing was sent meanwhile"),
 }
 
 SECOND_MASTER: dict[int, Row] = {
@@ -39,16 +54,6 @@ COMMAND_LINE: dict[int, Row] = {
              "tests/tdhil/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
              "tests/tdhil/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
             "the key is named with its line, nothing is connected to"),
-    96: Row("a quantity in rig.yaml in another unit than the key's (speed_max_rad_s: 100 rpm, speed_max_rpm)",
-            "converted and shown both ways, or refused without offering a number; both forms of a key are refused",
-            "0, 2", ("tests/tdhil/test_rig_units.py::test_a_value_with_its_unit_is_converted_and_both_are_told",
-             "tests/tdhil/test_rig_units.py::test_a_key_in_the_manual_s_unit",
-             "tests/tdhil/test_rig_units.py::test_what_is_refused_offers_no_wrong_number"),
-            "100 rpm = 10.47 rad/s in settings, dry run and prompt"),
-    97: Row("a bit rate that CAN doesn't have (500 for 500k)", "refused wherever it stands; the nearest is named", "2",
-            ("tests/tdhil/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
-             "tests/tdhil/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
-            "500 bit/s is none of CAN's; 500k is one"),
 }
 
 LOG: dict[int, Row] = {
@@ -59,10 +64,6 @@ LOG: dict[int, Row] = {
     106: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
              ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
              "what, where, and the next step"),
-    107: Row("replay on another kind of processor", "numbers the same to 1e-9, words the same", "the run's own",
-             ("tests/path/test_two_kernels.py::test_a_replay_under_other_kernels",
-              "tests/identify/test_quality.py::test_rounding_does_not_decide_whether_a_period_is_wrong"),
-             "the same result"),
 }
 
 BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG

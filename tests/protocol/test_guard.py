@@ -292,3 +292,14 @@ def test_noise_about_zero_is_no_reverse_rotation(limits):
     coarse = Guard(limits, PERIOD_S, 0.1, TORQUE_RESOLUTION)       # five quanta are more than 2 % of the limit
     coarse.check_sample(REST, sample(-0.49))
     guard(limits).check_sample(REST, sample(-0.19))
+
+
+def test_missing_feedback_is_this_computers_where_it_was_late():
+    watch = guard()
+    watch.host_late = lambda: "host or adapter late (40 of 500 cycles, p99 38 ms)"
+    with pytest.raises(CommunicationLost, match=r"late \(40 of 500 cycles, p99 38 ms\); no feedback for 13") as caught:
+        for _ in range(20):
+            watch.check_sample(REST, sample(fresh=False))
+    assert "--rate" in caught.value.next_step
+    assert "--real-time-priority" in caught.value.next_step
+    assert caught.value.where.startswith("host")

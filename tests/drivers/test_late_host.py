@@ -1,0 +1,162 @@
+"""A host or an adapter that is late: not taken for somebody else on the bus, nor for a drive that fell silent.
+
+On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
+"""
+
+import pytest
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import MonotonicClock
+from drivers.drive import Command, Limits, Mode
+from drivers.errors import CommunicationLost
+from drivers.ticks import LOWER_THE_RATE, Ticks, how_late
+
+LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+TURN = Command(Mode.SPEED, 1.0, 0.0)
+PERIOD_S = 0.004
+
+
+@pytest.fixture
+def drive(wire, peer, profile, fake_time):
+    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive.connect()
+    drive.preflight(LIMITS)
+    drive.enable(Mode.SPEED)
+    for _ in range(10):
+        drive.exchange(TURN)
+    return drive
+
+
+def numbers(drive, count):
+    samples = [drive.exchange(TURN) for _ in range(count)]
+    return [round(sample.torque_nm) if sample.fresh else None for sample in samples]
+
+
+@pytest.mark.parametrize("held", [2, 5, 20, 60])
+def test_an_adapter_that_hands_everything_on_at_once_is_nobody_else(drive, peer, fake_time, held):
+    """Every SYNC is answered once; but the answers of so many come together, as a stalled adapter gives them."""
+    release_s = fake_time.now_s + (held + 0.5) * PERIOD_S
+    peer.answer_sync = lambda cycle: [(max(0.0002, release_s - fake_time.now_s), peer.tpdo(cycle))]
+    peer.bus.put(0x701, b"\x05", (held + 0.4) * PERIOD_S)
+    found = numbers(drive, held + 5)
+    # Each sample is of its own SYNC or there is none; and those in time are all there.
+    assert all(one in (None, 11 + k) for k, one in enumerate(found)), found
+    assert found[-4:] == [11 + held + 1 + k for k in range(4)]
+    assert drive.counters.late >= held - 1
+
+
+def test_a_loop_that_comes_back_late_finds_what_came_in_time(drive, peer, wire, fake_time):
+    """Frozen for 30 ms behind its SYNC, it reads the answer all the same, and pairs it with that SYNC."""
+    send = wire.on_send
+
+    def freeze(identifier, data):
+        send(identifier, data)
+        if identifier == 0x080 and peer.syncs == 13:
+            fake_time.sleep(0.03)
+
+    wire.on_send = freeze
+    assert numbers(drive, 6) == [11, 12, 13, 14, 15, 16]
+    assert drive.counters.missed == 0
+    assert drive.counters.overruns == 1
+
+
+@pytest.mark.parametrize("where", ["before the tick", "after SYNC"])
+def test_a_stall_is_told_before_what_the_drive_did_meanwhile(drive, peer, wire, fake_time, where):
+    """The drive's watchdog has acted (EMCY 8130h), its heartbeat went on: nothing of that is the drive's doing."""
+    send = wire.on_send
+
+    def asleep():
+        fake_time.sleep(3.0)
+        wire.put(0x081, bytes.fromhex("3081110000000000"))
+        wire.put(0x701, b"\x7f")
+
+    if where == "before the tick":
+        asleep()
+    else:
+        def freeze(identifier, data):
+            send(identifier, data)
+            if identifier == 0x080:
+                wire.on_send = send
+                asleep()
+
+        wire.on_send = freeze
+    told = []
+    for _ in range(6):
+        try:
+            drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+        except CommunicationLost as error:
+            told.append(error)
+    assert told[0].what.startswith("the control loop stood still for 3.0")
+    assert told[0].where == "host"
+    for error in told[1:]:
+        assert error.what.startswith("this computer was late: its control loop stood still for 3.0"), error.what
+        assert error.where.startswith("host")
+        assert error.next_step == LOWER_THE_RATE
+    assert any("8130h" in error.what for error in told)
+    assert not any("has been missing" in error.what for error in told), "it lay unread"
+
+
+def test_a_short_stall_is_told_before_a_heartbeat_that_is_missing(drive, peer, wire, fake_time):
+    """0.2 s are borne; but the drive's heartbeat, which stops then, is not the drive's alone to answer for."""
+    fake_time.sleep(0.2)
+    with pytest.raises(CommunicationLost, match=r"still for 0\.20 s; after that: the drive's heart") as e:
+        for _ in range(200):
+            drive.exchange(TURN)
+    assert e.value.next_step == LOWER_THE_RATE
+
+
+def test_a_heartbeat_that_is_missing_is_the_drives_where_the_loop_was_in_time(drive):
+    with pytest.raises(CommunicationLost, match=r"node 1, 1017h: the drive's heartbeat") as caught:
+        for _ in range(200):
+            drive.exchange(TURN)
+    assert "supply" in caught.value.next_step
+    assert drive.host_late() == ""
+
+
+@pytest.mark.parametrize(("away_s", "refused"), [(0.2, False), (0.3, True), (0.5, True), (2.4, True)])
+def test_half_of_the_watchdogs_time_is_the_longest_stall(drive, wire, fake_time, away_s, refused):
+    """Beyond it the drive's watchdog may have acted; a setpoint from before it must not go out."""
+    wire.put(0x701, b"\x05", away_s)
+    fake_time.sleep(away_s)
+    wire.sent.clear()
+    if refused:
+        with pytest.raises(CommunicationLost, match="stood still"):
+            drive.exchange(TURN)
+        assert wire.sent == []
+    else:
+        assert drive.exchange(TURN).fresh
+
+
+def test_how_late_is_told_in_numbers(drive, peer, wire, fake_time):
+    for _ in range(20):
+        wire.put(0x701, b"\x05")
+        fake_time.sleep(0.01)
+        drive.exchange(TURN)
+    assert drive.host_late() == "host or adapter late (20 of 30 cycles, p99 8.2 ms)"
+
+
+def test_late_answers_count_as_late_too(drive, peer, wire):
+    peer.answer_sync = lambda cycle: [(1.5 * PERIOD_S, peer.tpdo(cycle))]
+    numbers(drive, 60)
+    assert drive.host_late().startswith("host or adapter late (5")
+
+
+def test_words_for_lateness():
+    assert how_late([], PERIOD_S) == ""
+    assert how_late([0.0001] * 1000, PERIOD_S) == ""
+    assert how_late([0.0] * 985 + [0.01] * 15, PERIOD_S) == ""
+    assert how_late([0.0] * 950 + [0.038] * 50, PERIOD_S) == "host or adapter late (50 of 1000 cycles, p99 38 ms)"
+
+
+def test_standing_still_is_remembered_for_a_while(fake_time):
+    clock = MonotonicClock()
+    ticks = Ticks(clock, PERIOD_S, 0.25)
+    fake_time.sleep(0.2)
+    ticks.wait()
+    assert ticks.stood_still_s(1.0) == pytest.approx(0.2, abs=PERIOD_S)
+    fake_time.sleep(0.04)
+    ticks.wait()
+    assert ticks.stood_still_s(0.01) == 0.0
+    assert ticks.stood_still_s(1.0) == pytest.approx(0.2, abs=PERIOD_S)
+    fake_time.sleep(5.0)
+    assert ticks.stood_still_s(1.0) == 0.0
