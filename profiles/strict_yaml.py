@@ -3,7 +3,9 @@
 ::
 
     file → text (size, UTF-8) → `yaml_tree` (YAML 1.2 core; no tags, aliases, duplicates) → pydantic, strict
+                                                                    ↑ `yaml_units` (100 rpm → 10.47 rad/s) ↵
 
+A value with a unit of its own is converted where the reader shows both (``convert``), else refused with what it is.
 Checks across several keys run once the keys themselves are right, so they may show up in a second round.
 """
 
@@ -19,8 +21,9 @@ from profiles import yaml_tree
 from profiles.data_model import DataModel
 from profiles.errors import DataFileError, Problem
 from profiles.yaml_messages import problems_of
+from profiles.yaml_units import Conversion, settle
 
-__all__ = ["DataModel", "Loaded", "load_model", "load_with_lines", "parse_model", "parse_with_lines"]
+__all__ = ["Conversion", "DataModel", "Loaded", "load_model", "load_with_lines", "parse_model", "parse_with_lines"]
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -35,6 +38,8 @@ class Loaded(Generic[M]):
     value: M
     file: str
     lines: MappingProxyType[yaml_tree.Path, int]
+    conversions: tuple[Conversion, ...] = ()
+    """What stood there with a unit of its own."""
 
 
 def load_model(path: Path, model: type[M]) -> M:
@@ -47,26 +52,37 @@ def parse_model(text: str, name: str, model: type[M]) -> M:
     return parse_with_lines(text, name, model).value
 
 
-def load_with_lines(path: Path, model: type[M]) -> Loaded[M]:
+def load_with_lines(path: Path, model: type[M], *, convert: bool = False) -> Loaded[M]:
     """As `load_model`, with the line of each key besides."""
-    return parse_with_lines(_read(path), str(path), model)
+    return parse_with_lines(_read(path), str(path), model, convert=convert)
 
 
-def parse_with_lines(text: str, name: str, model: type[M]) -> Loaded[M]:
-    """As `parse_model`, with the line of each key besides."""
+def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = False) -> Loaded[M]:
+    """As `parse_model`, with the line of each key besides. ``convert``: the caller shows ``conversions`` to people."""
     if len(text) > MAX_BYTES:
         raise _one(name, 0, f"larger than {MAX_BYTES // 1024} KiB; this is no file of this program")
     tree = yaml_tree.read_tree(text, name)
     if tree.data is None:
         raise _all(tree.problems or [Problem(name, 0, "the file is empty")])
+    conversions: tuple[Conversion, ...] = ()
     try:
-        # By way of JSON: strict Python input takes no list for a tuple and no word for an enumeration.
-        value = model.model_validate_json(json.dumps(tree.data), strict=True)
+        try:
+            value = _validated(tree, model)
+        except ValidationError as error:
+            conversions = settle(tree, error, model)
+            if not convert:
+                tree.problems += [one.refused(name) for one in conversions]
+            value = _validated(tree, model)
     except ValidationError as error:
         raise _all(tree.problems + problems_of(error, tree, model)) from None
     if tree.problems:
         raise _all(tree.problems)
-    return Loaded(value, name, MappingProxyType(tree.lines))
+    return Loaded(value, name, MappingProxyType(tree.lines), conversions)
+
+
+def _validated(tree: yaml_tree.Tree, model: type[M]) -> M:
+    # By way of JSON: strict Python input takes no list for a tuple and no word for an enumeration.
+    return model.model_validate_json(json.dumps(tree.data), strict=True)
 
 
 def _read(path: Path) -> str:

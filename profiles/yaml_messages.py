@@ -7,6 +7,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from profiles import quantities
 from profiles.data_model import CROSS_FIELD
 from profiles.errors import Problem
 from profiles.yaml_scalars import hint
@@ -57,19 +58,19 @@ def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> li
     unions: dict[Path, list[str]] = {}
     for item in items:
         if item["type"] in _WANTED:      # a union gives one of these for each of its members
-            unions.setdefault(_path_in_file(item, tree), []).append(item["type"])
+            unions.setdefault(path_in_file(item, tree), []).append(item["type"])
     found += [(path, tree.value_lines.get(path, 0), _wanted(kinds, tree, path)) for path, kinds in unions.items()]
     return found
 
 
 def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterator[tuple[Path, int, str]]:
-    kind, path = item["type"], _path_in_file(item, tree)
+    kind, path = item["type"], path_in_file(item, tree)
     if kind == CROSS_FIELD:
         for at, message in item["ctx"]["findings"]:
             there = (*path, *(at.split(".") if at else ()))
             yield there, tree.line(there), message
     elif kind == "extra_forbidden":
-        key, known = str(item["loc"][-1]), sorted(_fields_at(model, path[:-1]))
+        key, known = str(item["loc"][-1]), sorted(field_names(model, path[:-1]))
         if said := _never_here(model, path[:-1]).get(key):
             yield path, tree.line(path), said
             return
@@ -78,7 +79,8 @@ def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterat
         key = str(item["loc"][-1])
         yield path, tree.line(path), f"'{key}' is missing{_description(model, path, key)}"
     else:
-        yield path, tree.value_lines.get(path, tree.line(path)), _wrong_value(item, _value(tree.data, path))
+        said = _wrong_value(item, _value(tree.data, path), tree.written.get(path))
+        yield path, tree.value_lines.get(path, tree.line(path)), said
 
 
 def _wanted(kinds: list[str], tree: Tree, path: Path) -> str:
@@ -86,30 +88,50 @@ def _wanted(kinds: list[str], tree: Tree, path: Path) -> str:
     value = _value(tree.data, path)
     if value is None:
         return f"has no value; {wanted} is wanted here"
-    return f"{wanted} is wanted, not {_shown(value)}{_advice(kinds[0], value)}"
+    return f"{wanted} is wanted, not {_shown(value)}{_advice(kinds[0], value, path)}"
 
 
-def _wrong_value(item: dict[str, Any], value: Any) -> str:
+def _wrong_value(item: dict[str, Any], value: Any, written: str | None) -> str:
     kind, context = item["type"], item.get("ctx", {})
     if kind in {"literal_error", "enum"}:
         choices = [choice.strip("' ") for choice in context["expected"].replace(" or ", ", ").split(",")]
         return f"{context['expected']} is wanted, not {_shown(value)}{_meant(str(value), choices, listed=False)}"
     if kind in _BOUNDS:
-        return f"must be {_BOUNDS[kind][1]} {context[_BOUNDS[kind][0]]:g}, not {_shown(value)}"
+        as_written = f"{value:.4g} ({_clean(written)})" if written else ""
+        return f"must be {_BOUNDS[kind][1]} {context[_BOUNDS[kind][0]]:g}, not {as_written or _shown(value)}"
     if kind in {"too_short", "too_long"}:
         limit = context.get("min_length", context.get("max_length"))
         return f"{'at least' if kind == 'too_short' else 'at most'} {limit} entries are wanted"
     return str(item["msg"]).removeprefix("Value error, ")
 
 
-def _advice(kind: str, value: Any) -> str:
+def _advice(kind: str, value: Any, path: Path) -> str:
     if kind == "bool_type" and not (isinstance(value, str) and hint(value)):
         return "; write true or false"
     if kind == "string_type" and isinstance(value, int | float):
         return "; put it in quotes"
     if kind.startswith("int") and isinstance(value, float) and value.is_integer():
         return f"; write {int(value)}"
-    return f"; {hint(value)}" if isinstance(value, str) and hint(value) else ""
+    if isinstance(value, str) and hint(value):
+        return f"; {hint(value)}"
+    if kind.startswith(("int", "float")) and isinstance(value, str):
+        return _unit_advice(value, path)
+    return ""
+
+
+def _unit_advice(text: str, path: Path) -> str:
+    """Why a number with something behind it is not read. No number is offered: who wrote a unit meant it."""
+    parts = quantities.split(text)
+    if parts is None or not parts[1]:
+        return ""
+    unit = quantities.unit_of_key(next((part for part in reversed(path) if isinstance(part, str)), ""))
+    if unit is None:
+        return "; a number alone: this key has no unit"
+    try:
+        quantities.read(text, unit)
+    except ValueError as error:
+        return f"; {error}"
+    return ""
 
 
 def _shown(value: Any) -> str:
@@ -141,7 +163,7 @@ def _clean(text: str) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _path_in_file(item: dict[str, Any], tree: Tree) -> Path:
+def path_in_file(item: dict[str, Any], tree: Tree) -> Path:
     """The error's location without what pydantic adds to it: names of union members, a missing key."""
     path: Path = ()
     value = tree.data
@@ -157,7 +179,8 @@ def _value(data: Any, path: Path) -> Any:
     return data
 
 
-def _fields_at(model: type[BaseModel], path: Path) -> set[str]:
+def field_names(model: type[BaseModel], path: Path) -> set[str]:
+    """The keys that may stand in the section at ``path``."""
     return {info.alias or name for found in _models_at(model, path) for name, info in found.model_fields.items()}
 
 

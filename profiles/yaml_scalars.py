@@ -79,10 +79,8 @@ def hint(text: str) -> str:
         return f"write {text.replace('_', '')}"
     if re.fullmatch(r"[-+]?[0-9]+(:[0-9]+)+(\.[0-9]*)?", text):
         return "write the value in the unit that the key names, without ':'"
-    if re.fullmatch(r"[-+]?[0-9]+,[0-9]+", text):
-        return f"write {text.replace(',', '.')}"
+    if re.fullmatch(r"[-+]?[0-9]+(,[0-9]+)+(\.[0-9]*)?", text):
+        return "write it with a decimal point and without a comma"
     if len(text) <= MAX_NUMBER_LENGTH and _FLOAT.fullmatch(text):
         return f"write {text} without quotes"
-    if number := re.match(r"([-+]?[0-9]*\.?[0-9]+([eE][-+]?[0-9]+)?)\s*[A-Za-z°%µ·/]", text):
-        return f"write {number[1]}; the unit stands in the key"
     return ""

@@ -46,7 +46,8 @@ class Tree:
     """One document.
 
     ``lines`` holds the line of each key (of each item in a list), ``value_lines`` the line where its value
-    begins, ``refused`` the paths whose value was replaced by None because it already has its problem.
+    begins, ``refused`` the paths whose value was replaced by None because it already has its problem,
+    ``written`` what stood there where a value was converted (`yaml_units`).
     """
 
     file: str
@@ -54,6 +55,7 @@ class Tree:
     lines: dict[Path, int] = field(default_factory=dict)
     value_lines: dict[Path, int] = field(default_factory=dict)
     refused: set[Path] = field(default_factory=set)
+    written: dict[Path, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
     def line(self, path: Path) -> int:

@@ -18,7 +18,7 @@ from typing import Any
 from drivers.errors import DataFileError, Problem
 from tdhil.errors import UsageError
 from tdhil.options import Setting
-from tdhil.rig import Rig
+from tdhil.rig import Rig, bit_rate_problem
 
 _FLAGS = {
     "interface": "--interface",
@@ -172,3 +172,5 @@ def _check(settings: dict[str, Setting]) -> None:
     for name in ("bitrate", "port"):
         if (given := settings.get(name)) and (not isinstance(given.value, int) or given.value <= 0):
             raise UsageError(f"{name} must be a positive whole number, not {given.value!r}", where=given.source)
+    if (given := settings.get("bitrate")) and (wrong := bit_rate_problem(given.value)):
+        raise UsageError(f"bitrate {wrong}", where=given.source)

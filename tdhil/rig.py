@@ -11,6 +11,7 @@ motor shaft. It is frozen, and knows from which line of which file each of its k
       …
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -19,11 +20,40 @@ from pydantic import Field, PrivateAttr, ValidationError, model_validator
 
 from drivers.errors import DataFileError, PreflightRefused, Problem
 from profiles.data_model import DataModel, refuse_if
-from profiles.strict_yaml import load_with_lines
+from profiles.strict_yaml import Conversion, load_with_lines
 from profiles.yaml_messages import messages_of
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+
+def _within(low: float, high: float, *, zero: bool = False) -> Any:
+    """A number that some machine could have: what lies beyond is a slip, and no arithmetic is to choke on it."""
+    return Field(ge=0.0 if zero else low, le=high)
+
+
+Positive = Annotated[float, _within(1e-9, 1e9)]
+NotNegative = Annotated[float, _within(0.0, 1e9, zero=True)]
+Torque = Annotated[float, _within(1e-6, 1e7)]
+Speed = Annotated[float, Field(ge=-1e5, le=1e5)]
+Time = Annotated[float, _within(1e-6, 1e7)]
+Inertia = Annotated[float, _within(1e-9, 1e9)]
+Ratio = Annotated[float, _within(1e-6, 1e6)]
+Amplitude = Annotated[float, _within(1e-9, 1e5)]
+Frequency = Annotated[float, _within(1e-6, 1e4)]
+
+CAN_BIT_RATES = (
+    5_000, 10_000, 20_000, 33_000, 33_333, 47_000, 47_619, 50_000, 62_000, 62_500, 83_000, 83_300, 83_333, 95_000,
+    95_238, 100_000, 125_000, 200_000, 250_000, 400_000, 500_000, 750_000, 800_000, 1_000_000,
+)
+"""bit/s that CiA 301 names, and what else adapters have."""
+
+
+def bit_rate_problem(bit_s: int) -> str:
+    """What is wrong with a CAN bit rate; '' where it is one."""
+    if bit_s in CAN_BIT_RATES:
+        return ""
+    if bit_s * 1000 in CAN_BIT_RATES:
+        return f"{bit_s} bit/s is none of CAN's; {bit_s}k is one: {bit_s * 1000}"
+    nearest = min(CAN_BIT_RATES, key=lambda one: abs(math.log(one / max(bit_s, 1))))
+    return f"{bit_s} bit/s is none of CAN's; the nearest is {nearest}"
 
 
 class Bus(DataModel):
@@ -31,8 +61,14 @@ class Bus(DataModel):
 
     interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
     channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
-    bitrate: int | None = Field(default=None, gt=0, le=1_000_000, description="bit/s; socketcan: as the link has it")
+    bitrate: int | None = Field(default=None, gt=0, description="bit/s; socketcan: as the link has it")
     options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
+
+    @model_validator(mode="after")
+    def _known_to_can(self) -> Self:
+        if self.bitrate is not None and (wrong := bit_rate_problem(self.bitrate)):
+            refuse_if([("bitrate", wrong)])
+        return self
 
 
 class Modbus(DataModel):
@@ -60,13 +96,13 @@ class Modbus(DataModel):
 class Limits(DataModel):
     """What the machine may do; watched by the host and, where it can, by the drive."""
 
-    speed_min_rad_s: float = Field(description="rad/s; lowest speed while torque is regulated")
-    speed_max_rad_s: float = Field(gt=0, description="rad/s; highest speed")
-    torque_nm: Positive = Field(description="N·m; highest torque, either sign")
-    time_s: Positive = Field(description="s; longest run")
+    speed_min_rad_s: Speed = Field(description="rad/s; lowest speed while torque is regulated")
+    speed_max_rad_s: Annotated[float, _within(1e-6, 1e5)] = Field(description="rad/s; highest speed")
+    torque_nm: Torque = Field(description="N·m; highest torque, either sign")
+    time_s: Time = Field(description="s; longest run")
     quick_stop_rad_s2: Positive = Field(description="rad/s²; how hard the shaft is braked")
     watchdog_s: float = Field(default=0.5, ge=0.02, le=5, description="s of silence until the drive stops by itself")
-    probe_torque_nm: Positive = Field(description="N·m; highest torque to find out the direction and the breakaway")
+    probe_torque_nm: Torque = Field(description="N·m; highest torque to find out the direction and the breakaway")
     probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
 
     @model_validator(mode="after")
@@ -83,13 +119,13 @@ class Limits(DataModel):
 class Gear(DataModel):
     """Between motor and main shaft."""
 
-    ratio: Positive = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
+    ratio: Ratio = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
 
 
 class DriveData(DataModel):
     """What the drive does not tell of itself, and how far it can be trusted."""
 
-    rated_torque_nm: Positive | None = Field(default=None, description="N·m; name plate, where 6076h does not say")
+    rated_torque_nm: Torque | None = Field(default=None, description="N·m; name plate, where 6076h does not say")
     torque_scale_rel_sd: float | None = Field(
         default=None, ge=0, lt=1, description="standard deviation of the drive's torque scale, as a share (0.02 = 2 %)"
     )
@@ -116,10 +152,10 @@ class DriveData(DataModel):
 class Expected(DataModel):
     """What is expected of the shaft, for planning before it has moved (`--dry-run`); never used for the result."""
 
-    inertia_kg_m2: Positive | None = Field(default=None, description="kg·m² at the motor")
+    inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor")
     viscous_nm_s_rad: NotNegative | None = Field(default=None, description="N·m·s/rad")
-    coulomb_nm: NotNegative | None = Field(default=None, description="N·m")
-    load_noise_nm: Positive | None = Field(default=None, description="N·m; standard deviation of what disturbs")
+    coulomb_nm: Annotated[float, _within(0.0, 1e7, zero=True)] | None = Field(default=None, description="N·m")
+    load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of what disturbs")
 
 
 _OPERATORS = {
@@ -142,12 +178,12 @@ class Run(DataModel):
 
     excitation: Literal["multisine", "sine", "step", "pulses", "coast-down"] | None = None
     mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
-    frequency_hz: Positive | None = Field(default=None, description="Hz; base frequency of the excitation")
-    amplitude_rad_s: Positive | None = Field(default=None, description="rad/s; amplitude of the speed")
-    offset_rad_s: float | None = Field(default=None, description="rad/s; mean speed")
+    frequency_hz: Frequency | None = Field(default=None, description="Hz; base frequency of the excitation")
+    amplitude_rad_s: Amplitude | None = Field(default=None, description="rad/s; amplitude of the speed")
+    offset_rad_s: Speed | None = Field(default=None, description="rad/s; mean speed")
     periods: int | None = Field(default=None, ge=1, le=10_000)
     tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
-    max_time_s: Positive | None = Field(default=None, description="s; longest stage 5")
+    max_time_s: Time | None = Field(default=None, description="s; longest stage 5")
     model: Literal["auto", "rigid", "two-mass", "string", "paper"] | None = Field(
         default=None, description="of the shaft; auto: the simplest that fits"
     )
@@ -185,16 +221,17 @@ class Rig(DataModel):
     limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
     gear: Gear = Gear()
     load: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
-    make_up_torque_nm: Positive | None = Field(default=None, description="N·m at the motor; of the string's joints")
+    make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; of the string's joints")
     torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
     allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
     drive_data: DriveData = DriveData()
     expected: Expected = Expected()
-    reference_inertia_kg_m2: Positive | None = Field(default=None, description="kg·m² at the motor; shown beside J")
+    reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
     run: Run = Run()
 
     _file: str = PrivateAttr(default="")
     _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})
+    _conversions: tuple[Conversion, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -224,6 +261,12 @@ class Rig(DataModel):
         line = self.line(dotted)
         return f"{Path(self._file).name}:{line}" if line else ""
 
+    @property
+    def conversions(self) -> tuple[tuple[str, str, str], ...]:
+        """(key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of everything that stood there in a unit of its own."""
+        keys = [".".join(map(str, one.path)) for one in self._conversions]
+        return tuple((key, one.text, self.source(key)) for key, one in zip(keys, self._conversions, strict=True))
+
     def get(self, dotted: str) -> Any:
         """The value of a key such as ``run.seed``."""
         value: Any = self
@@ -238,10 +281,10 @@ class Rig(DataModel):
 
 
 def load_rig(path: Path) -> Rig:
-    """The bench in a rig.yaml; DataFileError with every problem and its line."""
-    loaded = load_with_lines(path, Rig)
+    """The bench in a rig.yaml; DataFileError with every problem and its line. Values with a unit become SI."""
+    loaded = load_with_lines(path, Rig, convert=True)
     rig = loaded.value
-    rig._file, rig._lines = loaded.file, loaded.lines
+    rig._file, rig._lines, rig._conversions = loaded.file, loaded.lines, loaded.conversions
     return rig
 
 
@@ -285,7 +328,7 @@ def simulated_default_rig(rig: Rig | None = None) -> Rig:
             for path, message in messages_of(error, data, Rig)
         ]
         raise DataFileError(tuple(found)) from None
-    filled._file, filled._lines = rig._file, rig._lines
+    filled._file, filled._lines, filled._conversions = rig._file, rig._lines, rig._conversions
     return filled
 
 

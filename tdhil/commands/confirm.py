@@ -12,6 +12,7 @@ from rich.console import Console
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
 from drivers.no_watchdog import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
+from profiles.quantities import RPM
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
@@ -68,7 +69,8 @@ def summary(
     return (
         f"\nThis run will move {preflight.identity.name}:\n"
         f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
-        f"  speed window    {limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g} rad/s\n"
+        f"  speed window    {limits.speed_min_rad_s:.4g} to {limits.speed_max_rad_s:.4g} rad/s "
+        f"({RPM.of_si(limits.speed_min_rad_s):.4g} to {RPM.of_si(limits.speed_max_rad_s):.4g} rpm)\n"
         f"  peak torque     {limits.torque_nm:g} N·m\n"
         f"  excitation      {request.kind}\n"
         f"  duration        at most {minutes(limits.time_s)}\n"

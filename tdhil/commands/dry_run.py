@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.drive import Identity
 from drivers.errors import PreflightRefused
+from profiles.quantities import RPM
 from tdhil import __version__
 from tdhil.commands.task import bench_of, excitation_request, lag_prior, machine_limits
 from tdhil.options import Resolved
@@ -50,12 +51,17 @@ def dry_run(options: Resolved, rig: Rig | None, simulated: bool, can_torque: boo
     """
     planned, figures, limits = plan_dry(options, rig, simulated, can_torque)
     if options["json"]:
-        json.dump(document(planned, figures, limits), sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+        plain = document(planned, figures, limits)
+        plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
+        json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
         sys.stdout.write("\n")
         return 0
     from rich.console import Console
 
-    show(planned, figures, limits, Console(highlight=False))
+    console = Console(highlight=False)
+    show(planned, figures, limits, console)
+    for key, text, source in rig.conversions if rig is not None else ():
+        console.print(f"{key}: {text}  ({source})", markup=False)
     return 0
 
 
@@ -195,7 +201,8 @@ def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
         table.add_column(heading, overflow="fold")
     table.add_row(
         "speed, rad/s", f"{plan.speed_min_rad_s:.3g} to {plan.speed_max_rad_s:.3g}",
-        f"{limits.speed_min_rad_s:g} to {limits.speed_max_rad_s:g}",
+        f"{limits.speed_min_rad_s:.4g} to {limits.speed_max_rad_s:.4g}\n"
+        f"{RPM.of_si(limits.speed_min_rad_s):.4g} to {RPM.of_si(limits.speed_max_rad_s):.4g} rpm",
     )
     table.add_row(
         "torque, N·m", f"{plan.torque_min_nm:.3g} to {plan.torque_max_nm:.3g}", f"±{limits.torque_nm:g}"

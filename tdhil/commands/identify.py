@@ -27,12 +27,14 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.options`)."""
+    from profiles.quantities import FREQUENCY, SPEED, TIME
     from tdhil.commands.line_options import add_drive_arguments, add_line_arguments
     from tdhil.commands.models import EXCITATIONS, MODELS
-    from tdhil.commands.quantities import seconds, share
+    from tdhil.commands.quantities import amount, share
 
     drive = add_drive_arguments(parser)
-    drive.add_argument("--rate", dest="rate_hz", type=float, metavar="HZ", help="cycles a second (default: profile's)")
+    drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
+                       help="cycles a second (default: profile's)")
     drive.add_argument("--accept-unverified", action="append", metavar="NAME",
                        help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
     drive.add_argument("--accept-no-watchdog", action="store_true",
@@ -46,18 +48,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
     motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
-    motion.add_argument("--frequency", dest="frequency_hz", type=float, metavar="HZ", help="lowest line or the tone")
-    motion.add_argument("--amplitude", dest="amplitude_rad_s", type=float, metavar="RAD_S", help="peak of the speed")
-    motion.add_argument("--offset", dest="offset_rad_s", type=float, metavar="RAD_S", help="mean speed")
+    motion.add_argument("--frequency", dest="frequency_hz", type=amount(FREQUENCY), metavar="HZ",
+                        help="lowest line or the tone")
+    motion.add_argument("--amplitude", dest="amplitude_rad_s", type=amount(SPEED), metavar="RAD_S",
+                        help="peak of the speed, such as 1.5 or 15rpm")
+    motion.add_argument("--offset", dest="offset_rad_s", type=amount(SPEED), metavar="RAD_S",
+                        help="mean speed, such as 4 or 40rpm")
     motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
-    motion.add_argument("--max-time", dest="max_time_s", type=seconds, metavar="TIME",
+    motion.add_argument("--max-time", dest="max_time_s", type=amount(TIME), metavar="TIME",
                         help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
     motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
     motion.add_argument("--yes", action="store_const", const=True, help="no prompt before motion; limits stay")
     result = parser.add_argument_group("result")
     result.add_argument("--tolerance", type=share, metavar="SHARE",
                         help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
-    result.add_argument("--confidence", type=float, metavar="P", help="of the interval (default 0.95)")
+    result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
     result.add_argument("--model", choices=MODELS, help="of the shaft (default auto: the simplest that fits)")
     result.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
     result.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
@@ -107,7 +112,7 @@ def run(namespace: argparse.Namespace) -> int:
         simulated = bool(options["simulate"]) or not connection.configured
         return dry_run(options, rig, simulated, can_torque(connection.profile))
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
-    show_settings(console, options, connection, peer)
+    show_settings(console, options, connection, peer, rig)
     return _run(namespace, options, connection, peer, suited(rig, peer.plant), console)
 
 

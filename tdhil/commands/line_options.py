@@ -25,6 +25,9 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     """Where it is: a Modbus line, or a CAN bus with python-can's own options."""
     from can.cli import add_bus_arguments
 
+    from profiles.quantities import BIT_RATE
+    from tdhil.commands.quantities import amount
+
     modbus = parser.add_argument_group("Modbus (what is left out is as the profile says)")
     modbus.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")
     modbus.add_argument("--port", type=int, metavar="N", help="TCP port (default 502)")
@@ -34,3 +37,7 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     modbus.add_argument("--stop-bits", type=int, choices=(1, 2), help="of the serial line")
     modbus.add_argument("--unit", type=int, metavar="N", help="unit (slave) number of the drive")
     add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
+    bit_rate = amount(BIT_RATE)
+    for action in parser._actions:  # python-can's take no 500k
+        if action.dest in ("bitrate", "data_bitrate"):
+            action.type = lambda text: int(bit_rate(text))

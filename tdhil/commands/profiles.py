@@ -8,11 +8,13 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from profiles.library import Profile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """`tdhil profiles`, `tdhil profiles show NAME`, `tdhil profiles check FILE`."""
+    """`tdhil profiles`, `… show NAME`, `… check FILE`, `… import FILE`."""
     parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
     shown = actions.add_parser("show", help="all that a person at the drive needs of one profile",
@@ -22,7 +24,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     checked = actions.add_parser("check", help="is a profile of your own right? exit 2 and a line a problem if not",
                                  description="Is a profile of your own right? Exit 2 and a line a problem if not.")
     checked.add_argument("files", metavar="FILE", nargs="+", help="a .yaml file, or vendor/model")
-    for action in (shown, checked):
+    begun = actions.add_parser("import", help="begin a profile of your own from the drive's EDS or DCF",
+                               description="Begin a profile of your own from the drive's EDS or DCF. What the file "
+                                           "can't know is marked unverified, with what to look for in the manual.")
+    begun.add_argument("file", metavar="FILE", help="the .eds or .dcf file that the drive's maker gives out")
+    begun.add_argument("-o", "--output", metavar="FILE", default=None,
+                       help="the profile (default: named as the EDS, in this folder); none is overwritten")
+    for action in (shown, checked, begun):
         action.add_argument("--json", action="store_const", const=True, default=argparse.SUPPRESS,
                             help="one JSON document on stdout")
     parser.set_defaults(run=run)
@@ -35,6 +43,8 @@ def run(namespace: argparse.Namespace) -> int:
         return _show(namespace.name, as_json)
     if namespace.action == "check":
         return _check(namespace.files, as_json)
+    if namespace.action == "import":
+        return _import(namespace.file, namespace.output, as_json)
     return _list(as_json)
 
 
@@ -111,6 +121,46 @@ def _check(files: list[str], as_json: bool) -> int:
     if as_json:
         _dump({"ok": not problems, "profiles": found, "problems": problems, "exit_code": code})
     return code
+
+
+def _import(file: str, output: str | None, as_json: bool) -> int:
+    from pathlib import Path
+
+    from profiles.eds_import import begin_profile
+    from profiles.eds_reader import read_eds
+    from profiles.errors import DataFileError, Problem
+    from tdhil.commands.profile_said import row, sure_text
+    from tdhil.commands.unverified import doubtful
+
+    source = Path(file)
+    target = Path(output) if output is not None else Path(f"{source.stem}.yaml")
+    if target.suffix not in (".yaml", ".yml"):
+        raise DataFileError((Problem(str(target), 0, "a profile's file ends in .yaml: name it so with -o"),))
+    begun = begin_profile(read_eds(source), file)
+    try:
+        with target.open("x", encoding="utf-8") as stream:
+            stream.write(begun.text)
+    except FileExistsError:
+        message = "is there already and stays as it is; name another one with -o"
+        raise DataFileError((Problem(str(target), 0, message),)) from None
+    except OSError as error:
+        message = f"can't be written ({error.strerror or error}); name another place with -o"
+        raise DataFileError((Problem(str(target), 0, message),)) from error
+    open_entries = [name for name, entry in doubtful(begun.profile) if entry.confidence == "unverified"]
+    if as_json:
+        _dump({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})
+        return 0
+    print(f"{target}: {begun.profile.name} on canopen, begun from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
+    print(f"Look up in the drive's manual: {', '.join(open_entries)}. What to look for stands in the file.")  # noqa: T201
+    print(f"Then: tdhil profiles check {target}, and tdhil identify --simulate --profile {_as_path(target)}")  # noqa: T201
+    return 0
+
+
+def _as_path(target: Path) -> str:
+    """As a shell takes it, and as `--profile` knows it for a file."""
+    import shlex
+
+    return shlex.quote(str(target) if target.parent.name or target.is_absolute() else f"./{target}")
 
 
 def _load(file: str) -> Profile:

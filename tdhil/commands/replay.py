@@ -8,9 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles.quantities import SHARE, TIME, TORQUE
 from tdhil.commands.conclude import conclude, print_result, save_report
 from tdhil.commands.models import MODELS
-from tdhil.commands.quantities import share
+from tdhil.commands.quantities import amount, share
 from tdhil.errors import ExitCode, UsageError
 from tdhil.record.errors import LogError, NothingRecoverable
 
@@ -32,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
     parser.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
     parser.add_argument("--model", choices=MODELS, help="of the shaft (default: the run's, or auto)")
-    parser.add_argument("--confidence", type=float, metavar="P", help="of the interval (default: the run's, or 0.95)")
+    parser.add_argument("--confidence", type=share, metavar="P", help="of the interval (default: the run's, or 0.95)")
     parser.add_argument("--tolerance", type=share, metavar="SHARE",
                         help="half-width of the interval that is enough (default: the run's, or 0.05)")
     trace = parser.add_argument_group("a trace in CSV (a run.mcap brings all this along)")
@@ -40,17 +41,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
     trace.add_argument("--excitation", type=Path, metavar="excitation.yaml",
                        help="the periodic motion that was run: period, lines, mean speeds, start times")
-    for flag, unit, text in (
-        ("--rated-torque", "NM", "what torque in %% or ‰ is a share of, N·m"),
-        ("--torque-limit", "NM", "the drive's torque limit, N·m: what is cut off there is refused"),
-        ("--gear", "RATIO", "i = ω_motor/ω_main (default 1)"),
-        ("--torque-scale-sd", "SHARE", "how right the drive's torque is, 1 sd (default 0.03)"),
-        ("--speed-lag", "S", "time constant of the filter on the reported speed"),
-        ("--speed-lag-sd", "S", "its standard deviation (default a tenth of it)"),
-        ("--torque-lag", "S", "time constant of the filter on the reported torque"),
-        ("--torque-lag-sd", "S", "its standard deviation (default a tenth of it)"),
+    for flag, unit, metavar, text in (
+        ("--rated-torque", TORQUE, "NM", "what torque in %% or ‰ is a share of, N·m"),
+        ("--torque-limit", TORQUE, "NM", "the drive's torque limit, N·m: what is cut off there is refused"),
+        ("--gear", None, "RATIO", "i = ω_motor/ω_main (default 1)"),
+        ("--torque-scale-sd", SHARE, "SHARE", "how right the drive's torque is, 1 sd (default 0.03)"),
+        ("--speed-lag", TIME, "S", "time constant of the filter on the reported speed"),
+        ("--speed-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
+        ("--torque-lag", TIME, "S", "time constant of the filter on the reported torque"),
+        ("--torque-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
     ):
-        trace.add_argument(flag, type=float, metavar=unit, help=text)
+        trace.add_argument(flag, type=float if unit is None else amount(unit), metavar=metavar, help=text)
     parser.set_defaults(run=run)
 
 
@@ -180,11 +181,11 @@ def _check(namespace: argparse.Namespace) -> None:
     for name, low, high, wanted in (
         ("confidence", 0.5, 1.0, "at least 0.5 and below 1"),
         ("tolerance", 1e-9, math.inf, "a positive share"),
-        ("rated_torque", 1e-9, math.inf, "a positive number of N·m"),
-        ("torque_limit", 1e-9, math.inf, "a positive number of N·m"),
-        ("gear", 1e-9, math.inf, "a positive number"),
+        ("rated_torque", 1e-9, 1e9, "a positive number of N·m"),
+        ("torque_limit", 1e-9, 1e9, "a positive number of N·m"),
+        ("gear", 1e-6, 1e6, "a positive number"),
         ("torque_scale_sd", 0.0, 1.0, "a share from 0 to below 1"),
-        *((lag, 0.0, math.inf, "a time in s, not negative")
+        *((lag, 0.0, 1e6, "a time in s, not negative")
           for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd")),
     ):
         value = getattr(namespace, name)

@@ -192,10 +192,10 @@ def _line_of(one: FoundDrive, connection: Connection) -> Mapping[str, Any]:
 
 
 def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
+    from profiles.quantities import TIME
+    from tdhil.commands.quantities import amount
+
+    value = amount(TIME)(text)
     if not 0.0 < value <= 60.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a time from 0 to 60 s")
     return value

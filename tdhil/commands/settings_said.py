@@ -32,12 +32,15 @@ def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig
         "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
         "faults": [fault.text for fault in peer.faults],
         "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
+        "converted": [list(row) for row in rig.conversions] if rig is not None else [],
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
 
 
-def show_settings(console: Console, options: Resolved, connection: Connection, peer: PeerPlan) -> None:
-    """Which value came from where: everything that isn't a default."""
+def show_settings(
+    console: Console, options: Resolved, connection: Connection, peer: PeerPlan, rig: Rig | None = None
+) -> None:
+    """Which value came from where: everything that isn't a default; and what became of a value with a unit."""
     if peer.embedded:
         why = "as asked for" if options["simulate"] else connection.nothing_there
         clock = "stepped time" if peer.stepped else "real time"
@@ -51,6 +54,8 @@ def show_settings(console: Console, options: Resolved, connection: Connection, p
     for name, value, source in options.rows():
         if source != "default":
             console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
+    for key, text, source in rig.conversions if rig is not None else ():
+        console.print(f"{key:<14} {text}  ({source})", markup=False)
 
 
 _PREFIX = {"canopen": "bus", "modbus": "line"}

@@ -42,7 +42,7 @@ _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the i
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
-    """Identify the inertia. Pure: the same recording gives the same bits. Never raises on bad data: it refuses."""
+    """Identify the inertia. Pure: on one machine the same recording gives the same bits. Never raises: it refuses."""
     options = options or Options()
     stage, kept = aborted_stage(recording), before_abort(recording)
     found = with_stepping(_identify(kept, options), kept, options)

@@ -1,7 +1,8 @@
 """A recording: all that identification may see, and nothing else.
 
 Pure data. `tdhil replay` builds it from run.mcap, a live run from its own samples; both must be equal to
-the last bit, and so must what is identified from them.
+the last bit, and so must what is identified from them on the same machine. On another processor, whose linear algebra
+sums in another order (or on another number of cores), what is identified is the same to 1e-9.
 """
 
 import math

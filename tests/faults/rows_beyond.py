@@ -54,6 +54,16 @@ COMMAND_LINE: dict[int, Row] = {
              "tests/tdhil/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
              "tests/tdhil/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
             "the key is named with its line, nothing is connected to"),
+    96: Row("a quantity in rig.yaml in another unit than the key's (speed_max_rad_s: 100 rpm, speed_max_rpm)",
+            "converted and shown both ways, or refused without offering a number; both forms of a key are refused",
+            "0, 2", ("tests/tdhil/test_rig_units.py::test_a_value_with_its_unit_is_converted_and_both_are_told",
+             "tests/tdhil/test_rig_units.py::test_a_key_in_the_manual_s_unit",
+             "tests/tdhil/test_rig_units.py::test_what_is_refused_offers_no_wrong_number"),
+            "100 rpm = 10.47 rad/s in settings, dry run and prompt"),
+    97: Row("a bit rate that CAN doesn't have (500 for 500k)", "refused wherever it stands; the nearest is named", "2",
+            ("tests/tdhil/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
+             "tests/tdhil/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
+            "500 bit/s is none of CAN's; 500k is one"),
 }
 
 LOG: dict[int, Row] = {
@@ -64,6 +74,10 @@ LOG: dict[int, Row] = {
     106: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
              ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
              "what, where, and the next step"),
+    107: Row("replay on another kind of processor", "numbers the same to 1e-9, words the same", "the run's own",
+             ("tests/path/test_two_kernels.py::test_a_replay_under_other_kernels",
+              "tests/identify/test_quality.py::test_rounding_does_not_decide_whether_a_period_is_wrong"),
+             "the same result"),
 }
 
 BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG

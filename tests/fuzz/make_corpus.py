@@ -82,6 +82,7 @@ def main() -> None:
 
     for path in sorted((ROOT / "profiles" / "generic").glob("*.yaml")):
         put("profile", f"valid_{path.name}", path.read_bytes())
+    put("eds", "valid_cia402.eds", (ROOT / "profiles" / "generic" / "cia402.eds").read_bytes())
     put("rig", "valid_rig.yaml", (ROOT / "examples" / "rig.yaml").read_bytes())
     for path in sorted((ROOT / "examples").glob("plant*.yaml")):
         put("plant", f"valid_{path.name}", path.read_bytes())

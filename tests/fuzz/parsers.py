@@ -29,6 +29,11 @@ YAML_WORDS = [
 CSV_WORDS = [b";", b",", b"\t", b"|", b'"', b"\r\n", b"\r", b"\xef\xbb\xbf", b"\xff\xfe", b"\0", b"time_s", b"rpm",
              b"[Nm]", b"%", b"1,5", b"1.000,5", b"2026-01-01T00:00:00", b"12:30:01,5", b"NaN", b"#", b"\xb5s", b"sep=;"]
 
+EDS_WORDS = [b"[", b"]", b"=", b";", b"#", b"0x", b"$NODEID+", b"[6060]", b"[1018sub1]", b"[1016Name]", b"sub",
+             b"\r\n", b"\xfc", b"\0", b"CompactSubObj=200", b"ObjectType=8", b"ObjectType=5", b"DataType=0x8",
+             b"ParameterValue=", b"HighLimit=-1", b"NodeID=$NODEID", b"ParameterName=\xe2\x80\xae", b"AccessType=",
+             b"\x1b[2J"]
+
 
 @dataclass(frozen=True)
 class Parser:
@@ -82,6 +87,13 @@ def _profile(path: Path) -> None:
     from profiles.library import load_profile
 
     load_profile(str(path))
+
+
+def _eds(path: Path) -> None:
+    from profiles.eds_import import begin_profile
+    from profiles.eds_reader import read_eds
+
+    begin_profile(read_eds(path), str(path))
 
 
 def _rig(path: Path) -> None:
@@ -165,6 +177,7 @@ PARSERS = {
     parser.name: parser
     for parser in (
         Parser("profile", ".yaml", _profile, _YAML),
+        Parser("eds", ".eds", _eds, (*mutate.BYTES, mutate.lines, mutate.number, mutate.tokens(EDS_WORDS))),
         Parser("rig", ".yaml", _rig, _YAML),
         Parser("plant", ".yaml", _plant, _YAML),
         Parser("study", ".yaml", _study, _YAML),

@@ -17,7 +17,7 @@ from parsers import CSV_WORDS, PARSERS, YAML_WORDS, check_refusal, try_one
 from drivers.errors import TdhilError
 
 ROOT = Path(__file__).parents[2]
-FRESH = {"can": 40, "mcap": 40, "profile": 40}
+FRESH = {"can": 40, "eds": 40, "mcap": 40, "profile": 40}
 FILES = [(name, path) for name, parser in PARSERS.items() for path in sorted(parser.folder.iterdir())]
 YAML = [name for name, parser in PARSERS.items() if parser.suffix == ".yaml"]
 FEW = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -101,6 +101,16 @@ def test_the_true_period_is_told(share):
     assert wrong_period(*lines_of(recording)) is None
 
 
+def test_rounding_does_not_decide_whether_a_period_is_wrong():
+    """A record in closed form, and the same with its last bits otherwise, as another processor computes it."""
+    recording = closed_form()
+    slow = replace(recording, time_s=recording.time_s * 1.0007)
+    for seed in range(12):
+        ulps = np.random.default_rng(seed).integers(-2, 3, len(slow.time_s)) * np.finfo(float).eps
+        other = replace(slow, speed_rad_s=slow.speed_rad_s * (1.0 + ulps))
+        assert wrong_period(*lines_of(other)) == pytest.approx(0.0007, abs=5e-4), seed
+
+
 @pytest.mark.parametrize("hertz", [0.15, 0.25, 0.77, 2.1])
 def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
     recording = closed_form(rate_hz=50.0)

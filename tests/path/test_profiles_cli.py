@@ -3,8 +3,10 @@
 import pytest
 from path_runs import tdhil
 
+from drivers.errors import PreflightRefused
 from profiles.library import load_profile, profile_names, profile_path
 from profiles.modbus_schema import ModbusProfile
+from tdhil.commands.unverified import require_accepted
 
 
 def test_the_table_has_every_profile_that_ships():
@@ -140,3 +142,56 @@ def test_an_eds_that_is_not_there(tmp_path):
     done = tdhil("profiles", "check", path)
     assert done.code == 2
     assert "no file 'cia402.eds' beside" in done.err
+
+
+def test_a_profile_is_begun_from_an_eds(tmp_path, monkeypatch):
+    """Ours is an EDS like any other; what it can't say is named, nothing is overwritten, and the check likes it."""
+    monkeypatch.chdir(tmp_path)
+    source = profile_path("generic/cia402").parent / "cia402.eds"
+    done = tdhil("profiles", "import", source)
+    assert done.code == 0, done.err
+    path = tmp_path / "cia402.yaml"
+    assert "Look up in the drive's manual: identity, modes, quick_stop, torque, watchdog" in done.out
+    assert tdhil("profiles", "check", path).code == 0
+    before = path.read_bytes()
+    again = tdhil("profiles", "import", source)
+    assert (again.code, path.read_bytes()) == (2, before)
+    assert "is there already and stays as it is; name another one with -o" in again.err
+    document = tdhil("profiles", "import", source, "-o", "mine.yaml", "--json").document
+    assert document["file"] == "mine.yaml"
+    assert document["unverified"] == ["identity", "modes", "quick_stop", "torque", "watchdog"]
+    assert (tmp_path / "mine.yaml").read_bytes() == before
+
+
+def test_a_real_drive_is_refused_what_an_eds_leaves_open(tmp_path):
+    """Before motion: every entry that the file can't know goes by its own name."""
+    path = tmp_path / "mine.yaml"
+    tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", path)
+    profile = load_profile(str(path))
+    with pytest.raises(PreflightRefused) as caught:
+        require_accepted(profile, ("likely",))
+    for name in ("identity", "modes", "quick_stop", "torque", "watchdog"):
+        assert f"--accept-unverified {name}" in str(caught.value)
+    require_accepted(profile, ("likely", "identity", "modes", "quick_stop", "torque", "watchdog"))
+
+
+@pytest.mark.parametrize(("content", "at"), [
+    ("[DeviceInfo]\nVendorNumber=\n", ":2: VendorNumber is empty"), ("", ": has no section [DeviceInfo]"),
+])
+def test_a_broken_eds_is_a_line_and_no_profile(tmp_path, content, at):
+    path = tmp_path / "drive.eds"
+    path.write_text(content)
+    done = tdhil("profiles", "import", path, "-o", tmp_path / "mine.yaml")
+    assert done.code == 2
+    assert f"{path}{at}" in done.err
+    assert "Traceback" not in done.err
+    assert not (tmp_path / "mine.yaml").exists()
+
+
+@pytest.mark.parametrize(("output", "words"), [
+    ("mine.txt", "ends in .yaml"), ("no/such/mine.yaml", "can't be written"),
+])
+def test_where_a_profile_cannot_go(tmp_path, output, words):
+    done = tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", tmp_path / output)
+    assert done.code == 2
+    assert words in done.err

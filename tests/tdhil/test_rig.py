@@ -107,7 +107,7 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("node: 5", "node: 128", 3, "at most 127"),
         ("json: true", "jsn: true", 39, "did you mean 'json'?"),
         ("allow_reverse: false", "allow_reverse: off", 19, "write false"),
-        ("ratio: 10.5", "ratio: 0", 15, "greater than 0"),
+        ("ratio: 10.5", "ratio: 0", 15, "at least 1e-06"),
         ("confidence: 0.99", "confidence: 95", 34, "less than 1"),
         ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 45, "a list"),
         ("unit: 7}", "unit: 256}", 46, "at most 255"),

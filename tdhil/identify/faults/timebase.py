@@ -25,6 +25,7 @@ _WIDEST = 0.05
 _MOST_STEPS = 4001
 _STEPS_A_TURN = 32.0
 _MOST_PERIODS = 64      # of a segment that are looked at: enough to see a turning that matters
+_EQUAL = 1e-6           # of Λ: less is rounding
 _FLOOR = 1e-12          # relative: scatter that is the arithmetic's
 _CLEAR_LINE = 3.0       # a line that doesn't stand out of its turned scatter says nothing about turning
 
@@ -60,7 +61,10 @@ def wrong_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) 
     step = max(1.0 / (_STEPS_A_TURN * longest), 2.0 * _WIDEST / (_MOST_STEPS - 1))
     reach = int(_WIDEST / step)
     trial: FloatArray = np.linspace(-reach * step, reach * step, 2 * reach + 1)
-    best = float(trial[np.argmax(_gain(turning, trial))])
+    coarse = _gain(turning, trial)
+    # An ε at which no line is clear gains nothing, and so does 0: of equals the smallest, whatever rounding makes of it
+    equal = trial[coarse >= np.max(coarse) - _EQUAL]
+    best = float(equal[np.argmin(np.abs(equal))])
     fine: FloatArray = np.linspace(best - step, best + step, 81)
     gain = _gain(turning, fine)
     return float(fine[np.argmax(gain)]) if float(np.max(gain)) >= _CLEAR else None

@@ -1,0 +1,207 @@
+"""Quantities as people write them: ``100 rpm``, ``90°``, ``2 kNm``, ``15 min``, ``5 %``; and what unit a key has.
+
+One table for every place that takes a quantity: data files, the command line, the columns of a trace. What could
+mean two things is not read: ``1/s`` and ``Hz`` of a speed (revolutions or radians), ``m`` (minutes or milli), ``MNm``.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Final
+
+_TURN: Final = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A value in it is value · ``times`` / ``over`` in SI; two numbers, so that 0.35 % is 0.0035 to the last bit."""
+
+    dimension: str
+    symbol: str
+    times: float = 1.0
+    over: float = 1.0
+
+    def si(self, value: float) -> float:
+        """``value``, given in this unit, in SI."""
+        return _scaled(value, self.times, self.over)
+
+    def of_si(self, value: float) -> float:
+        """``value``, given in SI, in this unit."""
+        return _scaled(value, self.over, self.times)
+
+
+def _scaled(value: float, times: float, over: float) -> float:
+    if times.is_integer() and over.is_integer() and abs(value) < 1e15:
+        return float(Fraction(repr(float(value))) * int(times) / int(over))       # as if it had been typed in decimals
+    return value * times / over
+
+
+SPEED: Final = Unit("speed", "rad/s")
+RPM: Final = Unit("speed", "rpm", _TURN, 60.0)
+ACCELERATION: Final = Unit("acceleration", "rad/s²")
+ANGLE: Final = Unit("angle", "rad")
+TORQUE: Final = Unit("torque", "N·m")
+TORQUE_RATE: Final = Unit("change of torque", "N·m/s")
+FRICTION: Final = Unit("friction over speed", "N·m·s/rad")
+STIFFNESS: Final = Unit("stiffness", "N·m/rad")
+INERTIA: Final = Unit("moment of inertia", "kg·m²")
+TIME: Final = Unit("time", "s")
+FREQUENCY: Final = Unit("frequency", "Hz")
+SHARE: Final = Unit("share", "1")
+BIT_RATE: Final = Unit("bit rate", "bit/s")
+KILONEWTON_METRE: Final = Unit("torque", "kN·m", 1e3)
+POUND_FOOT: Final = Unit("torque", "lbf·ft", 1.3558179483314004)
+DEGREE: Final = Unit("angle", "°", _TURN, 360.0)
+DEGREE_S: Final = Unit("speed", "°/s", _TURN, 360.0)
+TURNS_S: Final = Unit("speed", "rev/s", _TURN)
+RPM_S: Final = Unit("acceleration", "rpm/s", _TURN, 60.0)
+MILLISECOND: Final = Unit("time", "ms", 1.0, 1e3)
+MICROSECOND: Final = Unit("time", "µs", 1.0, 1e6)
+MINUTE: Final = Unit("time", "min", 60.0)
+HOUR: Final = Unit("time", "h", 3600.0)
+PERCENT: Final = Unit("share", "%", 1.0, 100.0)
+PERMILLE: Final = Unit("share", "‰", 1.0, 1000.0)
+
+_KILOBIT, _MEGABIT = Unit("bit rate", "kbit/s", 1e3), Unit("bit rate", "Mbit/s", 1e6)
+_TURN_ANGLE = Unit("angle", "turns", _TURN)
+_DEGREE_S2, _TURNS_S2 = Unit("acceleration", "°/s²", _TURN, 360.0), Unit("acceleration", "rev/s²", _TURN)
+_KILO_RATE = Unit("change of torque", "kN·m/s", 1e3)
+_FRICTION_RPM = Unit("friction over speed", "N·m/rpm", 60.0, _TURN)
+_STIFFNESS_DEGREE = Unit("stiffness", "N·m/°", 360.0, _TURN)
+_KILO_STIFFNESS = Unit("stiffness", "kN·m/rad", 1e3)
+_CENTI = Unit("moment of inertia", "kg·cm²", 1.0, 1e4)
+_TONNE = Unit("moment of inertia", "t·m²", 1e3)
+_KILOHERTZ, _MILLIHERTZ = Unit("frequency", "kHz", 1e3), Unit("frequency", "mHz", 1.0, 1e3)
+
+# How each is spelt once case, spaces and the signs · . * - _ ^ are out of the way.
+_SPELT: Final[tuple[tuple[Unit, str], ...]] = (
+    (SPEED, "rad/s rads rad/sec rads1"),
+    (RPM, "rpm r/min rev/min revs/min 1/min /min min1 u/min upm"),
+    (TURNS_S, "rps rev/s r/s"),
+    (DEGREE_S, "deg/s °/s degs"),
+    (ACCELERATION, "rad/s2 rads2 rad/s/s"),
+    (RPM_S, "rpm/s rpms rev/min/s 1/min/s min1/s u/min/s"),
+    (_DEGREE_S2, "deg/s2 °/s2 degs2"),
+    (_TURNS_S2, "rev/s2"),
+    (ANGLE, "rad"),
+    (DEGREE, "° deg degree degrees"),
+    (_TURN_ANGLE, "turn turns rev revs"),
+    (TORQUE, "nm"),
+    (KILONEWTON_METRE, "knm"),
+    (POUND_FOOT, "lbfft ftlbf lbft ftlb ftlbs"),
+    (TORQUE_RATE, "nm/s"),
+    (_KILO_RATE, "knm/s"),
+    (FRICTION, "nms/rad nm/(rad/s) nmsrad"),
+    (_FRICTION_RPM, "nm/rpm"),
+    (STIFFNESS, "nm/rad"),
+    (_STIFFNESS_DEGREE, "nm/° nm/deg"),
+    (_KILO_STIFFNESS, "knm/rad"),
+    (INERTIA, "kgm2"),
+    (_CENTI, "kgcm2"),
+    (_TONNE, "tm2"),
+    (TIME, "s sec second seconds"),
+    (MILLISECOND, "ms msec"),
+    (MICROSECOND, "us µs usec"),
+    (MINUTE, "min minute minutes"),
+    (HOUR, "h hour hours"),
+    (FREQUENCY, "hz"),
+    (_KILOHERTZ, "khz"),
+    (PERCENT, "% pct percent"),
+    (PERMILLE, "‰ permille promille permil"),
+    (BIT_RATE, "bit/s bits/s bps bd baud"),
+    (_KILOBIT, "k kbit/s kbits/s kbps kbit kbd kbaud"),
+    (_MEGABIT, "mbit/s mbits/s mbps mbit mbd mbaud"),
+)
+_UNITS: Final = {word: unit for unit, words in _SPELT for word in words.split()}
+_CASE_COUNTS: Final = {"M": _MEGABIT, "mHz": _MILLIHERTZ, "MHz": None, "m": None, "Ms": None, "MS": None}
+_IGNORED: Final = re.compile(r"[\s·.*⋅_^⁻-]")
+_NUMBER: Final = re.compile(
+    r"\s*([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)(?![0-9])\s*(\S.*)?", re.DOTALL
+)
+_LONGEST: Final = 60
+"""Characters; more is no quantity."""
+
+# What a key's name ends with; of several the longest counts.
+_ENDINGS: Final = {
+    "rad_s": SPEED, "rad_s2": ACCELERATION, "rad": ANGLE, "nm": TORQUE, "nm_s": TORQUE_RATE, "nm_s_rad": FRICTION,
+    "nm_rad": STIFFNESS, "kg_m2": INERTIA, "s": TIME, "hz": FREQUENCY, "rel_sd": SHARE, "share": SHARE,
+    "tolerance": SHARE, "confidence": SHARE, "bitrate": BIT_RATE, "baud": BIT_RATE,
+    "rpm": RPM, "rpm_s": RPM_S, "deg": DEGREE, "turns": _TURN_ANGLE, "deg_s": DEGREE_S, "deg_s2": _DEGREE_S2,
+    "knm": KILONEWTON_METRE, "knm_s": _KILO_RATE, "ms": MILLISECOND, "us": MICROSECOND, "percent": PERCENT,
+    "permille": PERMILLE, "kg_cm2": _CENTI, "khz": _KILOHERTZ,
+}
+
+
+def unit_of(text: str) -> Unit | None:
+    """The unit that ``text`` spells: ``rpm``, ``1/min``, ``N.m``, ``kg m^2``; None if none that is known."""
+    bare = _IGNORED.sub("", text.replace("¹", "1").replace("²", "2").replace("μ", "µ"))
+    return _CASE_COUNTS[bare] if bare in _CASE_COUNTS else _UNITS.get(bare.casefold())
+
+
+def split(text: str) -> tuple[float, str] | None:
+    """Number and the rest behind it (``''`` without one); None where no number stands at the front."""
+    if len(text) > _LONGEST or (found := _NUMBER.fullmatch(text)) is None:
+        return None
+    value = float(found[1])
+    return (value, (found[2] or "").strip()) if math.isfinite(value) else None
+
+
+def read(text: str, unit: Unit) -> float:
+    """``text`` in ``unit``; a number without one is in ``unit``. ValueError, in words for the user, names no number."""
+    parts = split(text)
+    if parts is None:
+        raise ValueError(f"a number and its unit are wanted, such as '3 {example(unit)}'")
+    value, word = parts
+    given = unit_of(word) if word else unit
+    if given is None:
+        raise ValueError(f"'{word}' is no unit of a {unit.dimension} that is known; known: {', '.join(known(unit))}")
+    if given.dimension != unit.dimension:
+        raise ValueError(f"{given.symbol} is a unit of {given.dimension}, but a {unit.dimension} is wanted; "
+                         f"known: {', '.join(known(unit))}")
+    converted = value if given == unit else unit.of_si(given.si(value))
+    if not math.isfinite(converted):
+        raise ValueError("too large for a number")
+    return converted
+
+
+def example(unit: Unit) -> str:
+    """A word for the unit that can be typed."""
+    return "%" if unit.dimension == "share" else unit.symbol
+
+
+def known(unit: Unit) -> tuple[str, ...]:
+    """The symbols of the same dimension, to be offered in a message."""
+    return tuple(one.symbol for one, _ in _SPELT if one.dimension == unit.dimension)
+
+
+def key_ending(key: str) -> tuple[str, Unit] | None:
+    """What the key of a quantity is without its unit, and the unit: ``speed_max_rpm`` → (speed_max, rpm)."""
+    parts = key.split("_")
+    for start in range(len(parts)):
+        if (unit := _ENDINGS.get("_".join(parts[start:]))) is not None:
+            # 'tolerance' names the quantity itself, 'torque_scale_rel_sd' its unit too: the base tells keys apart.
+            base = key if unit is SHARE else "_".join(parts[:start])
+            return base, unit
+    return None
+
+
+def unit_of_key(key: str) -> Unit | None:
+    """The unit in which the key's value is; None where its name says none."""
+    found = key_ending(key)
+    return found[1] if found is not None else None
+
+
+def same_quantity(key: str, other: str) -> bool:
+    """Are these two keys one quantity in different units: ``speed_max_rpm`` and ``speed_max_rad_s``?"""
+    one, two = key_ending(key), key_ending(other)
+    if one is None or two is None or one[1] == two[1] or one[1].dimension != two[1].dimension:
+        return False
+    bases = {key.removesuffix("_percent").removesuffix("_permille"), other} if two[1] is SHARE else {one[0], two[0]}
+    return len(bases) == 1
+
+
+def shown(value: float, unit: Unit) -> str:
+    """For people: ``10.47 rad/s``; a share as a bare number."""
+    number = f"{value:.4g}" if not float(value).is_integer() or abs(value) >= 1e9 else f"{value:.0f}"
+    return number if unit is SHARE else f"{number} {unit.symbol}"
