@@ -3,6 +3,8 @@
 from sim_bus import emergency as emcy
 from sim_bus.fault_hooks import Misbehaviour
 
+_PROFILE_VELOCITY = 3
+
 
 class Emcy(Misbehaviour):
     """An emergency message, and nothing else."""
@@ -66,6 +68,14 @@ class ModeKept(Misbehaviour):
 
     def end(self) -> None:
         self.scene.node.application.keeps_mode = False
+
+
+class ModeLost(ModeKept):
+    """The drive goes over to its profile velocity mode (3) by itself, and stays there whatever 6060h says."""
+
+    def begin(self) -> None:
+        self.scene.node.application.set_mode(_PROFILE_VELOCITY)
+        super().begin()
 
 
 class LimitedTorque(Misbehaviour):

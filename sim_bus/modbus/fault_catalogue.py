@@ -55,6 +55,8 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
     "fault-at-start": Kind(30, "the drive is in fault when the host comes", plain(machine.drive_fault)),
     "stuck-state": Kind(31, "the control word is ignored", plain(machine.stuck)),
     "mode-not-followed": Kind(32, "the drive stays with speed or torque as it is", plain(machine.mode_kept)),
+    "mode-lost": Kind(88, "the drive goes over to regulating speed by itself, and stays there",
+                      plain(machine.mode_lost)),
     "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
                 plain(machine.safe_torque_off)),
     "internal-limit": Kind(33, "an internal limit leaves this share of the torque",

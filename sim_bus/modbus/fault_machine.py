@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from sim_bus.cia402_application import Mode
 from sim_bus.modbus.fault_hooks import Misbehaviour
 from sim_bus.modbus.machine import Machine
 
@@ -59,6 +60,18 @@ def mode_kept() -> Act:
         machine.application.keeps_mode = keeps
 
     return Act(lambda machine: keep(machine, True), lambda machine: keep(machine, False))
+
+
+def mode_lost() -> Act:
+    """The drive regulates speed from then on, whatever is chosen, and shows it."""
+    def lose(machine: Machine) -> None:
+        machine.application.set_mode(Mode.CYCLIC_VELOCITY.value)
+        machine.application.keeps_mode = True
+
+    def over(machine: Machine) -> None:
+        machine.application.keeps_mode = False
+
+    return Act(lose, over)
 
 
 def limited_torque(share: float) -> Act:

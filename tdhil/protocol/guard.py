@@ -10,15 +10,20 @@ differentiating the reported speed instead would see nothing but noise). t_r is 
 three periods of a slow loop. Downwards ω_pred goes through standstill only where the torque overcomes the friction that
 then holds the shaft, and the shaft must not turn backwards (where it may: not faster than the limit). Between there and
 the window's lower end nothing comes to harm: that end is held by the reported speed.
+
+In speed mode it is the following error that is held, as motion controllers do, by a window and a time. What the shaft
+may be late by is not taken for an error: the window lies about all that the reference was over the longest plausible
+lag, and a shaft that comes nearer, however slowly a heavy one may at its torque limit, is waited for.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 
 from drivers.drive import Command, Counters, Mode, PowerState, Sample
-from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit
+from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed
 from drivers.ticks import LOWER_THE_RATE
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
@@ -35,6 +40,24 @@ FROZEN_SHARE = 0.1
 LIMITED_S = 0.5
 """In torque mode the drive's internal limit may act for so long: a torque that is not the commanded one moves the shaft
 to where nobody planned (row 33)."""
+
+MODE_LOST_S, MODE_SWITCH_S, MODE_CYCLES = 0.25, 1.0, 15
+"""The drive may display another mode than the commanded one for so long, and for so many cycles: since it was seen in
+it, and from a switch on (`Bench.switch_mode` gives up sooner). The display comes every few cycles only, may be lost,
+and a mode that somebody changed is asked for again meanwhile."""
+
+FOLLOW_SHARE, FOLLOW_S, FOLLOW_STRING_S = 0.05, 5.0, 10.0
+"""In speed mode the shaft may stay away from its reference by this share of the speed limit; by more for so long, if it
+comes no nearer. With a drill string on it it may swing meanwhile."""
+
+NEARER_SHARE = 0.02
+"""Of the speed limit, that the shaft must come nearer by within that time."""
+
+FOLLOW_MEAN_S, FOLLOW_BLOCK_S = 0.5, 0.1
+"""What is compared is the mean reported speed over the first, with the reference in blocks of the second."""
+
+AT_LIMIT_SHARE = 0.9
+"""Of the torque limit, from which on the torque counts as being at it."""
 
 PACE_S, LATE_SHARE = 2.0, 0.2
 """A loop that was late in this share of its cycles over this time can't hold its rate (row 8)."""
@@ -65,6 +88,8 @@ class Guard:
         self._stale = 0
         self._still: _Still | None = None
         self._limited_since_s: float | None = None
+        self._mode = _ModeShown()
+        self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
         self._pace_cycles = max(10, round(PACE_S / period_s))
         self._pace_from = Counters()
         self._started_s: float | None = None
@@ -152,8 +177,10 @@ class Guard:
                 where=where,
                 next_step="Raise limits.time_s in rig.yaml or ask for fewer periods",
             )
+        self._check_mode(command, sample)
         self._check_frozen(command, sample, where)
         self._check_limited(command, sample)
+        self._check_following(command, sample, where)
         if command.mode is Mode.TORQUE and self.model is not None:
             self._check_window(self.model, command, sample.speed_rad_s, where)
 
@@ -248,6 +275,48 @@ class Guard:
                 next_step="Does a gateway repeat old values? Check the bus and the drive; is the shaft locked?",
             )
 
+    def _check_mode(self, command: Command, sample: Sample) -> None:
+        if self.expected is not PowerState.ENABLED:
+            self._mode = _ModeShown()
+        elif sample.fresh and not self._mode.see(command.mode, sample):
+            shown = "none of those that it was prepared for" if sample.mode is None else f"{sample.mode.value} mode"
+            raise ModeNotConfirmed(
+                f"the drive lost its mode: {command.mode.value} mode is commanded, and it displays {shown}",
+                where=f"mode display (6061h in CiA 402) at {sample.time_s:.3f} s",
+                next_step="The shaft was stopped. Did a second master, a tool or a parameter of the drive change it?",
+            )
+
+    def torque_told(self, torque_nm: float, limit_active: bool) -> tuple[str, str]:
+        """How a torque stands to its limit, and what would help a shaft that does not get its speed with it."""
+        limit_nm = self._limits.torque_nm
+        if limit_active or abs(torque_nm) >= AT_LIMIT_SHARE * limit_nm:
+            by = "the drive's internal limit acts" if limit_active else f"at its limit of {limit_nm:g} N·m"
+            return (
+                f"torque {torque_nm:.1f} N·m, {by}",
+                "Does a brake or the load hold the shaft? Else it needs a higher torque limit (limits.torque_nm in"
+                " rig.yaml, and the drive's own)",
+            )
+        return (
+            f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m",
+            "Does the drive take its speed from elsewhere (panel, another master), hold a speed limit or a ramp of its"
+            " own, or count speed in another unit than the profile says? Else its speed loop is tuned too softly",
+        )
+
+    def _check_following(self, command: Command, sample: Sample, where: str) -> None:
+        if self.expected is not PowerState.ENABLED or command.mode is not Mode.SPEED:
+            self._following.reset()
+            return
+        following = self._following
+        if sample.fresh and not following.see(command.speed_rad_s, sample):
+            torque, helps = self.torque_told(following.torque_nm, sample.limit_active)
+            raise LimitHit(
+                f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"
+                f" {following.speed_rad_s:.3f} rad/s reported, apart since {following.since_s:.1f} s and no nearer for"
+                f" {following.within_s:g} s; {torque}",
+                where=where,
+                next_step=f"The shaft was stopped. {helps}",
+            )
+
     def _check_limited(self, command: Command, sample: Sample) -> None:
         if command.mode is not Mode.TORQUE or not sample.limit_active:
             self._limited_since_s = None
@@ -270,3 +339,87 @@ class _Still:
         self.mode = mode
         self.since_s = since_s
         self.lowest = self.highest = setpoint
+
+
+class _ModeShown:
+    """The mode that the drive displays beside the commanded one."""
+
+    def __init__(self) -> None:
+        self._commanded: Mode | None = None
+        self._seen = False                 # in the commanded one, since that was commanded
+        self._other_since_s: float | None = None
+        self._others = 0
+
+    def see(self, commanded: Mode, sample: Sample) -> bool:
+        """False once another one has been displayed for too long."""
+        if commanded is not self._commanded:
+            self._commanded, self._seen, self._other_since_s = commanded, False, None
+        if sample.mode is commanded:
+            self._seen, self._other_since_s = True, None
+            return True
+        if self._other_since_s is None:
+            self._other_since_s, self._others = sample.time_s, 0
+        self._others += 1
+        allowed_s = MODE_LOST_S if self._seen else MODE_SWITCH_S
+        return self._others <= MODE_CYCLES or sample.time_s - self._other_since_s < allowed_s
+
+
+class _Following:
+    """The reported speed beside the reference of speed mode."""
+
+    def __init__(
+        self, limits: MachineLimits, period_s: float, speed_resolution_rad_s: float, assumptions: ControlAssumptions
+    ) -> None:
+        self._window_rad_s = max(FOLLOW_SHARE * limits.speed_max_rad_s, 5.0 * speed_resolution_rad_s)
+        self._nearer_rad_s = max(NEARER_SHARE * limits.speed_max_rad_s, 2.0 * speed_resolution_rad_s)
+        reach_s = assumptions.reaction_s + 3.0 * assumptions.largest_speed_lag_s + FOLLOW_MEAN_S
+        self.within_s = FOLLOW_STRING_S if limits.load == "string" else FOLLOW_S
+        self._blocks: deque[_Block] = deque(maxlen=1 + math.ceil(reach_s / max(FOLLOW_BLOCK_S, period_s)))
+        self._recent: deque[tuple[float, float]] = deque(maxlen=max(1, round(FOLLOW_MEAN_S / period_s)))
+        self.reset()
+
+    def reset(self) -> None:
+        """What comes next is seen as the first."""
+        self._blocks.clear()
+        self._recent.clear()
+        self._side = 0.0                   # of the reference that the shaft is away on; 0: it is not
+        self._anchor_rad_s = self._anchor_s = self.since_s = 0.0
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean reported speed."""
+        return math.fsum(speed for speed, _ in self._recent) / len(self._recent)
+
+    @property
+    def torque_nm(self) -> float:
+        """Mean reported torque."""
+        return math.fsum(torque for _, torque in self._recent) / len(self._recent)
+
+    def see(self, reference_rad_s: float, sample: Sample) -> bool:
+        """False once the shaft has been away from its reference, and come no nearer, for too long."""
+        now_s = sample.time_s
+        if not self._blocks or now_s - self._blocks[-1].start_s >= FOLLOW_BLOCK_S:
+            self._blocks.append(_Block(now_s, reference_rad_s))
+        else:
+            self._blocks[-1].widen(reference_rad_s)
+        self._recent.append((sample.speed_rad_s, sample.torque_nm))
+        speed_rad_s = self.speed_rad_s
+        below = min(block.lowest for block in self._blocks) - self._window_rad_s - speed_rad_s
+        above = speed_rad_s - max(block.highest for block in self._blocks) - self._window_rad_s
+        side = 1.0 if below > 0.0 else -1.0 if above > 0.0 else 0.0
+        if side != self._side:
+            self._side, self._anchor_rad_s, self._anchor_s, self.since_s = side, speed_rad_s, now_s, now_s
+        elif side * (speed_rad_s - self._anchor_rad_s) >= self._nearer_rad_s:
+            self._anchor_rad_s, self._anchor_s = speed_rad_s, now_s
+        return side == 0.0 or now_s - self._anchor_s < self.within_s
+
+
+class _Block:
+    """What the reference was from ``start_s`` on."""
+
+    def __init__(self, start_s: float, reference_rad_s: float) -> None:
+        self.start_s = start_s
+        self.lowest = self.highest = reference_rad_s
+
+    def widen(self, reference_rad_s: float) -> None:
+        self.lowest, self.highest = min(self.lowest, reference_rad_s), max(self.highest, reference_rad_s)

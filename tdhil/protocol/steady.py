@@ -72,8 +72,11 @@ def wait_until_steady(
         good = good + 1 if abs(mean - target_rad_s) <= tolerance_rad_s else 0
         if good >= BLOCKS:
             return seen
+    torque_nm = sum(sample.torque_nm for sample in block) / len(block)
+    torque, helps = bench.guard.torque_told(torque_nm, block[-1].limit_active)
     raise LimitHit(
-        f"the speed did not settle at {target_rad_s:.3f} rad/s within {timeout_s:g} s (last {mean:.3f} rad/s)",
+        f"the speed did not settle at {target_rad_s:.3f} rad/s within {timeout_s:g} s (last {mean:.3f} rad/s);"
+        f" {torque}",
         where=f"at {bench.now_s:.1f} s",
-        next_step="Is the torque limit too low for this load, or the drive's speed loop badly tuned?",
+        next_step=helps,
     )

@@ -45,6 +45,13 @@ STAGES: dict[int, Row] = {
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
     87: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",
             ("tests/faults/test_stage_rows.py::test_a_fault_that_never_comes_is_said",)),
+    88: Row("a mode that is lost in motion", "QS", "6",
+            ("tests/faults/test_stage_rows.py::test_a_mode_that_is_lost_in_motion",
+             "tests/protocol/test_guard_follows.py::test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame")),
+    89: Row("a shaft that does not follow in speed mode", "following error: QS", "7",
+            ("tests/faults/test_stage_rows.py::test_a_shaft_that_does_not_follow_in_speed_mode",
+             "tests/protocol/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
+             "tests/protocol/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
 }
 
 COMMAND_LINE: dict[int, Row] = {

@@ -36,3 +36,23 @@ def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, s
     events = [event.text for event in read_run(run.log).events if event.kind == "fault"]
     assert events == [f"--fault {never} never came"]
     seen(87, said, None, run.assert_log_whole(), run.done.code)
+
+
+@pytest.mark.parametrize(
+    ("drive", "when"), [("canopen", "hold+2s"), ("canopen", "acquire+5s"), ("modbus", "acquire+5s")]
+)
+def test_a_mode_that_is_lost_in_motion(drive, when, rehearse, seen):
+    run = rehearse("--drive", drive, "--fault", f"mode-lost@{when}")
+    run.assert_ended(6, "lost its mode", "torque mode is commanded", "second master")
+    standstill_s = run.assert_stopped(run.fault_s, 1.0)
+    assert run.done.outcomes[-1] == (when.split("+")[0], "aborted")
+    seen(88, f"in {when}: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
+
+
+@pytest.mark.parametrize("drive", ["canopen", "modbus"])
+def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
+    """Torque enough for a tenth of the limit, and friction takes more."""
+    run = rehearse("--drive", drive, "--fault", "internal-limit@speed+8s=10%")
+    run.assert_ended(7, "does not follow", "apart since", "limit", "brake or the load")
+    standstill_s = run.assert_stopped(run.fault_s, 8.0)
+    seen(89, run.message, standstill_s, run.assert_log_whole(), run.done.code)
