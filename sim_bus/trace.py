@@ -15,15 +15,36 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from profiles.errors import TdhilError
+
 HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
 ROW_PERIOD_US = 10_000
 _FLUSH_S = 0.25
 
 
+class NotATrace(TdhilError):
+    """The file that a trace is to be written to holds something else."""
+
+    exit_code = 2
+
+
+def check_trace_path(path: Path, where: str = "trace") -> None:
+    """An older trace may be written over, nothing else. Raises NotATrace."""
+    if not path.is_file():
+        return
+    with path.open("rb") as file:
+        head = file.read(len(HEADER))
+    if head and head != HEADER.encode():
+        raise NotATrace("holds something else; it is left as it is", where=f"{where} {path}",
+                        next_step="Name another file")
+
+
 class Trace:
-    """Writes the file; without a path nothing happens."""
+    """Writes the file, over an older trace; without a path nothing happens. Raises NotATrace for any other file."""
 
     def __init__(self, path: Path | None) -> None:
+        if path is not None:
+            check_trace_path(path)
         self._file = path.open("w", encoding="utf-8") if path is not None else None
         self._flushed_s = time.monotonic()
         if self._file is not None:

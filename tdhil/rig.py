@@ -161,6 +161,7 @@ class Expected(DataModel):
 _OPERATORS = {
     "yes": "--yes",
     "accept_no_watchdog": "--accept-no-watchdog",
+    "accept_shared_watchdog": "--accept-shared-watchdog",
     "accept_wider_limit": "--accept-wider-limit NAME",
     "accept_wider_limits": "--accept-wider-limit NAME",
     "reset_fault": "--reset-fault",

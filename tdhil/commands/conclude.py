@@ -51,7 +51,9 @@ def save_report(document: Mapping[str, Any], recording: Recording, path: Path | 
     if path is not None:
         from tdhil.report.html import write_report
 
-        write_report(document, recording, path)
+        written = write_report(document, recording, path)
+        if written != path:
+            print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from drivers.drive import Identity
+    from drivers.drive import Identity, Preflight
     from profiles.library import Profile
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
     from tdhil.options import Resolved
-    from tdhil.protocol.task import RunOutcome, Task
+    from tdhil.protocol.task import Idle, RunOutcome, Task
     from tdhil.record.run_log import RunLog
     from tdhil.rig import Rig
 
@@ -106,6 +106,7 @@ def run(namespace: argparse.Namespace) -> int:
         from tdhil.report.html import check_report_path
 
         check_report_path(namespace.report, Path(options["log"]))
+    _check_files(namespace, options)
     if namespace.dry_run:
         from tdhil.commands.dry_run import dry_run
 
@@ -114,6 +115,27 @@ def run(namespace: argparse.Namespace) -> int:
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     return _run(namespace, options, connection, peer, suited(rig, peer.plant), console)
+
+
+def _check_files(namespace: argparse.Namespace, options: Resolved) -> None:
+    """Before anything is opened: no file of this run is another's. UsageError names the option."""
+    from tdhil.commands.log_file import check_log_path, check_names
+
+    log, trace = Path(options["log"]), options["trace"]
+    profile = options["profile"]
+    check_names({
+        "--rig": namespace.rig,
+        "--profile": Path(profile) if profile.endswith((".yaml", ".yml")) else None,
+        "--plant": None if options["plant"] is None else Path(options["plant"]),
+        "--log": log,
+        "--report": namespace.report,
+        "--trace": None if trace is None else Path(trace),
+    })
+    check_log_path(log, options.source("log") if options.source("log") != "default" else "--log")
+    if trace is not None:
+        from sim_bus.trace import check_trace_path
+
+        check_trace_path(Path(trace), "--trace")
 
 
 def _run(
@@ -125,7 +147,7 @@ def _run(
     console: Console,
 ) -> int:
     from tdhil.commands.confirm import confirm_motion
-    from tdhil.commands.log_file import make_room
+    from tdhil.commands.log_file import LogPlace
     from tdhil.commands.peer import open_drive
     from tdhil.commands.settings_said import configuration
     from tdhil.commands.stop_signals import stop_on_signals
@@ -137,10 +159,27 @@ def _run(
     from tdhil.record.writer import RunWriter
     from tdhil.report.live import LiveDisplay
 
-    path = Path(options["log"])
-    if (older := make_room(path)) is not None:
-        console.print(f"an older {path} was kept as {older}", style="dim", markup=False)
-    writer = RunWriter(path, epoch_ns=peer.epoch_ns, block=peer.stepped)
+    place = LogPlace(Path(options["log"]))
+    writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open)
+    writer.path = place.path
+    if place.live:
+        console.print(f"another run is writing {place.wanted}: this one's log is {place.path}", style="yellow",
+                      markup=False, soft_wrap=True)
+    elif place.older is not None:
+        console.print(f"an older {place.wanted} was kept as {place.older}", style="dim", markup=False)
+    outcome = None
+
+    def stub() -> bool:
+        stopped = outcome is not None and outcome.stop is not None
+        return not (place.motion or stopped)
+
+    def confirm(task: Task, preflight: Preflight, idle: Idle) -> None:
+        confirm_motion(
+            task, preflight, idle, yes=bool(options["yes"]), console=console, pause_display=display.pause,
+            unverified=accepted_lines(connection.profile, options["accept_unverified"]),
+        )
+        place.motion = True
+
     log = RunLog(writer, configuration(options, connection, peer, rig))
     data = rig.drive_data if rig is not None else None
     trace = None if options["trace"] is None else Path(options["trace"])
@@ -156,13 +195,7 @@ def _run(
                 log,
                 stop_request,
                 display,
-                partial(
-                    confirm_motion,
-                    yes=bool(options["yes"]),
-                    console=console,
-                    pause_display=display.pause,
-                    unverified=accepted_lines(connection.profile, options["accept_unverified"]),
-                ),
+                confirm,
                 reset_fault=namespace.reset_fault,
                 say=display.say,
             ).run()
@@ -171,10 +204,13 @@ def _run(
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
             console.print(f"tdhil: --fault {fault} never came: this run did not reach its moment", style="yellow",
                           markup=False, soft_wrap=True)
-        code = _finish(outcome, log, str(path), bool(options["json"]), console, namespace.report)
+        code = _finish(
+            outcome, log, str(place.name(stub=stub())), bool(options["json"]), console, namespace.report
+        )
     except BaseException:
         with suppress(LogError):  # the first cause stays the cause
             log.close()
+        place.settle(stub=stub())
         raise
     try:
         log.close()
@@ -183,6 +219,7 @@ def _run(
         if not isinstance(outcome.cause, LogError):
             console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
         code = code or int(exit_code(error))
+    place.settle(stub=stub())
     return code
 
 

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: nothing is missing; 3: some of it is; 10 (`NothingRecoverable`): nothing can be read."""
-    from tdhil.commands.log_file import make_room
+    from tdhil.commands.log_file import check_log_path, make_room
     from tdhil.record.salvage import examine, write_copy
     from tdhil.report.live import stderr_console
 
@@ -35,6 +35,8 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError("there is no such log", where=str(path), next_step="Name a run.mcap of this tool")
     if target is not None and target.exists() and target.samefile(path):
         raise UsageError("would be written over the log itself", where=f"-o {target}", next_step="Name another file")
+    if target is not None:
+        check_log_path(target, "-o")
     found = examine(path)
     if target is not None:
         if (older := make_room(target)) is not None:

@@ -29,21 +29,37 @@ _VERDICTS = {
 
 
 def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
-    """Before anything moves: can a report be made, and put there? Never over the log. Raises UsageError."""
+    """Before anything moves: can a report be made, and put there? Never over an older file. Raises UsageError."""
     require_extra(where)
     if path.resolve() == log.resolve():
         raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html")
     if path.is_dir():
         raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html")
+    if path.exists() and (path.is_file() or path.is_symlink()):
+        raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
+                         next_step=f"Name another file, such as {fresh(path).name}, or move that one away")
     if not path.parent.is_dir():
         raise UsageError("there is no such folder", where=f"{where} {path}", next_step=f"Make {path.parent} first")
 
 
-def write_report(document: Mapping[str, Any], recording: Recording, path: Path) -> None:
-    """Write the page; what is there is replaced. Raises UsageError where it can't be written."""
+def fresh(path: Path) -> Path:
+    """``path``, or the first of report-2.html, report-3.html … that isn't there."""
+    number, found = 1, path
+    while found.exists():
+        number += 1
+        found = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return found
+
+
+def write_report(document: Mapping[str, Any], recording: Recording, path: Path) -> Path:
+    """Write the page, and where it went: beside a file that has come there meanwhile. Raises UsageError."""
     text = report_page(document, recording)
+    if path.is_file():
+        path = fresh(path)
     try:
-        path.write_text(text, encoding="utf-8")
+        with path.open("x" if not path.exists() else "w", encoding="utf-8") as file:
+            file.write(text)
+        return path
     except OSError as error:
         raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}") from error
 

@@ -54,6 +54,7 @@ STAGES: dict[int, Row] = {
              "tests/protocol/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
 }
 
+FILES = "tests/path/test_files_of_a_run.py::"
 COMMAND_LINE: dict[int, Row] = {
     95: Row("rig.yaml confirms in the operator's place (run: yes, accept_no_watchdog …)", "refused, with the line and "
             "the flag; consent to a profile's entries counts for the profile of the same file only", "2",
@@ -71,6 +72,18 @@ COMMAND_LINE: dict[int, Row] = {
             ("tests/tdhil/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
              "tests/tdhil/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
             "500 bit/s is none of CAN's; 500k is one"),
+    98: Row("two runs log into one folder", "a live log is never moved; the second takes a name of its own and says it",
+            "-", (f"{FILES}test_a_live_log_is_never_moved", f"{FILES}test_runs_begun_at_once_share_no_file",
+                  f"{FILES}test_a_second_run_in_the_folder_of_a_live_one_says_where_its_log_is"),
+            "the second's log is run-<date>.mcap, as its settings, its end and its JSON say"),
+    99: Row("a run that is refused, where the last good log is", "the last good log keeps its name", "as the refusal's",
+            (f"{FILES}test_a_refusal_leaves_the_last_good_log_in_its_place",
+             f"{FILES}test_a_bus_that_can_not_be_opened_is_no_reason_to_lose_the_last_log_s_name"),
+            "the refusal is logged in run.refused.mcap"),
+    100: Row("--log, --report or --trace names a file that isn't theirs (rig.yaml)", "R; the file stays as it is", "2",
+             (f"{FILES}test_no_file_of_somebody_else_is_touched",
+              f"{FILES}test_a_replay_s_report_goes_over_nothing_either"),
+             "named with the option; not even a log was begun"),
 }
 
 LOG: dict[int, Row] = {

@@ -44,7 +44,9 @@ def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
 
 
 @pytest.mark.parametrize("section", ["", "run:\n  "])
-@pytest.mark.parametrize("key", ["yes", "accept_no_watchdog", "accept_wider_limit", "reset_fault"])
+@pytest.mark.parametrize("key", [
+    "yes", "accept_no_watchdog", "accept_shared_watchdog", "accept_wider_limit", "reset_fault",
+])
 def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, section, key):
     with pytest.raises(DataFileError) as caught:
         load_rig(rig(tmp_path, f"node: 3\n{section}{key}: true\n"))
