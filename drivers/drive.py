@@ -231,3 +231,21 @@ class StopsFeeding(Protocol):
     """
 
     def stop_feeding(self) -> None: ...
+
+
+@runtime_checkable
+class Paced(Protocol):
+    """A drive whose cycles keep time by this computer's clock, at a rate that nobody has named.
+
+    ``rates_hz`` are those it may be given, the highest first; empty where the rate stands. `set_rate` is for after
+    preflight and before anything is enabled; with ``measuring`` a loop that stands still for long is no error.
+    ``began_late_s``: by how much the last cycle began late, s.
+    """
+
+    @property
+    def rates_hz(self) -> tuple[float, ...]: ...
+
+    @property
+    def began_late_s(self) -> float: ...
+
+    def set_rate(self, rate_hz: float, *, measuring: bool = False) -> None: ...

@@ -14,6 +14,8 @@ RECENT = 1000
 """So many cycles are looked at when it is asked how late they were."""
 LATE_SHARE = 0.02
 """Of those: so many late ones are an ordinary scheduler's."""
+RATES_HZ = (1000.0, 500.0, 250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20.0)
+"""What is tried below a profile's rate, where this computer doesn't hold that one; a watchdog wants five cycles."""
 STALL_S, STALL_CYCLES = 0.05, 3.0
 """Whoever was away for longer than both has stood still."""
 

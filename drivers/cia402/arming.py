@@ -34,15 +34,20 @@ def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile,
     return with_demand
 
 
+def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
+    """Cycle period 1006h; what it then reads, µs. Raises ObjectRefused where the drive has none."""
+    if not profile.cyclic.has_period:
+        raise ObjectRefused("not in the profile", where="1006h")
+    return objects.change(0x1006, 0, round(period_s * 1e6), 32)
+
+
 def set_timing(
     table: Table, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
 ) -> bool:
     """Cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h; whether the drive produces one."""
     period_us = round(period_s * 1e6)
     try:
-        if not profile.cyclic.has_period:
-            raise ObjectRefused("not in the profile", where="1006h")
-        back = objects.change(0x1006, 0, period_us, 32)
+        back = set_period(objects, profile, period_s)
         table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
     except ObjectRefused:
         table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")

@@ -12,7 +12,9 @@ by node guarding instead (remote frame 700h+node); what else the frames of a dri
 
 from __future__ import annotations
 
+import math
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from drivers.cia402 import arming
@@ -33,9 +35,9 @@ from drivers.cia402.units import find_units
 from drivers.cia402.watch import STOPPED, Watch
 from drivers.clock import Clock
 from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, Preflight, Sample
-from drivers.errors import CommandRejected, CommunicationLost, PreflightRefused
+from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.table import Table
-from drivers.ticks import Ticks, how_late
+from drivers.ticks import RATES_HZ, Ticks, how_late
 from drivers.wider import OwnLimits
 from profiles.marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.schema import CanopenProfile
@@ -79,6 +81,7 @@ class Cia402Drive:
     ) -> None:
         self.clock = clock
         self.period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
+        self._rate_is_named = rate_hz is not None
         self._profile = profile
         self._node = node
         self._host_node = host_node
@@ -106,7 +109,7 @@ class Cia402Drive:
         self._feedback = self._new_feedback()
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
-        self._watchdog_s = 0.0
+        self._watchdog_s = self._allowed_silence_s = 0.0
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
         self._reported = Reported()
@@ -209,18 +212,49 @@ class Cia402Drive:
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
             limits.watchdog_s if feed_s else 0.0, own.kept,
         )
-        self._start(limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0)
+        self._allowed_silence_s = limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0
+        self._start()
         return found
 
-    def _start(self, allowed_silence_s: float) -> None:
+    @property
+    def rates_hz(self) -> tuple[float, ...]:
+        """The profile's rate and lower ones; none in stepped time, or where a rate was named."""
+        if self._rate_is_named or self.clock.stepped:
+            return ()
+        highest, lowest = self._profile.cyclic.rate_hz, arming.LEAST_CYCLES / (self._watchdog_s or math.inf)
+        return (highest, *(rate for rate in RATES_HZ if lowest <= rate < highest))
+
+    @property
+    def began_late_s(self) -> float:
+        """By how much the last cycle began late, s."""
+        return self._ticks.late_s[-1] if self._ticks.late_s else 0.0
+
+    def set_rate(self, rate_hz: float, *, measuring: bool = False) -> None:
+        """Another rate, after preflight and before anything is enabled: 1006h is written in pre-operational.
+
+        With ``measuring`` a loop that stands still is no error, as nothing can move.
+        """
+        self.period_s = round(1e6 / rate_hz) * 1e-6
+        self._watch.stop()
+        self._life.feed()
+        self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        with suppress(ObjectRefused):  # it follows the SYNC alone then
+            arming.set_period(self._objects, self._profile, self.period_s)
+        self._life.feed()
+        self._feedback = self._new_feedback()
+        self._cycles = self._missed = self._late = self._contradictions = 0
+        self._start(0.0 if measuring else 0.5)
+
+    def _start(self, stall_share: float = 0.5) -> None:
+        """Operational from now on, and watched. Standing still for this share of the watchdog's time is an error."""
         try:
             self._watch.check()        # nothing moves yet: what is wrong already is a refusal
         except CommunicationLost as error:
             raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
-        self._ticks = Ticks(self.clock, self.period_s, 0.5 * self._watchdog_s)
-        self._watch.start(allowed_silence_s)
+        self._ticks = Ticks(self.clock, self.period_s, stall_share * self._watchdog_s)
+        self._watch.start(self._allowed_silence_s)
 
     def _pause(self) -> None:
         """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""

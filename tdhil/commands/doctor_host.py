@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from tdhil.commands.finding import Finding, bad, note, ok
+from tdhil.commands.real_time import HOW, allowed
 
 LIBRARIES = {"python-can": (4, 6), "canopen": (2, 4), "pymodbus": (3, 16)}
 """Name on the package index → the first version that this program was written for."""
@@ -28,6 +29,7 @@ def host_findings(log: Path) -> Iterator[Finding]:
     yield from library_findings(_version)
     yield timer_finding(time.get_clock_info("monotonic").resolution)
     yield jitter_finding(naps(time.monotonic, time.sleep))
+    yield priority_finding(*allowed())
     yield disk_finding(log)
 
 
@@ -60,6 +62,16 @@ def jitter_finding(late_s: Sequence[float]) -> Finding:
     if worst <= LATE_S:
         return ok("scheduling", text)
     return note("scheduling", text, "Close other programs, plug the laptop in; or run at a lower --rate")
+
+
+def priority_finding(why_no_priority: str, why_not_locked: str) -> Finding:
+    """May the control loop go before everything else, and is its memory its own?"""
+    both = (("priority", why_no_priority), ("locked memory", why_not_locked))
+    missing = [f"{name}: {why}" for name, why in both if why]
+    if not missing:
+        return ok("real time", "--real-time-priority may be used")
+    said = f"--real-time-priority can't be had ({'; '.join(missing)})"
+    return note("real time", said, f"Where cycles are late: {HOW}")
 
 
 def naps(now_s: Callable[[], float], sleep: Callable[[float], None]) -> list[float]:

@@ -34,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     drive = add_drive_arguments(parser)
     drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
-                       help="cycles a second (default: profile's)")
+                       help="cycles a second (default: what this computer holds, up to the profile's)")
+    drive.add_argument("--real-time-priority", action="store_true",
+                       help="the control loop before all other programs, its memory locked, where that is allowed")
     drive.add_argument("--accept-unverified", action="append", metavar="NAME",
                        help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
     drive.add_argument("--accept-no-watchdog", action="store_true",
@@ -149,6 +151,7 @@ def _run(
     from tdhil.commands.confirm import confirm_motion
     from tdhil.commands.log_file import LogPlace
     from tdhil.commands.peer import open_drive
+    from tdhil.commands.real_time import real_time_priority
     from tdhil.commands.settings_said import configuration
     from tdhil.commands.stop_signals import stop_on_signals
     from tdhil.commands.unverified import accepted_lines
@@ -187,7 +190,12 @@ def _run(
     try:
         with stop_on_signals() as stop_request, open_drive(
             peer, options, connection, data, log.frame, trace
-        ) as drive, LiveDisplay(console, show_preflight=False) as display:
+        ) as drive, LiveDisplay(console, show_preflight=False) as display, real_time_priority(
+            namespace.real_time_priority, stepped=peer.stepped
+        ) as raised:
+            if raised.said:
+                log.configure(real_time_priority=raised.plain())
+                display.say(raised.said)
             outcome = Runner(
                 drive,
                 partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog,

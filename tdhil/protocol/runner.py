@@ -9,12 +9,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 
-from drivers.drive import Command, Drive, Limits, Mode, Outcome, Preflight, Sample
+from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample
 from drivers.errors import PreflightRefused
+from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.braking_probe import NOT_YET, slow_down
 from tdhil.protocol.choose_mode import choose_mode, keep_within, no_torque
+from tdhil.protocol.choose_rate import choose_rate, quieten
 from tdhil.protocol.control import MeanSpeedControl
 from tdhil.protocol.excitation import RigGuess, SwingPlan
 from tdhil.protocol.guard import Guard
@@ -173,6 +175,8 @@ class Runner:
         if self._reset_fault:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
             self._drive.reset_fault()
+        if not self._drive.clock.stepped:
+            quieten()
         preflight = self._book.preflight = self._drive.preflight(
             Limits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
@@ -197,6 +201,7 @@ class Runner:
             self._log.configure(**no_watchdog.configuration(preflight))
             self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID_SHARED)
             self._say(no_watchdog.SAID_SHARED)
+        self._choose_rate()
         # What the line carries is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s
         task = replace(task, assumptions=task.assumptions.at_period(period_s))
@@ -220,6 +225,22 @@ class Runner:
         guard.no_braking = NOT_YET
         guard.host_late = getattr(self._drive, "host_late", guard.host_late)
         return task, Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle), preflight
+
+    def _choose_rate(self) -> None:
+        """Where nobody has named it and this computer's clock is what counts: the highest that holds."""
+        drive = self._drive
+        if not (isinstance(drive, Paced) and drive.rates_hz):
+            return
+
+        def cycle() -> Sample:
+            if self._stop_request.signum is not None:
+                raise Interrupted(self._stop_request.signum)
+            return drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+
+        choice = choose_rate(drive, drive.rates_hz, cycle)
+        self._log.event(drive.clock.now_s(), "rate", choice.text)
+        self._log.configure(rate_tried=choice.plain())
+        self._say(choice.text)
 
     def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
         """The rough rig: stage 2's, with the drift of stage 3 as a witness."""

@@ -6,7 +6,7 @@ On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
 import pytest
 
 from drivers.cia402.drive import Cia402Drive
-from drivers.clock import MonotonicClock
+from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost
 from drivers.ticks import LOWER_THE_RATE, Ticks, how_late
@@ -160,3 +160,58 @@ def test_standing_still_is_remembered_for_a_while(fake_time):
     assert ticks.stood_still_s(1.0) == pytest.approx(0.2, abs=PERIOD_S)
     fake_time.sleep(5.0)
     assert ticks.stood_still_s(1.0) == 0.0
+
+
+# -- another rate ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def prepared(wire, peer, profile, fake_time):
+    peer.objects[0x1006, 0] = bytes(4)
+    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive.connect()
+    assert drive.preflight(LIMITS).refused == ()
+    return drive
+
+
+def test_another_rate_is_written_before_anything_is_enabled(prepared, peer, wire, fake_time):
+    assert prepared.rates_hz == (250.0, 200.0, 125.0, 100.0, 50.0, 25.0, 20.0)
+    numbers(prepared, 5)
+    prepared.set_rate(50.0, measuring=True)
+    assert peer.value(0x1006) == 20_000
+    assert prepared.period_s == 0.02
+    assert peer.operational
+    wire.sent.clear()
+    begun_s, counted = fake_time.now_s, peer.syncs
+    samples = [prepared.exchange(Command(Mode.SPEED, 0.0, 0.0)) for _ in range(20)]
+    assert all(sample.fresh for sample in samples)
+    assert peer.syncs == counted + 20
+    assert fake_time.now_s - begun_s == pytest.approx(20 * 0.02, abs=0.02)
+    assert len(wire.of(0x77F)) >= 3                       # the watchdog goes on being fed
+    assert (prepared.counters.cycles, prepared.counters.missed) == (20, 0)
+
+
+def test_standing_still_is_no_error_while_a_rate_is_tried_and_one_afterwards(prepared, wire, fake_time):
+    for measuring in (True, False):
+        prepared.set_rate(100.0, measuring=measuring)
+        prepared.exchange(TURN)
+        wire.put(0x701, b"\x05", 0.3)
+        fake_time.sleep(0.3)
+        if measuring:
+            prepared.exchange(TURN)
+            assert prepared.began_late_s == pytest.approx(0.3, abs=0.01)
+        else:
+            with pytest.raises(CommunicationLost, match="stood still"):
+                prepared.exchange(TURN)
+
+
+def test_a_short_watchdog_leaves_no_slow_rate(wire, peer, profile, fake_time):
+    drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
+    drive.connect()
+    drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.06))
+    assert drive.rates_hz == (250.0, 200.0, 125.0, 100.0)
+
+
+def test_a_named_rate_and_stepped_time_leave_no_choice(wire, peer, profile, fake_time):
+    assert Cia402Drive(wire, profile, MonotonicClock(), node=1, rate_hz=250.0).rates_hz == ()
+    assert Cia402Drive(wire, profile, SteppedClock(), node=1).rates_hz == ()
