@@ -116,6 +116,12 @@ class Access:
         self.write(register, counts)
         return self.read(register)
 
+    def press(self, register: Register, counts: int, before: int, timeout_s: float) -> None:
+        """Write in a cycle, asked once; ``before`` is given back like any change."""
+        self._undo.setdefault((register.table, register.address), lambda: self.write(register, before))
+        words = to_words(counts, register.type, self._order)
+        self.once(self.write_request(register.address, words), timeout_s, register_name(register))
+
     def restore(self) -> tuple[str, ...]:
         """Undo every change, the last one first; what could not be given back, a line each."""
         failed: list[str] = []

@@ -31,10 +31,11 @@ LEAST_TIMEOUT_S = 0.05
 
 @dataclass(frozen=True)
 class Pace:
-    """How fast the cycle goes. ``timeout_s`` is for one transaction."""
+    """How fast the cycle goes. ``timeout_s`` is for one transaction; ``usual_s`` is what a whole round takes."""
 
     period_s: float
     timeout_s: float
+    usual_s: float
 
 
 def measure_pace(
@@ -57,7 +58,7 @@ def measure_pace(
             "cycle rate", f"{asked_hz:g} Hz", f"{failed} of {failed + len(took_s)} cycles failed", False, line,
             "The line is not good enough: check wiring, shielding, termination and baud rate",
         )
-        return Pace(1.0 / asked_hz, LEAST_TIMEOUT_S)
+        return Pace(1.0 / asked_hz, LEAST_TIMEOUT_S, 1.0 / asked_hz)
     # Four in five are faster: a few hiccups of the host must not slow the whole run down.
     usual_s = sorted(took_s)[4 * len(took_s) // 5]
     # To the µs; carried periods are rounded up, so that the line does carry them.
@@ -70,7 +71,7 @@ def measure_pace(
     else:
         table.row("cycle rate", f"{asked_hz:g} Hz", text, True, line)
     timeout_s = min(max(4.0 * longest_s, LEAST_TIMEOUT_S), 0.25 * watchdog_s)
-    return Pace(period_s, timeout_s)
+    return Pace(period_s, timeout_s, usual_s)
 
 
 def arm_watchdog(

@@ -12,8 +12,20 @@ has gone by like that, the drive counts as lost.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 
-from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PowerState, Preflight, Sample
+from drivers.drive import (
+    Command,
+    Counters,
+    FrameTap,
+    Identity,
+    Limits,
+    Mode,
+    Outcome,
+    PowerState,
+    Preflight,
+    Sample,
+)
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.modbus import preflight as checks
 from drivers.modbus.access import Access
@@ -22,8 +34,9 @@ from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
 from drivers.modbus.echoes import check_setpoints, clear_setpoints
 from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
 from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped
-from drivers.modbus.limits import set_limits
+from drivers.modbus.limits import own_speed_limits, set_limits
 from drivers.modbus.link import Link, late_replies
+from drivers.modbus.other_master import OtherMaster
 from drivers.modbus.parameters import find_filters
 from drivers.modbus.plan import Transaction, only_reads, plan_cycle
 from drivers.modbus.registers import register_name
@@ -34,7 +47,7 @@ from drivers.modbus.standstill import Standstill
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
 from drivers.table import Table
 from drivers.ticks import Ticks
-from profiles.modbus_schema import ModbusProfile, StatusState
+from profiles.modbus_schema import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost write must not end a run."""
@@ -45,8 +58,19 @@ RESET_PAUSE_S = 0.1
 BUDGET_SHARE = 0.5
 """Of the watchdog time that may go by without a good reply, or with this loop standing still."""
 
+SETTLED_CYCLES = 5
+"""Without an enabled drive, after which one that is enabled again wasn't enabled by this run."""
+INSIST_SHARE = 0.8
+"""Of a period, that the stop's words are repeated in against somebody who goes on commanding the drive."""
+SILENT_TIMES = 1.5
+"""Of the watchdog's time, that a drive whose watchdog is to act is not even read, where reading feeds it."""
+
+PRESS_EVERY_S = 0.1
+"""How often the drive's own speed limit is lowered against another master."""
+
 _NO_SETPOINTS = Setpoints(0, 0, False)
 _NOTHING_YET = Feedback(0, 0.0, 0.0, None, None)
+_DRIVEN = (PowerState.ENABLED, PowerState.QUICK_STOP)
 _NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT, PowerState.NOT_READY)
 
 
@@ -94,7 +118,13 @@ class ModbusDrive:
         self._sent_mode = Mode.SPEED
         self._since_mode_sent = self._since_looked = 0
         self._failing_since_s: float | None = None
-        self._told_loss = False
+        self._told_loss = self._told_other = False
+        self._out_of_operation = 0     # cycles so far, since nobody asks for it
+        self._other = OtherMaster(self._access, profile, self._plan)
+        self._speed_limits: list[tuple[Register, float, int]] = []      # register, rad/s a count, counts as found
+        self._quick_stop_rad_s2 = self._pressed_rad_s = 0.0
+        self._pressed_s: float | None = None
+        self._silent_since_s: float | None = None       # not fed any more, so that the drive's watchdog acts
         self._ticks = Ticks(self.clock, self.period_s)
         self._cycles = self._missed = self._late_before = 0
 
@@ -137,7 +167,7 @@ class ModbusDrive:
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
             set_limits(table, access, profile, limits, rated_nm, found)
-            check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
+            read_back = check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
             checks.check_modes(table, access, profile)
             pace = measure_pace(
                 table, self._link.description, self._asked_hz, limits.watchdog_s,
@@ -150,7 +180,13 @@ class ModbusDrive:
             if watched:
                 simulated = self._identity.simulated
                 shared = check_who_feeds(table, access, profile, limits, self._idle_round, simulated=simulated)
-            self._watchdog_s = limits.watchdog_s
+            self._speed_limits = own_speed_limits(profile, found)
+            if all(check.outcome is not Outcome.REFUSED for check in table.checks):
+                self._other.prepare(
+                    read_back, found.values, rated_nm, self.period_s, pace.usual_s, len(self._plan.cycle),
+                    self._idle_round,
+                )
+            self._watchdog_s, self._quick_stop_rad_s2 = limits.watchdog_s, limits.quick_stop_rad_s2
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
         self._standstill = Standstill(scales.speed, limits.speed_rad_s, self.period_s)
@@ -197,6 +233,21 @@ class ModbusDrive:
         """From the next cycle on the profile's quick-stop word; it isn't ended by enabling."""
         self._wish = Wish.QUICK_STOP
 
+    def stop_feeding(self) -> None:
+        """See `drivers.drive.StopsFeeding`; where reading feeds the watchdog, nothing is asked until it had its time.
+
+        Raises CommandRejected where another master commands the drive and so feeds it, too: silence would leave the
+        shaft to that one alone, so the quick stop goes on being repeated.
+        """
+        if self._other.seen and not self._profile.watchdog.fed_by_us_alone:
+            raise CommandRejected(
+                "the other master feeds the drive's watchdog, too, so silence would not make it act: the quick stop is"
+                " repeated as fast as the line carries it", where=self._where,
+                next_step="Use the hard-wired emergency stop, and take the other master off the drive",
+            )
+        if self._silent_since_s is None:
+            self._silent_since_s = self.clock.now_s()
+
     def disable(self) -> None:
         """From the next cycle on off; a shaft that still turns under power is braked first."""
         self._wish = Wish.OFF
@@ -211,7 +262,8 @@ class ModbusDrive:
     def exchange(self, command: Command) -> Sample:
         """One cycle: wait for the tick, write, read.
 
-        Raises CommunicationLost (no good reply within half the watchdog time, line gone, a loop that was frozen),
+        Raises CommunicationLost (no good reply within half the watchdog time, line gone, a loop that was frozen,
+        somebody else who commands the drive or changes what the run rests on),
         DriveFault (fault state, a refused request) and CommandRejected; each trouble of the drive once, so that a stop
         can go on exchanging.
         """
@@ -221,12 +273,16 @@ class ModbusDrive:
         self._unless_frozen(self._ticks.wait)
         if setpoints.speed:
             self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction it is braked from
+        if not self._may_write():
+            return self._watch()
+        self._look_for_others()
         turning = not self._standstill.near(self._feedback.speed_rad_s)
         word = controlword_towards(
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
         )
         image = self._codec.image(word, setpoints, command.mode)
         self._unless_frozen(self._ticks.check)
+        self._other.sent(image)
         begun_s = self.clock.now_s()
         self._cycles += 1
         try:
@@ -243,9 +299,85 @@ class ModbusDrive:
         self._ticks.done()
         self._failing_since_s, self._told_loss = None, False
         self._take(self._codec.feedback(got.words), command.mode)
+        if self._other.seen and self._wish is not Wish.ENABLED:
+            got = self._insist(got, setpoints, command.mode, begun_s)
         self._follow_state()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def _look_for_others(self) -> None:
+        """Raises CommunicationLost once; the stop that follows goes on exchanging."""
+        if self._other.seen and self._wish is not Wish.ENABLED:
+            return                     # known, and the line is needed for the stop
+        try:
+            self._other.look(self._timeout_s)
+        except LinkLost:
+            self._stay_out()
+            raise
+        except CommunicationLost:
+            if not self._told_other:
+                self._told_other = True
+                self._ticks.done()
+                raise
+
+    def _insist(self, got: Round, setpoints: Setpoints, mode: Mode, begun_s: float) -> Round:
+        """Against somebody who goes on commanding: the stop's words again, as often as the period has room for."""
+        until_s = begun_s + INSIST_SHARE * self.period_s
+        self._press_speed_limits(begun_s)
+        took_s = 0.0
+        while (sent_s := self.clock.now_s()) + took_s < until_s:
+            turning = not self._standstill.near(self._feedback.speed_rad_s)
+            word = controlword_towards(
+                self._profile.control, self._state, self._wish, mode, reverse=self._reverse, turning=turning
+            )
+            try:
+                got = go_round(
+                    self._access, self._plan.cycle, self._codec.image(word, setpoints, mode), self._timeout_s,
+                    self._moving,
+                )
+            except (CommunicationLost, RegisterRefused):
+                break                  # the next cycle tells of it
+            self._feedback = self._codec.feedback(got.words)
+            self._state = decode(self._profile.control, self._feedback.status)
+            took_s = self.clock.now_s() - sent_s
+            if took_s <= 0.0:          # a line that takes no time has no end of room
+                break
+        self._ticks.done()
+        return got
+
+    def _press_speed_limits(self, now_s: float) -> None:
+        """A quick stop that is ended again and again begins its ramp anew each time and never gets anywhere.
+
+        So the drive's own speed limit goes down along that ramp, whoever's setpoint acts; `close` gives it back.
+        """
+        recently = self._pressed_s is not None and now_s < self._pressed_s + PRESS_EVERY_S
+        if recently or power_state(self._state) not in _DRIVEN:
+            return
+        if self._pressed_s is None:
+            self._pressed_rad_s, self._pressed_s = abs(self._feedback.speed_rad_s), now_s
+        self._pressed_rad_s -= self._quick_stop_rad_s2 * (now_s - self._pressed_s)
+        self._pressed_s = now_s
+        for register, rad_s, before in self._speed_limits:
+            counts = max(1, min(abs(before), int(max(0.0, self._pressed_rad_s) / rad_s)))
+            with suppress(CommunicationLost, RegisterRefused, CommandRejected):
+                self._access.press(register, counts if before >= 0 else -counts, before, self._timeout_s)
+
+    def _may_write(self) -> bool:
+        """Not once the drive is left to its watchdog; but a shaft at rest that nothing drives may be disabled."""
+        if self._silent_since_s is None:
+            return True
+        return self._wish is Wish.OFF and self._at_rest and power_state(self._state) is not PowerState.ENABLED
+
+    def _watch(self) -> Sample:
+        """A cycle that only reads, or not even that while reading feeds the watchdog."""
+        begun_s = self.clock.now_s()
+        self._cycles += 1
+        sample = self.look()
+        if sample is None:
+            self._missed += 1
+            self._ticks.done()
+            return self._sample(begun_s, self.clock.now_s() - begun_s, 0.0, fresh=False)
+        return sample
 
     def _unless_frozen(self, look_at_ticks: Callable[[], None]) -> None:
         try:
@@ -259,18 +391,28 @@ class ModbusDrive:
 
         While it shows itself enabled the quick-stop word is written by itself, once each time.
         """
-        if not self._reads:
+        if not self._reads or self._must_be_silent():
             return None
         try:
             got = go_round(self._access, self._reads, {}, self._timeout_s, self._moving)
         except (CommunicationLost, RegisterRefused):
             return None
         self._take(self._codec.feedback(got.words), self._sent_mode)
-        if self._wish is not Wish.ENABLED and power_state(self._state) is PowerState.ENABLED:
+        if (
+            self._silent_since_s is None and self._wish is not Wish.ENABLED
+            and power_state(self._state) is PowerState.ENABLED
+        ):
             self._push()
         self._ticks.done()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
+
+    def _must_be_silent(self) -> bool:
+        """Would reading keep the watchdog from acting that is to act?"""
+        entry = self._profile.watchdog
+        by_reading = entry.fed_by_any_client or entry.fed_by == "requests_of_this_connection"
+        since_s = self._silent_since_s
+        return since_s is not None and by_reading and self.clock.now_s() - since_s < SILENT_TIMES * self._watchdog_s
 
     def _push(self) -> None:
         """The control word of a quick stop alone, in the shortest request that the drive knows."""
@@ -349,9 +491,23 @@ class ModbusDrive:
                     where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
                     next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
                 )
+        elif self._wish is not Wish.ENABLED:
+            out, self._out_of_operation = self._out_of_operation, self._out_of_operation + 1
+            if power is PowerState.ENABLED:
+                self._out_of_operation = 0
+                # What was sent just before the wish changed may still take effect.
+                self._other.seen = self._other.seen or out >= SETTLED_CYCLES
+                if out >= SETTLED_CYCLES and not self._told_other:
+                    self._told_other = True
+                    raise CommunicationLost(
+                        f"the drive was enabled although this run doesn't ask for it, status"
+                        f" {self._feedback.status:04X}h: somebody else commands it",
+                        where=f"{self._where}, {register_name(self._profile.cycle.control.register_)}",
+                        next_step="Take the other master off the drive (PLC, panel, gateway)",
+                    )
         elif self._wish is Wish.ENABLED:
             if power is PowerState.ENABLED:
-                self._was_enabled = True
+                self._was_enabled, self._out_of_operation = True, 0
             elif power is PowerState.QUICK_STOP:
                 self._wish = Wish.QUICK_STOP
             elif self._was_enabled:

@@ -42,8 +42,12 @@ def clear_setpoints(table: Table, access: Access, profile: ModbusProfile, off: i
 def check_setpoints(
     table: Table, access: Access, profile: ModbusProfile, scales: Scales, rated_nm: float,
     values: Mapping[str, float], limits: Limits,
-) -> None:
-    """A row for each setpoint: several values written, read back, and compared with the drive's echo if any."""
+) -> frozenset[str]:
+    """A row for each setpoint: several values written, read back, and compared with the drive's echo if any.
+
+    The setpoints ('speed', 'torque') whose own registers showed what was written.
+    """
+    read_back = set[str]()
     cycle = profile.cycle
     pairs: list[tuple[str, Signal, float, float, str]] = [
         ("speed", cycle.speed_setpoint, scales.speed_setpoint, limits.speed_rad_s, "rad/s")
@@ -59,13 +63,15 @@ def check_setpoints(
             text = "this drive doesn't show it: its scale and sign can be seen in motion only"
             table.note(f"{name} setpoint as the drive understood it", text, "profile, echoes")
         for echo in (*echoes, None):
-            _check_one(table, access, name, signal, lsb, tests, unit, echo, rated_nm, values)
+            if _check_one(table, access, name, signal, lsb, tests, unit, echo, rated_nm, values) and echo is None:
+                read_back.add(name)
+    return frozenset(read_back)
 
 
 def _check_one(
     table: Table, access: Access, name: str, signal: Signal, lsb: float, tests: list[float], unit: str,
     echo: Echo | None, rated_nm: float, values: Mapping[str, float],
-) -> None:
+) -> bool:
     register = signal.register_
     seen_in = register if echo is None else echo.register_
     seen_lsb = lsb if echo is None else si_per_count(echo, values, rated_nm)
@@ -99,8 +105,8 @@ def _check_one(
             access.read(register)
         except PreflightRefused as error:
             table.note(title, f"can't be read: {error.what}", where)
-            return
+            return False
     mend = "Word order, scale, sign or address of it is wrong in the profile, or the drive doesn't take it over"
     if echo is not None:
         mend += ". Does it take its reference from this bus, in both directions? See the profile's source for the echo"
-    table.attempt(title, wanted, where, work, mend)
+    return table.attempt(title, wanted, where, work, mend)

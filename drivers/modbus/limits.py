@@ -18,7 +18,7 @@ from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.registers import to_counts
 from drivers.modbus.scales import RPM, per_count
 from drivers.table import Table
-from profiles.modbus_schema import ModbusProfile, Parameter
+from profiles.modbus_schema import ModbusProfile, Parameter, Register
 
 _SLACK = 1e-9
 """One part in 10^9: a limit that is a whole number of counts must not lose or gain one to the last bit."""
@@ -46,6 +46,18 @@ def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Lim
             if kind == "torque_limit":
                 text += "; only the guard and the setpoint hold it"
             table.note(title, text, "profile")
+
+
+def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Register, float, int]]:
+    """The drive's own speed limits that may be set in motion: register, rad/s for one count, counts as found."""
+    limits = []
+    for parameter in profile.parameters:
+        register, before = parameter.register_, found.counts.get(parameter.name)
+        lsb = per_count(parameter, found.values)
+        settable = parameter.set_to in ("speed_limit", "speed_limit_reverse") and parameter.writable_in_operation
+        if settable and register is not None and before is not None and lsb and parameter.unit == "rpm":
+            limits.append((register, lsb * RPM, before))
+    return limits
 
 
 def write_setting(

@@ -33,7 +33,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drivers.drive import Command, Mode, PowerState, Sample, StopsFeeding
-from drivers.errors import StopNotConfirmed
+from drivers.errors import CommandRejected, StopNotConfirmed
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.let_go import MEAN_S, LetGo, LetGoLimits
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
@@ -261,7 +261,16 @@ class StopSequence:
     def _leave_to_watchdog(self, sample: Sample) -> bool:
         """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
         drive = self._bench.drive
-        if not (self._fed and self._watched and isinstance(drive, StopsFeeding) and self._ask(drive.stop_feeding)):
+        if not (self._fed and self._watched and isinstance(drive, StopsFeeding)):
+            return False
+        try:
+            drive.stop_feeding()
+        except CommandRejected as error:   # it would not help: somebody else feeds the watchdog, too
+            self._fed = False
+            self._note(error)
+            return False
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
             return False
         self._fed = False
         self._trouble.append(

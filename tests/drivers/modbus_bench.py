@@ -80,13 +80,14 @@ class ModbusBench:
         return found
 
     def decode(self, frames):
-        """Cycles are function 23, one after the other; preflight's last request is another one."""
+        """Cycles are function 23; preflight ends at the moment of its last write by another one."""
         found, cycle = [], False
+        armed_s = max((one.time_s for one in frames if one.outgoing and one.data[0] in (6, 16)), default=-1.0)
         for frame in frames:
+            if frame.time_s <= armed_s:
+                continue
             if frame.outgoing:
                 cycle = frame.data[0] == 23
-                if not cycle:
-                    found = []
             elif cycle:
                 function, size, status, speed, torque, mode = struct.unpack(">BBHihH", frame.data)
                 assert (function, size) == (23, 10)

@@ -320,7 +320,7 @@ def test_mode_in_a_register_of_its_own_comes_after_the_seed():
     bank.requests.clear()
     for _ in range(40):
         run.cycle(1.0, 120.0, Mode.TORQUE)
-    assert sum(request[0] == 3 for request in bank.requests) == 2
+    assert sum(request[:3] == bytes((3, 0, 9)) for request in bank.requests) == 2
 
 
 def test_mode_by_bits_of_the_control_word():

@@ -29,6 +29,17 @@ MODBUS: dict[int, Row] = {
         "R, unless the operator accepts it by name; requests of others are counted where the drive counts them", "4",
         (HERE + "test_modbus_second_master.py",),
     ),
+    71: Row(
+        "another master writes control word and setpoints over Modbus in motion, 5 to 100 times a second",
+        "noticed by reading them back; QS that stands against it (stop word repeated, the drive's own speed limit"
+        " lowered along the ramp); 8 where that one still commands at the end", "5, 8",
+        (HERE + "test_modbus_second_master.py",),
+    ),
+    72: Row(
+        "somebody sets the Modbus watchdog, its reaction or a limit in motion",
+        "read back during the run: QS, naming register, old and new value", "5",
+        (HERE + "test_modbus_second_master.py",),
+    ),
 }
 
 UNITS: dict[int, Row] = {

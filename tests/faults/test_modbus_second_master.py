@@ -1,5 +1,6 @@
 """Rows 70 on: other clients of a Modbus drive that read, command, or change its settings; judged on the shaft."""
 
+import math
 import re
 import struct
 import subprocess
@@ -7,8 +8,10 @@ import sys
 
 import pytest
 from path_runs import REAL, Shaft, identify, process
+from rehearsal import at, run
 
 from profiles.library import load_modbus_profile, profile_path
+from sim_bus.modbus import embedded
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 
@@ -75,3 +78,72 @@ def test_row_70_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen)
     shaft = Shaft.read(trace)
     assert abs(shaft.speed_rad_s).max() < TURNING_RAD_S and "operation enabled" not in set(shaft.state)
     seen(70, message, None, "whole", 4)
+
+
+# -- another master that commands, and one that changes settings, in stepped time ------------------------------
+
+
+class Other:
+    """Asks the drive over a connection of its own every ``every_s`` of plant time, from `begin` on."""
+
+    def __init__(self, monkeypatch):
+        self.pdus, self.every_s, self.next_s, self.until_s = (), 0.0, math.inf, math.inf
+        run_until, other = embedded.EmbeddedModbusDrive.run_until, self
+
+        def running(self, time_s):
+            while other.next_s <= min(time_s, other.until_s):
+                run_until(self, other.next_s)
+                for pdu in other.pdus:
+                    self._faults.request(pdu, 2)
+                other.next_s += other.every_s
+            run_until(self, time_s)
+
+        monkeypatch.setattr(embedded.EmbeddedModbusDrive, "run_until", running)
+
+    def begin(self, now_s, every_s, *pdus, lasts_s=math.inf):
+        self.pdus, self.every_s, self.next_s, self.until_s = pdus, every_s, now_s + every_s, now_s + lasts_s
+
+
+@pytest.fixture
+def other(no_bus_of_the_user, monkeypatch):
+    return Other(monkeypatch)
+
+
+def command(control, speed_rad_s, torque_permille=0, mode=0):
+    """Control word, both setpoints and the mode of generic/modbus, in one request."""
+    rpm = round(speed_rad_s / (2.0 * math.pi / 60.0) / 0.01)
+    return struct.pack(">BHHBHihH", 16, 0, 5, 10, control, rpm, torque_permille, mode)
+
+
+@pytest.mark.parametrize(("hz", "pdu", "stage"), [
+    (5.0, command(15, 5.0), "speed"), (50.0, command(15, 5.0), "speed"), (100.0, command(15, 5.0), "acquire"),
+    (20.0, command(15, 0.0, 300, 1), "hold"), (10.0, struct.pack(">BHHBi", 16, 1, 2, 4, 4775), "speed"),
+], ids=["5 Hz", "50 Hz", "100 Hz in acquire", "torque in hold", "its setpoint alone"])
+def test_row_71_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_path, seen):
+    """The stop stands against it, the shaft comes to rest, and who did it is told."""
+    acted = at(monkeypatch, stage, 5.0, lambda sample: other.begin(sample.time_s, 1.0 / hz, pdu))
+    ended = run(tmp_path, "--drive", "modbus")
+    assert ended.done.code in (5, 8), ended.done.err
+    ended.assert_ended(ended.done.code, "somebody else commands this drive", "this run wrote", "Take the other master")
+    shaft = ended.shaft
+    after = shaft.time_s >= acted[0]
+    assert abs(shaft.speed_rad_s[after]).max() < 7.0
+    quiet = shaft.time_s >= shaft.time_s[-1] - 1.0
+    assert abs(shaft.speed_rad_s[quiet]).max() < 0.2, "the other master turned the shaft on"
+    seen(71, f"{hz:g} Hz in {stage}: {ended.message}", ended.standstill_s(acted[0]) if ended.done.code == 5 else None,
+         ended.assert_log_whole(), ended.done.code)
+
+
+@pytest.mark.parametrize(("address", "value", "words"), [
+    (40, 0, ("register 40", "time-out", "was 0.5 s, and is 0 s")),
+    (41, 0, ("register 41", "reaction", "was 3, and is 0")),
+    (38, 4000, ("register 38", "was 0.4 of rated torque, and is 4 of rated torque")),
+], ids=["watchdog off", "reaction", "torque limit"])
+def test_row_72_somebody_changes_a_setting_in_motion(address, value, words, other, monkeypatch, tmp_path, seen):
+    """Once, as a commissioning tool does: a host that died later would find no watchdog."""
+    pdu = struct.pack(">BHH", 6, address, value)
+    acted = at(monkeypatch, "speed", 5.0, lambda sample: other.begin(sample.time_s, 0.05, pdu, lasts_s=0.06))
+    ended = run(tmp_path, "--drive", "modbus")
+    ended.assert_ended(5, "somebody else changed a setting during the run", *words)
+    standstill_s = ended.assert_stopped(acted[0], 2.0)
+    seen(72, ended.message, standstill_s, ended.assert_log_whole(), 5)

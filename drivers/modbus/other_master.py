@@ -1,0 +1,209 @@
+"""Somebody else who writes to the drive during a run: words in its registers that aren't ours, settings that changed.
+
+Now and then, just before a cycle writes, what the cycle writes is read: control word and setpoints must be some that
+this host has sent within the last half second (an adapter's process image may lag). A register is believed once it has
+read back a number other than zero: not every drive shows its words again. In between, the settings that a run rests on
+(watchdog and reaction, limits, what preflight requires, what scales the signals) must read as they did at its end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from typing import NamedTuple
+
+from drivers.errors import CommunicationLost
+from drivers.modbus import requests
+from drivers.modbus.access import Access
+from drivers.modbus.errors import LinkLost, RegisterRefused
+from drivers.modbus.parameters import show
+from drivers.modbus.plan import CyclePlan, Span, spans
+from drivers.modbus.registers import from_words, register_name
+from drivers.modbus.scales import per_count, si_per_count
+from profiles.modbus_schema import ModbusProfile, Parameter, Register, Signal
+
+REMEMBERED_S = 0.5
+EVERY_S, EVERY_TIGHT_S = 0.1, 0.5
+"""Between two looks on an average: where the line has room for them, and where it has none."""
+SETTINGS_EVERY, SETTINGS_EVERY_TIGHT = 8, 2
+"""Of so many looks one is at the settings."""
+GOLDEN = 0.6180339887498949
+"""Looks at even intervals would miss for ever somebody who writes in step with them."""
+ROOM = 0.8
+"""Of the period that a cycle with a look may take."""
+_TAKE_OFF = "Take the other master off the drive (PLC, panel, commissioning tool, gateway)"
+
+
+class _Word(NamedTuple):
+    """One register that the cycle writes."""
+
+    name: str
+    register: Register
+    shown: Callable[[int], str]
+
+
+class OtherMaster:
+    """Knows what this host has sent and what the settings were; `look` is to be called before a cycle writes."""
+
+    def __init__(self, access: Access, profile: ModbusProfile, plan: CyclePlan) -> None:
+        self._access = access
+        self._profile = profile
+        self._order = profile.line.word_order
+        self._functions = profile.cycle.functions
+        self._written = [one.write for one in plan.cycle if one.write is not None]
+        self._words: list[_Word] = []
+        self._spans: list[Span] = []
+        self._believed: set[str] = set()
+        self._sent: dict[int, deque[int]] = {}
+        self._settings: list[tuple[Span, list[tuple[Parameter, int]]]] = []
+        self._values: Mapping[str, float] = {}
+        self._keep = self._looks = self._settings_looks = 0
+        self._tight = False
+        self._next_s = 0.0
+        self.seen = False              # somebody else has commanded, at some time
+
+    def prepare(
+        self, read_back: Collection[str], values: Mapping[str, float], rated_nm: float, period_s: float,
+        round_s: float, transactions: int, feed: Callable[[], object],
+    ) -> None:
+        """At the end of preflight: the settings as they stand. ``read_back``: setpoints ('speed') known to show again.
+
+        ``round_s``: what a cycle of so many ``transactions`` takes. ``feed`` keeps the watchdog quiet meanwhile.
+        """
+        self._values = values
+        words = _words_of(self._profile, values, rated_nm)
+        self._words = [word for word in words if any(span.covers(word.register) for span in self._written)]
+        self._spans = self._readable_spans([word.register for word in self._words])
+        self._believed = {f"{name} setpoint" for name in read_back}
+        self._keep = math.ceil(REMEMBERED_S / period_s) + 2
+        self._tight = round_s * (1.0 + 1.0 / max(1, transactions)) > ROOM * period_s
+        watched = [one for one in self._profile.parameters if one.register_ is not None and self._matters(one)]
+        self._settings = []
+        open_ones = self._readable_spans([one.register_ for one in watched if one.register_ is not None])
+        while open_ones:
+            feed()
+            span = open_ones.pop(0)
+            inside = [one for one in watched if one.register_ is not None and span.covers(one.register_)]
+            try:
+                found = self._access.read_words(span.table, span.address, span.length)
+            except RegisterRefused:
+                if len(inside) > 1:    # one of them, or what lies between: each by itself, then
+                    registers = [one.register_ for one in inside if one.register_ is not None]
+                    open_ones += [Span(one.table, one.address, one.count) for one in registers]
+                continue               # what the drive doesn't show was told, or refused, where it was needed
+            self._settings.append((span, [(one, self._number(one.register_, span, found)) for one in inside]))
+        self._next_s = self._access.clock.now_s()
+
+    def sent(self, image: Mapping[int, int]) -> None:
+        """These words go out, and may reach the drive."""
+        for address, word in image.items():
+            self._sent.setdefault(address, deque(maxlen=self._keep or None)).append(word)
+
+    def look(self, timeout_s: float) -> None:
+        """One read, if it is time. Raises CommunicationLost, naming what somebody else has written.
+
+        A look without an answer is none: the cycle tells of a bad line.
+        """
+        now_s = self._access.clock.now_s()
+        if now_s < self._next_s - 1e-9 or not self._keep:
+            return
+        self._looks += 1
+        self._next_s = now_s + (EVERY_TIGHT_S if self._tight else EVERY_S) * (0.5 + self._looks * GOLDEN % 1.0)
+        every = SETTINGS_EVERY_TIGHT if self._tight else SETTINGS_EVERY
+        if self._settings and (self._looks % every == 0 or not self._spans):
+            span, parameters = self._settings[self._settings_looks % len(self._settings)]
+            self._settings_looks += 1
+            found = self._read(span, timeout_s)
+            if found is not None:
+                self._compare_settings(span, found, parameters)
+        elif self._spans and self._sent:
+            span = self._spans[self._looks % len(self._spans)]
+            found = self._read(span, timeout_s)
+            if found is not None:
+                self._compare_words(span, found)
+
+    def _read(self, span: Span, timeout_s: float) -> tuple[int, ...] | None:
+        function = requests.READ_HOLDING if span.table == "holding" else requests.READ_INPUT
+        try:
+            return self._access.once(requests.read(function, span.address, span.length), timeout_s).words
+        except LinkLost:
+            raise
+        except (CommunicationLost, RegisterRefused):
+            return None
+
+    def _compare_words(self, span: Span, found: tuple[int, ...]) -> None:
+        for word in self._words:
+            register = word.register
+            if not span.covers(register):
+                continue
+            addresses = range(register.address, register.address + register.count)
+            words = [found[address - span.address] for address in addresses]
+            ours = all(one in self._sent.get(at, ()) for at, one in zip(addresses, words, strict=True))
+            if ours and any(words):
+                self._believed.add(word.name)
+            elif not ours and word.name in self._believed:
+                self.seen = True
+                last = from_words([self._sent[at][-1] for at in addresses], register.type, self._order)
+                other = from_words(words, register.type, self._order)
+                raise CommunicationLost(
+                    f"somebody else commands this drive: the {word.name} there is {word.shown(other)}, and this run"
+                    f" wrote {word.shown(last)}",
+                    where=register_name(register),
+                    next_step=f"{_TAKE_OFF}; one master only may write control word and setpoints",
+                )
+
+    def _compare_settings(self, span: Span, found: tuple[int, ...], parameters: list[tuple[Parameter, int]]) -> None:
+        for parameter, before in parameters:
+            register = parameter.register_
+            assert register is not None
+            now = self._number(register, span, found)
+            if now != before:
+                raise CommunicationLost(
+                    f"somebody else changed a setting during the run: '{parameter.title}' was"
+                    f" {self._shown(parameter, before)}, and is {self._shown(parameter, now)}",
+                    where=register_name(register),
+                    next_step=f"{_TAKE_OFF}; see to this setting before the next run",
+                )
+
+    def _matters(self, parameter: Parameter) -> bool:
+        """Does the run's safety or its result rest on it?"""
+        watchdog, cycle = self._profile.watchdog, self._profile.cycle
+        signals = (cycle.speed_setpoint, cycle.torque_setpoint, cycle.speed, cycle.torque)
+        scaling = {signal.times for signal in signals if signal is not None} | {self._profile.rated_torque}
+        own = {watchdog.parameter, watchdog.reaction_parameter} | scaling
+        return parameter.set_to is not None or parameter.require is not None or parameter.name in own
+
+    def _readable_spans(self, registers: list[Register]) -> list[Span]:
+        tables = {"holding": requests.READ_HOLDING, "input": requests.READ_INPUT}
+        asked = [one for one in registers if one.table == "holding" or tables[one.table] in self._functions]
+        if requests.READ_HOLDING not in self._functions:
+            asked = [one for one in asked if one.table != "holding"]
+        return spans(asked, self._profile.cycle.largest_gap, self._profile.cycle.largest_read)
+
+    def _number(self, register: Register | None, span: Span, found: tuple[int, ...]) -> int:
+        assert register is not None
+        at = register.address - span.address
+        return from_words(found[at : at + register.count], register.type, self._order)
+
+    def _shown(self, parameter: Parameter, counts: int) -> str:
+        scale = per_count(parameter, self._values)
+        return f"{counts} counts" if scale is None else show(counts * scale, parameter)
+
+
+def _words_of(profile: ModbusProfile, values: Mapping[str, float], rated_nm: float) -> list[_Word]:
+    """Control word and setpoints, shown in SI."""
+    cycle = profile.cycle
+
+    def in_si(signal: Signal, unit: str) -> Callable[[int], str]:
+        scale = si_per_count(signal, values, rated_nm)
+        return lambda counts: f"{counts * scale:.4g} {unit}"
+
+    found = [
+        _Word("control word", cycle.control.register_, lambda word: f"{word & 0xFFFF:04X}h"),
+        _Word("speed setpoint", cycle.speed_setpoint.register_, in_si(cycle.speed_setpoint, "rad/s")),
+    ]
+    torque = cycle.torque_setpoint
+    if torque is not None and profile.modes.torque and torque.register_ != cycle.speed_setpoint.register_:
+        found.append(_Word("torque setpoint", torque.register_, in_si(torque, "N·m")))
+    return found
