@@ -116,7 +116,7 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
 
         wait_for("the shaft to come to rest", resting)
         shaft = Shaft.read(trace)
-    assert host.returncode == 5, err
+    assert host.returncode == 8, err           # it can't see the shaft come to rest
     assert "connection" in json.loads(out)["error"]["message"] and "Traceback" not in err
     (at_s,) = shaft.events("fault: ")
     assert shaft.speed_at(at_s) > 0.1
