@@ -32,6 +32,7 @@ class CanopenProfile(DataModel):
     name: ProfileName = Field(description="vendor/model, as in --profile")
     title: str = Field(min_length=3, description="one line for tables and reports")
     bus: Literal["canopen"]
+    experimental: bool = Field(default=False, description="second-hand, or never tried on the bus that it names")
     eds: str | None = Field(default=None, description="an EDS file beside this one; null = none needed")
     node: int = Field(default=1, ge=1, le=127, description="node number unless told otherwise")
     identity: IdentityEntry

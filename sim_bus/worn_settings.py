@@ -20,6 +20,9 @@ DATA_TYPES = {
 _USUAL_COUNTS = 10_000.0
 """A limit stands at about so many counts where the profile doesn't know the constant that scales it."""
 
+_USUAL_ENCODER = 4096.0
+"""Counts a turn, where the profile divides by a resolution that it doesn't know."""
+
 
 class WornSettings:
     """``raw`` is what stands in each object; `scales` what that means."""
@@ -108,6 +111,8 @@ class WornSettings:
             if user.times == one.name and not one.default:
                 return self._limit(user) / (user.per_lsb * one.per_lsb * _USUAL_COUNTS)
         value = one.default or 0.0
+        if not value and one.name in (*self._profile.speed.times, *self._profile.speed.over):
+            value = _USUAL_ENCODER if one.name in self._profile.speed.over else 1.0
         if one.require is not None and one.require.at_least is not None:
             value = max(value, one.require.at_least)
         return value if one.scale == "power_of_two" else value / self._unit(one)

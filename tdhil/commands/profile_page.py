@@ -53,8 +53,8 @@ def _head(profile: Profile, console: Console) -> None:
         rows.append(("line", f"{' or '.join(line.transports)}; TCP port {line.port}; {line.baud} baud 8{line.parity}"
                              f"{line.stop_bits}; unit {line.unit}; 32 bit {line.word_order.replace('_', ' ')}"))
         rows.append(("cycle", f"{profile.cycle.rate_hz:g} Hz unless told otherwise, if the line carries it"))
-        if profile.experimental:
-            rows.append(("EXPERIMENTAL", "from second-hand sources throughout"))
+    if profile.experimental:
+        rows.append(("EXPERIMENTAL", "second-hand, or never tried on this bus"))
     rows.append(("how sure", sure_text(profile)))
     for name, text in rows:
         console.print(f"  {name:<12}  {text}", markup=False)

@@ -51,7 +51,7 @@ def row(profile: Profile) -> dict[str, Any]:
         "modes": modes_text(profile),
         "watchdog": watchdog_text(profile),
         "entries": counts(profile),
-        "experimental": isinstance(profile, ModbusProfile) and profile.experimental,
+        "experimental": profile.experimental,
     }
 
 

@@ -56,7 +56,10 @@ class Bench:
         self.host = can.Bus(interface="virtual", channel=self.simulated.channel)
         self.bus = Swapped(can.Bus(interface="virtual", channel=self.simulated.channel))
         self.frames = []
-        self.drive = Cia402Drive(self.bus, profile, SteppedClock(), node=1, tap=self.frames.append)
+        self.drive = Cia402Drive(
+            self.bus, profile, SteppedClock(), node=1, tap=self.frames.append,
+            rated_torque_nm=golden.get("told_rated_torque_nm"),
+        )
         self.drive.connect()
         for entry in golden.get("stands", ()):
             self.node.store.write(entry["index"] << 8 | entry["sub"], entry["value"])
@@ -160,3 +163,18 @@ def test_the_simulated_drive_reports_so(bench, golden):
         reporting = bench.node.inverter.reporting
         reporting.torque_nm, reporting.speed_rad_s = entry["torque_nm"], entry["speed_rad_s"]
         assert bench.node._transmit[0].pack()[2:] == data(entry["bytes"])[2:], entry["means"]
+
+
+def test_a_drive_behind_a_gateway_has_no_watchdog_and_is_refused(monkeypatch):
+    """Its own watches EtherCAT: nothing on the CAN side may pass for one; only by name it is taken."""
+    monkeypatch.setitem(GOLDEN["beckhoff-ax8000"]["limits"], "accept_no_watchdog", False)
+    bench = Bench(GOLDEN["beckhoff-ax8000"])
+    assert [check.name for check in bench.found.refused] == ["watchdog"]
+    bench.close()
+
+
+def test_a_scaling_that_is_set_otherwise_is_refused():
+    golden = GOLDEN["beckhoff-ax8000"]
+    bench = Bench(golden | {"stands": [{"index": 0x3005, "sub": 2, "value": 8448}]})
+    assert [check.name for check in bench.found.refused] == ["3005h:02 Scaling index velocity NC"]
+    bench.close()

@@ -197,3 +197,12 @@ def test_another_reaction_object_and_filters(bench: Open) -> None:
     for value, option in ((7, 1), (6, 0)):
         host.write(0x2345, 2, value, 2)
         assert settings.connection_option == option
+
+
+def test_an_encoder_that_the_profile_does_not_know(bench: Open) -> None:
+    """A profile begun from an EDS without values: some encoder, rather than a division by zero."""
+    data = load_canopen_profile("elmo/gold").model_dump()
+    data["parameters"] = tuple(one | {"default": None} for one in data["parameters"])
+    simulated, host = bench(profile=CanopenProfile.model_validate(data))
+    assert (host.read(0x608F, 1), host.read(0x608F, 2)) == (4096, 1)
+    assert simulated.simulator.node.application.modes
