@@ -181,7 +181,7 @@ class Drive(Protocol):
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
 
-    A drive may also be a `Looking` one, and one that `StopsFeeding`.
+    A drive may also be a `Looking` one, a `Positioned` one, and one that `StopsFeeding`.
     """
 
     @property
@@ -249,3 +249,28 @@ class Paced(Protocol):
     def began_late_s(self) -> float: ...
 
     def set_rate(self, rate_hz: float, *, measuring: bool = False) -> None: ...
+
+
+class PositionReading(NamedTuple):
+    """The motor shaft's angle, counted by the drive independently of the unit of its speed.
+
+    ``time_s`` is control time of the reading, give or take ``half_width_s``. The angle starts over after
+    ``wraps_rad`` (None: it never does); its zero means nothing. ``where``: object or register.
+    """
+
+    time_s: float
+    half_width_s: float
+    position_rad: float
+    wraps_rad: float | None
+    where: str
+
+
+@runtime_checkable
+class Positioned(Protocol):
+    """A drive that may also tell the angle of its motor shaft, apart from its speed.
+
+    ``read_position`` is called after `preflight`, between two cycles, in speed mode at a steady speed or a gentle ramp;
+    it takes a part of the watchdog's time at most. None: the drive has no angle to tell, or gave no answer.
+    """
+
+    def read_position(self) -> PositionReading | None: ...

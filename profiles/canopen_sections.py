@@ -73,6 +73,28 @@ class Speed(Entry):
     deceleration_rpm_s_per_lsb: Positive | None = Field(description="unit of 6084h in rpm/s; null = no such object")
 
 
+class Position(Entry):
+    """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right.
+
+    Read only, and believed only where the drive has it.
+    """
+
+    index: Index = Field(default=0x6064, description="object with the count")
+    sub: SubIndex = Field(default=0, description="its sub-index")
+    type: ObjectType = Field(default="i32", description="its data type")
+    counts_per_turn: Positive | None = Field(
+        default=None,
+        description="counts for one turn of the motor; 1 for a counter of turns; null = 608Fh:1 over 608Fh:2",
+    )
+    wrap_counts: Positive | None = Field(
+        default=None, description="counts after which it starts over; null = when its data type is full"
+    )
+
+
+STANDARD_POSITION = Position(source="CiA 402-2, 6064h and 608Fh, where the drive has them", confidence="verified")
+"""What is looked for in a drive whose profile says nothing of it."""
+
+
 class TorqueActual(ObjectAt):
     """Where the torque is reported, of one instant with the speed, and in which unit."""
 

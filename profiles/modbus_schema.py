@@ -271,6 +271,16 @@ _NO_ECHO = Entry(
 """Stands where an echo is missing: no check at standstill can find that setpoint's entry wrong, so a person answers."""
 
 
+class Position(Entry):
+    """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right. Read only."""
+
+    register_: Register = Field(alias="register")
+    counts_per_turn: Positive = Field(description="counts for one turn of the motor; 1 for a counter of turns")
+    wrap_counts: Positive | None = Field(
+        default=None, description="counts after which it starts over; null = when its register is full"
+    )
+
+
 class ModbusCycle(Entry):
     """The numbers of every cycle."""
 
@@ -317,6 +327,11 @@ class ModbusProfile(DataModel):
     modes: ModeSwitch
     quick_stop: QuickStop
     cycle: ModbusCycle
+    position: Position | None = Field(
+        default=None,
+        description="the motor's angle, held against the reported speed; null = none, and the operator is asked what "
+        "he sees",
+    )
     rated_torque: Name | None = Field(
         default=None, description="parameter in nm that is 100 % torque; null: rig.yaml drive_data.rated_torque_nm"
     )

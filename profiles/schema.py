@@ -11,9 +11,11 @@ from pydantic import Field, model_validator
 
 from profiles.canopen_parameter import Parameter
 from profiles.canopen_sections import (
+    STANDARD_POSITION,
     Cyclic,
     IdentityEntry,
     Modes,
+    Position,
     QuickStop,
     ReportingFilter,
     Speed,
@@ -39,6 +41,11 @@ class CanopenProfile(DataModel):
     modes: Modes
     quick_stop: QuickStop
     speed: Speed
+    position: Position | None = Field(
+        default=STANDARD_POSITION,
+        description="the motor's angle, held against the reported speed; left out = 6064h and 608Fh where the drive "
+        "has them; null = none, and the operator is asked what he sees",
+    )
     torque: Torque
     watchdog: Watchdog
     cyclic: Cyclic
@@ -77,8 +84,10 @@ class CanopenProfile(DataModel):
         return {one.name: one for one in self.parameters}[name]
 
     def entries(self) -> tuple[tuple[str, Entry], ...]:
-        """(name, entry) of everything that carries a source and a confidence."""
-        found: list[tuple[str, Entry]] = [(name, part) for name, part in self if isinstance(part, Entry)]
+        """(name, entry) of everything that the profile says, with its source and confidence."""
+        found: list[tuple[str, Entry]] = [
+            (name, part) for name, part in self if isinstance(part, Entry) and part != STANDARD_POSITION
+        ]
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         return (*found, *((f"parameters.{part.name}", part) for part in self.parameters))
 

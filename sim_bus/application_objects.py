@@ -5,6 +5,7 @@
 6083 6084 6085             accelerations                               0.1 rpm/s
 6080                       max motor speed                             rpm
 6071 6072 6074 6077 60E0 60E1   torques                                ‰ of 6076h
+6064 · 608F                angle · its counts a turn                   increments
 6076 · 6075                rated torque · rated current                mN·m · mA
 6087                       torque slope                                ‰ of 6076h per second
 606E 6070                  times                                       ms
@@ -12,12 +13,13 @@
 """
 
 from collections.abc import Callable
+from math import floor
 
 from canopen.sdo import SdoAbortedError
 
 from sim_bus.cia402_application import Application, Settings
 from sim_bus.object_store import ABORT_VALUE, ObjectStore, key_of
-from sim_bus.object_units import ObjectUnits, standard_units
+from sim_bus.object_units import TURN, ObjectUnits, standard_units
 from sim_bus.reporting import RPM
 
 
@@ -25,6 +27,12 @@ def clamped(value: float, bits: int) -> int:
     """Rounded to the nearest integer that a signed field of ``bits`` can hold."""
     top = (1 << bits - 1) - 1
     return max(-top - 1, min(top, round(value)))
+
+
+def wrapped(counts: float, bits: int = 32, *, signed: bool = True) -> int:
+    """A counter of so many bits, which starts over when it is full."""
+    seen = floor(counts) % (1 << bits)
+    return seen - (1 << bits) if signed and seen >> (bits - 1) else seen
 
 
 class ApplicationObjects:
@@ -59,7 +67,8 @@ class ApplicationObjects:
         store.variable(0x6080, 0).max = speed
 
     def _bind_process_data(self) -> None:
-        application, live, hooks = self._application, self._store.live, self._store.hooks
+        application, store = self._application, self._store
+        live, hooks = store.live, store.hooks
         control, reporting = application.inverter.control, application.inverter.reporting
         units = self._units
         velocity, target, actual = units.velocity, units.target_torque, units.actual_torque
@@ -68,6 +77,8 @@ class ApplicationObjects:
         live[key_of(0x6060)] = live[key_of(0x6061)] = lambda: application.mode.value
         live[key_of(0x606B)] = self._velocity_demand
         live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / velocity, 32)
+        per_turn = store.default(key_of(0x608F, 1))
+        live[key_of(0x6064)] = lambda: wrapped(application.inverter.state.angle_rad / TURN * per_turn)
         live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
         live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
         live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)

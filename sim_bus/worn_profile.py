@@ -9,11 +9,11 @@ from canopen.objectdictionary import datatypes
 
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile
-from sim_bus.application_objects import clamped
+from sim_bus.application_objects import clamped, wrapped
 from sim_bus.cia402_application import Application, Mode
 from sim_bus.node_guarding import LifeGuard
 from sim_bus.object_store import ObjectStore, key_of
-from sim_bus.object_units import ObjectUnits, profile_units
+from sim_bus.object_units import TURN, ObjectUnits, profile_units
 from sim_bus.worn_settings import DATA_TYPES, WornSettings
 
 _REACTIONS = {"none": 0, "fault_reaction": 1, "coast": 2, "quick_stop": 3}
@@ -39,6 +39,7 @@ class WornProfile:
         self._watchdog(store, guard)
         self._torque(store)
         self._speed(store)
+        self._position(store)
         self._filters(store)
         self.settings.bind(store)
         if not self.profile.cyclic.has_period:
@@ -56,6 +57,8 @@ class WornProfile:
             0x1016: profile.watchdog.kind == "heartbeat" and profile.watchdog.consumer_index == 0x1016,
             0x6007: profile.watchdog.reaction_index == 0x6007,
             0x605A: stop.option_code is not None,
+            0x6064: profile.position is not None,
+            0x608F: profile.position is not None,
             0x6071: bool(profile.modes.torque),
             0x6072: torque.max_torque_rated_per_lsb is not None,
             0x6074: torque.has_demand,
@@ -138,6 +141,26 @@ class WornProfile:
     def _speed(self, store: ObjectStore) -> None:
         if self.profile.speed.si_unit is not None:
             store.set_default(0x60A9, 0, self.profile.speed.si_unit)
+
+    def _position(self, store: ObjectStore) -> None:
+        """The angle in the profile's object, in its counts; the standard's 6064h is there already."""
+        position, inverter = self.profile.position, self._application.inverter
+        if position is None or (position.counts_per_turn is None and position.index == 0x6064):
+            return
+        store.add(
+            position.index, position.sub, DATA_TYPES[position.type], writable=False, mappable=True, name="Angle"
+        )
+        per_turn = position.counts_per_turn or store.default(key_of(0x608F, 1))
+
+        def counts() -> float:
+            turned = inverter.state.angle_rad / TURN * per_turn
+            if position.wrap_counts is not None:
+                turned %= position.wrap_counts
+            if position.type == "f32":
+                return turned
+            return wrapped(turned, int(position.type[1:]), signed=position.type[0] == "i")
+
+        store.live[key_of(position.index, position.sub)] = counts
 
     def _filters(self, store: ObjectStore) -> None:
         """What smooths the reports of the simulated machine, as the profile's drive would tell it."""

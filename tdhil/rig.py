@@ -164,6 +164,7 @@ _OPERATORS = {
     "accept_shared_watchdog": "--accept-shared-watchdog",
     "accept_wider_limit": "--accept-wider-limit NAME",
     "accept_wider_limits": "--accept-wider-limit NAME",
+    "accept_speed_unit": "--accept-speed-unit",
     "reset_fault": "--reset-fault",
 }
 _ONLY_THE_OPERATOR = {

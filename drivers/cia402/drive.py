@@ -26,6 +26,7 @@ from drivers.cia402.link import CanLink
 from drivers.cia402.look import keep_stepping, look, push
 from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
 from drivers.cia402.parameters import check_parameters
+from drivers.cia402.position import Angle, find_angle
 from drivers.cia402.reported import Reported
 from drivers.cia402.sdo import Objects
 from drivers.cia402.shape import RPDO1, RPDO1_SPEED, shape_of
@@ -34,7 +35,7 @@ from drivers.cia402.state import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, cont
 from drivers.cia402.units import find_units
 from drivers.cia402.watch import STOPPED, Watch
 from drivers.clock import Clock
-from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, Preflight, Sample
+from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.table import Table
 from drivers.ticks import RATES_HZ, Ticks, how_late
@@ -110,6 +111,7 @@ class Cia402Drive:
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
         self._watchdog_s = self._allowed_silence_s = 0.0
+        self._angle: Angle | None = None
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
         self._reported = Reported()
@@ -186,6 +188,7 @@ class Cia402Drive:
         self._codes = checks.choose_modes(table, objects, self._profile)
         self._modes = {code: mode for mode, code in self._codes.items()}
         table.checks += scaling.checks
+        self._angle = find_angle(table, objects, self._profile)
         own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
         set_limits(table, objects, self._profile, limits, rated_nm, own)
         checks.clear_targets(table, objects, self._profile)
@@ -361,6 +364,15 @@ class Cia402Drive:
         self._life.feed()
         self._ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
+
+    def read_position(self) -> PositionReading | None:
+        """The motor's angle by one SDO between two cycles; None where the drive has none, or didn't answer in time."""
+        if self._angle is None:
+            return None
+        self._life.feed_when_due(self.clock.now_s())
+        found = self._angle.read(self._objects, self.clock, self._watchdog_s)
+        self._ticks.put_off()
+        return found
 
     def _follow_state(self) -> None:
         """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.

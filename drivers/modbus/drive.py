@@ -22,6 +22,7 @@ from drivers.drive import (
     Limits,
     Mode,
     Outcome,
+    PositionReading,
     PowerState,
     Preflight,
     Sample,
@@ -39,6 +40,7 @@ from drivers.modbus.link import Link, late_replies
 from drivers.modbus.other_master import OtherMaster
 from drivers.modbus.parameters import find_filters
 from drivers.modbus.plan import Transaction, only_reads, plan_cycle
+from drivers.modbus.position import Angle, find_angle
 from drivers.modbus.registers import register_name
 from drivers.modbus.rounds import Round, go_round
 from drivers.modbus.scales import Scales
@@ -110,6 +112,7 @@ class ModbusDrive:
         self._stage = ""               # as announced
         self._modes: frozenset[Mode] = frozenset()
         self._watchdog_s = self._timeout_s = 0.0
+        self._angle: Angle | None = None
         self._wish = Wish.OFF
         self._was_enabled = self._told_fault = self._reverse = self._at_rest = False
         self._state: StatusState | None = None
@@ -167,6 +170,7 @@ class ModbusDrive:
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
             set_limits(table, access, profile, limits, rated_nm, found)
+            self._angle = find_angle(table, access, profile)
             read_back = check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
             checks.check_modes(table, access, profile)
             pace = measure_pace(
@@ -413,6 +417,15 @@ class ModbusDrive:
         by_reading = entry.fed_by_any_client or entry.fed_by == "requests_of_this_connection"
         since_s = self._silent_since_s
         return since_s is not None and by_reading and self.clock.now_s() - since_s < SILENT_TIMES * self._watchdog_s
+
+    def read_position(self) -> PositionReading | None:
+        """The motor's angle, in one transaction between two cycles; None where there is none, or no good reply."""
+        if self._angle is None:
+            return None
+        found = self._angle.read(self._access, self._timeout_s)
+        self._ticks.done()
+        self._ticks.put_off()
+        return found
 
     def _push(self) -> None:
         """The control word of a quick stop alone, in the shortest request that the drive knows."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from math import floor, pi
 
 from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
 from profiles.modbus_schema import Echo, ModbusProfile, Register, Signal
@@ -43,7 +44,7 @@ class Map:
         self._wrongs = {wrong.kind for wrong in wrongs}
         self._speed_counts = 0
         self._torque_counts = 0
-        named = self._cycle() + self._mode() + self._echoes() + self._families() + self._settings()
+        named = self._cycle() + self._mode() + self._echoes() + self._position() + self._families() + self._settings()
         self.slots: dict[tuple[str, int], Slot] = {}
         for slot in named:
             self._lay(replace(slot, layout=self._moved(slot.layout)))
@@ -109,6 +110,22 @@ class Map:
             "speed": lambda: application.target_speed_rad_s, "torque": lambda: application.target_torque_nm,
         }
         return [self._reported(echo, targets[echo.setpoint]) for echo in self._profile.echoes]
+
+    def _position(self) -> list[Slot]:
+        """The true shaft's angle in counts; the counter starts over when it is full."""
+        position = self._profile.position
+        if position is None:
+            return []
+        layout, inverter = self._layout(position.register_), self._application.inverter
+
+        def read() -> int:
+            turned = inverter.state.angle_rad / (2.0 * pi) * position.counts_per_turn
+            if position.wrap_counts is not None:
+                turned %= position.wrap_counts
+            span = layout.highest - layout.lowest + 1
+            return (floor(turned) - layout.lowest) % span + layout.lowest
+
+        return [Slot(layout, read)]
 
     def _families(self) -> list[Slot]:
         return [Slot(Layout(address), extra.read, extra.write) for address, extra in self._words.extras().items()]

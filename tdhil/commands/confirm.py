@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import sys
 import threading
@@ -18,6 +19,7 @@ from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
 
 WORD = "MOVE"
+SPEED_FLAG = "--accept-speed-unit"
 _UNWATCHED = "  [ ] somebody stands at that stop for the whole run: nothing else stops the shaft if this host fails\n"
 
 _SHARED = (
@@ -56,6 +58,57 @@ def confirm_motion(
     console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
     if _ask(idle).strip() != WORD:
         raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
+
+
+def confirm_speed(
+    speed_rad_s: float,
+    why: str,
+    idle: Idle,
+    *,
+    console: Console,
+    pause_display: Callable[[], None],
+    gear_ratio: float = 1.0,
+) -> None:
+    """Return if the operator sees the shaft turn as fast as the drive reports; PreflightRefused (exit 4) if not.
+
+    Asked while the shaft turns, one cycle after the other; ``--yes`` is no answer to it.
+    """
+    turning = turns_text(speed_rad_s)
+    pause_display()
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise PreflightRefused(
+            f"nobody is there to see whether the shaft turns {turning}, as the drive reports ({why})",
+            where="no terminal",
+            next_step="Run it at a terminal, where somebody sees the shaft; say in the profile where the drive tells"
+            f" its angle (position); or take the unit of speed by name: {SPEED_FLAG}",
+        )
+    main = f" (the main shaft, behind the gear, {turns_text(speed_rad_s / gear_ratio)})" if gear_ratio != 1.0 else ""
+    console.print(
+        f"\nThe shaft turns, and {why}.\n"
+        f"The drive reports {speed_rad_s:.3g} rad/s: watch a mark on the motor's shaft for some turns.",
+        markup=False,
+    )
+    console.print(
+        f"Is it turning {turning}{main}? Type yes and Enter; anything else stops it: ", end="", markup=False
+    )
+    answer = _ask(idle).strip().lower()
+    if answer not in ("y", "yes"):
+        raise PreflightRefused(
+            f"the shaft was not seen to turn {turning}, as the drive reports: its unit of speed is not what the profile"
+            " says",
+            where="prompt",
+            next_step="Check the speed scaling in the profile: how long one turn really takes, against what was asked,"
+            " is the factor",
+        )
+
+
+def turns_text(speed_rad_s: float) -> str:
+    """A speed as somebody with a watch sees it."""
+    way = "forward" if speed_rad_s >= 0.0 else "backwards"
+    turn_s = 2.0 * math.pi / max(abs(speed_rad_s), 1e-9)
+    if turn_s >= 2.0:
+        return f"{way} once every {turn_s:.3g} s"
+    return f"{way} {10.0 / turn_s:.3g} times in 10 s"
 
 
 def summary(

@@ -46,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        "this host dies while one of them goes on asking")
     drive.add_argument("--accept-wider-limit", action="append", choices=("torque", "speed", "quick-stop"),
                        help="let the run widen this limit of the drive's own; otherwise a tighter one stays")
+    drive.add_argument("--accept-speed-unit", action="store_true",
+                       help="take the profile's unit of speed without seeing the shaft turn as fast as it says")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
@@ -148,7 +150,7 @@ def _run(
     rig: Rig | None,
     console: Console,
 ) -> int:
-    from tdhil.commands.confirm import confirm_motion
+    from tdhil.commands.confirm import confirm_motion, confirm_speed
     from tdhil.commands.log_file import LogPlace
     from tdhil.commands.peer import open_drive
     from tdhil.commands.real_time import real_time_priority
@@ -198,14 +200,17 @@ def _run(
                 display.say(raised.said)
             outcome = Runner(
                 drive,
-                partial(_task, options, connection.profile, rig, log, say, namespace.accept_no_watchdog,
-                        namespace.accept_shared_watchdog, tuple(namespace.accept_wider_limit or ())),
+                partial(_task, options, connection.profile, rig, log, say, namespace),
                 log,
                 stop_request,
                 display,
                 confirm,
                 reset_fault=namespace.reset_fault,
                 say=display.say,
+                confirm_speed=partial(
+                    confirm_speed, console=console, pause_display=display.pause,
+                    gear_ratio=1.0 if rig is None else rig.gear.ratio,
+                ),
             ).run()
         for fault in peer.never_came:
             with suppress(LogError):
@@ -237,9 +242,7 @@ def _task(
     rig: Rig | None,
     log: RunLog,
     say: Callable[[str], None],
-    accept_no_watchdog: bool,
-    accept_shared_watchdog: bool,
-    accept_wider: tuple[str, ...],
+    accepted: argparse.Namespace,
     identity: Identity,
 ) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
@@ -254,8 +257,11 @@ def _task(
     elif text := note(profile):
         say(text)
     limits = machine_limits(
-        bench, accept_no_watchdog=accept_no_watchdog, accept_shared_watchdog=accept_shared_watchdog,
-        accept_wider=accept_wider,
+        bench,
+        accept_no_watchdog=accepted.accept_no_watchdog,
+        accept_shared_watchdog=accepted.accept_shared_watchdog,
+        accept_wider=tuple(accepted.accept_wider_limit or ()),
+        accept_speed_unit=accepted.accept_speed_unit,
     )
     return Task(limits, excitation_request(options), facts(bench))
 

@@ -32,7 +32,7 @@ def bench_of(identity: Identity, rig: Rig | None) -> Rig:
 
 def machine_limits(
     bench: Rig, *, accept_no_watchdog: bool = False, accept_shared_watchdog: bool = False,
-    accept_wider: Collection[str] = (),
+    accept_wider: Collection[str] = (), accept_speed_unit: bool = False,
 ) -> MachineLimits:
     """The guard's limits. Raises PreflightRefused where the rig has none.
 
@@ -54,6 +54,7 @@ def machine_limits(
         accept_no_watchdog=accept_no_watchdog,
         accept_shared_watchdog=accept_shared_watchdog,
         accept_wider=frozenset(accept_wider),
+        accept_speed_unit=accept_speed_unit,
     )
 
 

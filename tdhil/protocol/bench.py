@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from threading import Event, Thread
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from drivers.drive import Command, Drive, Mode, PowerState, Sample
 from drivers.errors import DriveFault, ModeNotConfirmed
@@ -32,6 +32,8 @@ class RunLog(Protocol):
 
     def event(self, time_s: float, kind: str, text: str) -> None: ...
 
+    def configure(self, **run: Any) -> None: ...
+
 
 Watcher = Callable[[Command, Sample], None]
 
@@ -48,6 +50,8 @@ class Bench:
         self.period_s = drive.period_s
         self.stop_side_troubles: list[str] = []
         self.last: Sample | None = None
+        self.beside: Watcher | None = None         # what a stage does beside every cycle, behind the guard
+        self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
         self._stop_request = stop_request
         self._watch = watch
 
@@ -66,7 +70,9 @@ class Bench:
         self.last = sample
         self.guard.check_sample(command, sample)
         self.guard.check_pace(self.drive.counters)
-        if self._watch is not None:
+        if self.beside is not None:
+            self.beside(command, sample)
+        if self._watch is not None and not self.quiet:
             self._watch(command, sample)
         return sample
 

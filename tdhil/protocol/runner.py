@@ -23,6 +23,7 @@ from tdhil.protocol.guard import Guard
 from tdhil.protocol.lag_knowledge import with_known_lag, with_read_filters, with_timing
 from tdhil.protocol.plan_stage import StagePlanner
 from tdhil.protocol.settings import StopRequest
+from tdhil.protocol.speed_look import Onlooker
 from tdhil.protocol.stage_acquire import run_acquire
 from tdhil.protocol.stage_book import StageBook
 from tdhil.protocol.stage_hold import run_hold
@@ -32,7 +33,7 @@ from tdhil.protocol.stage_swing import run_swings
 from tdhil.protocol.stage_torque import TorqueResult, run_torque
 from tdhil.protocol.stop import StopReport, StopSequence
 from tdhil.protocol.string_rules import refuse_with_string
-from tdhil.protocol.task import Confirm, Display, MakeTask, RunOutcome, Say, Task
+from tdhil.protocol.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
 from tdhil.record.recording import Excitation, LagPrior, Ramp
 from tdhil.record.run_log import RunLog
 
@@ -55,6 +56,7 @@ class Runner:
         *,
         reset_fault: bool = False,
         say: Say = _nothing,
+        confirm_speed: ConfirmSpeed = nobody_sees,
     ) -> None:
         self._drive = drive
         self._make_task = make_task
@@ -64,6 +66,7 @@ class Runner:
         self._stop_request = stop_request
         self._display = display
         self._confirm = confirm
+        self._confirm_speed = confirm_speed
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._prior = LagPrior()
@@ -124,7 +127,12 @@ class Runner:
             if breakaway is not None:
                 self._log.event(bench.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
         with self._book.stage("speed", 50.0):
-            speed = run_speed(bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset)
+            onlooker = Onlooker(
+                self._confirm_speed, preflight.identity.simulated, limits.accept_speed_unit, self._say
+            )
+            speed = run_speed(
+                bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset, onlooker
+            )
             self._log.motion(None, speed.levels, (speed.ramp,))
             self._note_rough(bench, speed)
             self._note_timing(bench, speed)

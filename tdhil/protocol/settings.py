@@ -21,6 +21,7 @@ class MachineLimits:
     torque_ramp_nm_s: float = 0.0      # with a string: how fast trapped torque is brought down
     accept_no_watchdog: bool = False   # the operator takes a drive that won't stop by itself (--accept-no-watchdog)
     accept_shared_watchdog: bool = False   # … or one that any client feeds (--accept-shared-watchdog)
+    accept_speed_unit: bool = False    # the operator takes the profile's unit of speed unseen (--accept-speed-unit)
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
 
 

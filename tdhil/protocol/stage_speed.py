@@ -6,6 +6,7 @@ them a rough inertia by its balance of momentum, in which a lag cancels since bo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from tdhil.identify.samples import Samples
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.settings import ControlAssumptions, MachineLimits
+from tdhil.protocol.speed_look import Onlooker, SpeedLook
 from tdhil.protocol.steady import SteadyLevel, steady_level, trace, wait_until_steady
 from tdhil.record.recording import FloatArray, Level, Ramp
 
@@ -28,6 +30,7 @@ GOOD_ENOUGH = 0.2
 """Relative uncertainty of the rough inertia that is good enough to plan with."""
 
 TRIES = 4
+NOBODY = Onlooker()
 
 
 @dataclass(frozen=True)
@@ -69,15 +72,21 @@ def run_speed(
     assumptions: ControlAssumptions,
     speed_resolution_rad_s: float,
     torque_offset_nm: float,
+    onlooker: Onlooker = NOBODY,
 ) -> SpeedResult:
-    """Both levels and the ramp between them. Raises what the bench raises, LimitHit if a speed doesn't settle."""
+    """Both levels and the ramp between them.
+
+    Raises what the bench raises, LimitHit if a speed doesn't settle, PreflightRefused if the unit of speed is wrong.
+    """
     low_rad_s, high_rad_s = mean_speeds(limits)
     tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
     rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
     start = bench.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(bench) else None
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
-    _ramp(bench, speed_now, low_rad_s, rate)
-    low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions)
+    look = SpeedLook(bench, limits, assumptions, speed_resolution_rad_s, onlooker)
+    look.ramp(speed_now, low_rad_s, rate)
+    low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions, before_level=look.level)
+    look.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
     for _ in range(TRIES):
         between = _ramp(bench, low_rad_s, high_rad_s, rate)
         ramped = len(between)
@@ -153,6 +162,7 @@ def _settle_and_hold(
     tolerance_rad_s: float,
     assumptions: ControlAssumptions,
     into: list[Sample] | None = None,
+    before_level: Callable[[], None] = lambda: None,
 ) -> list[Sample]:
     """Settle, let the reporting lags run out, then the level; the settling is appended to ``into``."""
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
@@ -160,4 +170,5 @@ def _settle_and_hold(
     settling += bench.hold(command, 2.0 * assumptions.largest_speed_lag_s)
     if into is not None:
         into += settling
+    before_level()
     return bench.hold(command, LEVEL_S)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from drivers.drive import Command, Identity, Preflight, Sample
+from drivers.errors import PreflightRefused
 from tdhil.protocol.excitation import Plan, SwingPlan
 from tdhil.protocol.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.protocol.stop import StopReport
@@ -62,3 +63,16 @@ MakeTask = Callable[[Identity], Task]
 
 Confirm = Callable[[Task, Preflight, Idle], None]
 """Asks whether the shaft may be moved; raises PreflightRefused if not."""
+
+ConfirmSpeed = Callable[[float, str, Idle], None]
+"""Asks whether the motor's shaft is seen to turn at this speed, rad/s, and says why nothing else tells; raises
+PreflightRefused if not. `Idle` is one cycle at that speed."""
+
+
+def nobody_sees(speed_rad_s: float, why: str, idle: Idle) -> None:
+    """A `ConfirmSpeed` with nobody there."""
+    raise PreflightRefused(
+        f"nobody is there to see whether the shaft turns at {speed_rad_s:.3g} rad/s ({why})",
+        where="unit of speed",
+        next_step="Say in the profile where the drive tells its angle (position), or run it at a terminal",
+    )

@@ -13,9 +13,9 @@ from drivers.errors import CommunicationLost, PreflightRefused
 
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 ROWS = [
-    "identity", "state", "modes of operation", "rated torque", "torque limit", "speed limit", "quick-stop ramp",
-    "quick-stop option", "targets", "mode display for 9", "mode display for 10", "PDO mapping", "cycle", "stepped time",
-    "drive's heartbeat", "watchdog reaction", "watchdog",
+    "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
+    "quick-stop ramp", "quick-stop option", "targets", "mode display for 9", "mode display for 10", "PDO mapping",
+    "cycle", "stepped time", "drive's heartbeat", "watchdog reaction", "watchdog",
 ]
 
 
@@ -45,7 +45,7 @@ def test_a_drive_as_it_should_be(make, peer):
     assert [check.name for check in found.checks] == ROWS
     assert found.refused == ()
     assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
-    assert {check.name for check in found.checks if check.outcome is Outcome.NOTE} == {"identity"}
+    assert {check.name for check in found.checks if check.outcome is Outcome.NOTE} == {"identity", "angle of the motor"}
     assert peer.operational
 
 
@@ -354,7 +354,7 @@ def test_everything_wrong_at_once(make, peer, profile):
     rows = [check.name for check in found.checks]
     by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4"}
     assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
-    good = {"stepped time"}
+    good = {"stepped time", "angle of the motor"}
     assert set(refused(found)) == set(rows) - good
     assert all(check.where for check in found.refused)
 

@@ -43,6 +43,17 @@ MODBUS: dict[int, Row] = {
 }
 
 UNITS: dict[int, Row] = {
+    80: Row("profile's unit of speed too small by 2 to 10, and no object of the drive contradicts it",
+            "found at walking pace by the drive's angle, with its factor; the true shaft stays below speed_max", "4",
+            (HERE + "test_speed_unit.py",)),
+    81: Row("the same in a drive that tells no angle", "the operator is asked at speed_max/20; his no ends it", "4",
+            (HERE + "test_speed_unit.py",)),
+    82: Row("the same, with nobody at a terminal", "R at that speed, unless the unit is taken by name", "4",
+            (HERE + "test_speed_unit.py",)),
+    83: Row("the drive's angle counts against its reported speed", "R, naming the sign", "4",
+            (HERE + "test_speed_unit.py",)),
+    84: Row("the drive's angle stands still while it reports that the shaft turns", "the operator is asked", "4",
+            (HERE + "test_speed_unit.py",)),
 }
 
 STAGES: dict[int, Row] = {

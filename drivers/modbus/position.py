@@ -1,0 +1,61 @@
+"""The motor shaft's angle as a drive on Modbus counts it, apart from the unit of its speed."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from drivers.drive import PositionReading
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus import requests
+from drivers.modbus.access import Access
+from drivers.modbus.errors import RegisterRefused
+from drivers.modbus.registers import WordOrder, from_words, register_name
+from drivers.table import Table
+from profiles.modbus_schema import ModbusProfile, Position
+
+_TITLE = "angle of the motor"
+_ASKED = "whether the shaft turns as fast as the drive says is asked of the operator"
+_WIDTHS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
+
+
+class Angle(NamedTuple):
+    """The register that counts the angle."""
+
+    entry: Position
+    order: WordOrder
+
+    @property
+    def rad_per_count(self) -> float:
+        return 2.0 * math.pi / self.entry.counts_per_turn
+
+    def read(self, access: Access, timeout_s: float) -> PositionReading | None:
+        """One transaction; None without a good reply."""
+        entry, register = self.entry, self.entry.register_
+        function = requests.READ_HOLDING if register.table == "holding" else requests.READ_INPUT
+        where = register_name(register)
+        try:
+            answer = access.once(requests.read(function, register.address, register.count), timeout_s, where)
+        except (CommunicationLost, RegisterRefused):
+            return None                # the next cycle tells of a line that is gone
+        half_s = 0.5 * (answer.received_s - answer.sent_s)
+        counts = from_words(answer.words, register.type, self.order)
+        wraps = entry.wrap_counts or float(1 << _WIDTHS[register.type])
+        unit = self.rad_per_count
+        return PositionReading(answer.sent_s + half_s, half_s, counts * unit, wraps * unit, where)
+
+
+def find_angle(table: Table, access: Access, profile: ModbusProfile) -> Angle | None:
+    """The profile's register, where the drive gives it; a note says what there is."""
+    entry = profile.position
+    if entry is None:
+        table.note(_TITLE, f"not told by this drive: {_ASKED}", "profile, position")
+        return None
+    where = register_name(entry.register_)
+    try:
+        access.read(entry.register_)
+    except PreflightRefused as error:
+        table.note(_TITLE, f"not told: {error.what}; {_ASKED}", where)
+        return None
+    table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts a turn, held against the speed in stage 2", where)
+    return Angle(entry, profile.line.word_order)

@@ -1,0 +1,376 @@
+"""A profile whose unit of speed is wrong, and nothing in the drive that contradicts it: judged on the true shaft.
+
+The host's profile says 0.01 rpm where a count is 0.1 rpm, and no highest speed is written to the drive: the shaft turns
+ten times as fast as it is asked to and says so of itself ten times too small. The whole path, stage 1 to the stop,
+through frames, in stepped time; what the shaft does is the simulator's own word.
+"""
+
+import math
+from dataclasses import replace
+from importlib.resources import files
+
+import can
+import pytest
+from fake_drive import FakeDisplay, FakeLog
+
+from drivers.cia402.drive import Cia402Drive
+from drivers.clock import SteppedClock
+from drivers.errors import PreflightRefused
+from drivers.modbus.drive import ModbusDrive
+from drivers.modbus.embedded import EmbeddedLink
+from profiles.library import load_canopen_profile, load_modbus_profile
+from sim_bus.modbus.embedded import EmbeddedModbusDrive
+from sim_bus.params import RigParams
+from sim_bus.simulator import EmbeddedSimulator
+from tdhil.errors import exit_code
+from tdhil.protocol import speed_look
+from tdhil.protocol.runner import Runner
+from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.protocol.task import Task
+
+LIMITS = MachineLimits(
+    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
+    probe_torque_nm=200.0,
+)
+
+
+class Enough(Exception):
+    """The unit of speed has been settled: all that was to be seen has been seen."""
+
+
+class Log(FakeLog):
+    """Ends the run once the unit of speed has been settled, or, ``on`` through, when the stage is over."""
+
+    on = False
+
+    def configure(self, **run):
+        super().configure(**run)
+        if "speed_unit" in run and not self.on:
+            raise Enough
+
+
+class Unmarked:
+    """A drive that is taken for a real one."""
+
+    def __init__(self, drive):
+        self._drive = drive
+
+    def __getattr__(self, name):
+        return getattr(self._drive, name)
+
+    def read_position(self):
+        return self._drive.read_position()
+
+    def connect(self):
+        return replace(self._drive.connect(), simulated=False)
+
+    def preflight(self, limits):
+        found = self._drive.preflight(limits)
+        return replace(found, identity=replace(found.identity, simulated=False))
+
+
+class Rig:
+    """One bus: what the drive is, what the host takes it for, and how the true shaft turns."""
+
+    def __init__(self, drive, true_speed, close, node=None):
+        self.drive, self.true_speed, self.close, self.node = drive, true_speed, close, node
+        self.log, self.asked = Log(), []
+
+    def run(self, *, simulated=True, confirm_speed=None, limits=LIMITS):
+        seen = []
+
+        def on_cycle(_stage, _count):
+            seen.append(abs(self.true_speed()))
+
+        def on_started(name):
+            if name in ("torque", "hold", "acquire"):
+                raise Enough
+
+        display = FakeDisplay(on_cycle=on_cycle, on_started=on_started)
+        options = {} if confirm_speed is None else {"confirm_speed": confirm_speed}
+        drive = self.drive if simulated else Unmarked(self.drive)
+        self.outcome = Runner(
+            drive, lambda _: Task(limits, ExcitationRequest()), self.log, StopRequest(), display, lambda *_: None,
+            **options,
+        ).run()
+        self.highest_rad_s, self.last_rad_s = max(seen), seen[-1]
+        return self.outcome
+
+    def says(self, answer):
+        """A `ConfirmSpeed` of an operator who looks for five seconds."""
+
+        def confirm(speed_rad_s, why, idle):
+            for _ in range(round(5.0 / self.drive.period_s)):
+                idle()
+            self.asked.append((speed_rad_s, abs(self.true_speed()), why))
+            if not answer:
+                raise PreflightRefused("the shaft was not seen to turn as the drive reports", where="prompt")
+
+        return confirm
+
+
+def profile_of(tmp_path, name, load, *changes):
+    text = (files("profiles") / f"{name}.yaml").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text.replace("eds: cia402.eds", "eds: null"))
+    return load(str(path))
+
+
+def canopen(tmp_path, factor, *changes, worn=False):
+    """``factor``: by how much the host's unit is too small. ``worn``: the drive has the changes, too."""
+    wrong = (
+        ("  rpm_per_lsb: 0.1\n", f"  rpm_per_lsb: {0.1 / factor:.6g}\n"),
+        ("max_motor_speed_rpm_per_lsb: 1.0", "max_motor_speed_rpm_per_lsb: null"),
+    )
+    of_drive = profile_of(tmp_path, "generic/cia402", load_canopen_profile, *changes) if worn else None
+    simulated = EmbeddedSimulator(RigParams(), seed=3, profile=of_drive).open()
+    bus = can.Bus(interface="virtual", channel=simulated.channel)
+    profile = profile_of(tmp_path, "generic/cia402", load_canopen_profile, *wrong, *changes)
+
+    def close():
+        bus.shutdown()
+        simulated.close()
+
+    drive = Cia402Drive(bus, profile, SteppedClock(), node=1)
+    return Rig(drive, lambda: simulated.simulator.speed_rad_s, close, simulated.simulator.node)
+
+
+def modbus(tmp_path, factor, *changes):
+    told = f"per_lsb: {0.01 / factor:.6g}, unit: rpm"
+    wrong = (
+        ("register: {address: 1, type: i32}, per_lsb: 0.01, unit: rpm", "register: {address: 1, type: i32}, " + told),
+        ("register: {address: 17, type: i32}, per_lsb: 0.01, unit: rpm", "register: {address: 17, type: i32}, " + told),
+        # What would show it before motion: the echo of the setpoint, and the limits of speed.
+        ("  - {setpoint: speed, register: {address: 48, type: i32}, per_lsb: 0.001, unit: rpm, "
+         "source: this project's own map, confidence: verified}\n", ""),
+        ("    set_to: speed_limit\n", ""),
+        ("    set_to: speed_limit_reverse\n", ""),
+    )
+    simulated = EmbeddedModbusDrive(RigParams(), load_modbus_profile("generic/modbus"), seed=3)
+    clock = SteppedClock()
+    profile = profile_of(tmp_path, "generic/modbus", load_modbus_profile, *wrong, *changes)
+
+    def true_speed():
+        return simulated.speed_rad_s
+
+    drive = ModbusDrive(EmbeddedLink(simulated.serve, clock), profile, unit=1)
+    return Rig(drive, true_speed, simulated.close)
+
+
+SPEED = "speed:\n  rpm_per_lsb"
+
+
+def angle(keys):
+    """Where the drive counts its angle, in front of the unit of its speed."""
+    return f"position:\n  {keys}\n  source: a test\n  confidence: verified\n{SPEED}"
+
+
+NO_ANGLE = {
+    canopen: (SPEED, f"position: null\n{SPEED}"),
+    modbus: ("position:\n  register: {address: 52, type: i32}\n  counts_per_turn: 4096\n"
+             "  source: this project's own map\n  confidence: verified\n", ""),
+}
+
+
+@pytest.fixture
+def made(tmp_path):
+    open_rigs = []
+
+    def make(bus, factor=10.0, *changes, **options):
+        open_rigs.append(bus(tmp_path, factor, *changes, **options))
+        return open_rigs[-1]
+
+    yield make
+    for rig in open_rigs:
+        rig.close()
+
+
+both = pytest.mark.parametrize("bus", [canopen, modbus])
+
+
+def assert_stopped_in_time(rig):
+    assert rig.highest_rad_s < LIMITS.speed_max_rad_s
+    assert rig.outcome.stop is not None
+    assert rig.outcome.stop.confirmed
+    assert rig.last_rad_s < 0.05
+
+
+@both
+@pytest.mark.parametrize("factor", [10.0, 2.0 * math.pi, 3.0, 2.0])
+def test_the_angle_shows_a_unit_that_is_too_small(made, seen, bus, factor):
+    rig = made(bus, factor)
+    cause = rig.run().cause
+    assert exit_code(cause) == 4
+    assert "unit of speed is too small by a factor of" in cause.what
+    assert float(cause.what.rsplit(" ", 1)[1]) == pytest.approx(factor, rel=0.06)
+    assert "speed scaling in the profile" in cause.next_step
+    assert_stopped_in_time(rig)
+    if factor == 10.0:
+        seen(80, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+
+
+@both
+def test_a_unit_that_is_too_large(made, bus):
+    """Ten times too slow is no danger, but a wrong inertia; the shaft is let turn at the slow speed only."""
+    rig = made(bus, 0.25)
+    cause = rig.run().cause
+    assert exit_code(cause) == 4
+    assert "too large by a factor of 4" in cause.what
+    assert_stopped_in_time(rig)
+
+
+@both
+def test_without_an_angle_the_operator_says_no(made, seen, bus):
+    rig = made(bus, 10.0, NO_ANGLE[bus])
+    cause = rig.run(simulated=False, confirm_speed=rig.says(False)).cause
+    assert exit_code(cause) == 4
+    (reported, true, why), = rig.asked
+    assert reported == pytest.approx(2.0 * math.pi / 12.0, rel=0.05)        # once every 12 s, it says
+    assert true == pytest.approx(10.0 * reported, rel=0.1)
+    assert "tells no angle" in why
+    assert_stopped_in_time(rig)
+    seen(81, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+
+
+@both
+def test_without_an_angle_and_with_nobody_there(made, seen, bus):
+    rig = made(bus, 10.0, NO_ANGLE[bus])
+    cause = rig.run(simulated=False).cause
+    assert exit_code(cause) == 4
+    assert "nobody is there to see whether the shaft turns" in cause.what
+    assert_stopped_in_time(rig)
+    seen(82, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+
+
+@both
+def test_the_operator_says_yes_to_a_right_unit(made, bus):
+    rig = made(bus, 1.0, NO_ANGLE[bus])
+    assert isinstance(rig.run(simulated=False, confirm_speed=rig.says(True)).cause, Enough)
+    (reported, true, _), = rig.asked
+    assert true == pytest.approx(reported, rel=0.1)
+    assert rig.log.run["speed_unit"]["seen_by"] == "operator"
+
+
+@both
+def test_taken_by_name_nobody_is_asked(made, bus):
+    rig = made(bus, 1.0, NO_ANGLE[bus])
+    limits = replace(LIMITS, accept_speed_unit=True)
+    assert isinstance(rig.run(simulated=False, limits=limits).cause, Enough)
+    assert rig.log.run["speed_unit"]["seen_by"] == "--accept-speed-unit"
+    (warning,) = speed_look.warnings(rig.log.run)
+    assert "--accept-speed-unit" in warning
+
+
+@both
+def test_a_name_does_not_take_a_shaft_that_would_be_too_fast(made, bus):
+    rig = made(bus, 10.0)
+    cause = rig.run(simulated=False, limits=replace(LIMITS, accept_speed_unit=True)).cause
+    assert exit_code(cause) == 4
+    assert "too small by a factor of 10" in cause.what
+    assert_stopped_in_time(rig)
+
+
+@both
+def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
+    """A good unit of speed, and an encoder said to have twice the counts that it has."""
+    old, new = {
+        canopen: (SPEED, angle("counts_per_turn: 16384")),
+        modbus: ("counts_per_turn: 4096", "counts_per_turn: 8192"),
+    }[bus]
+    rig = made(bus, 1.0, (old, new))
+    cause = rig.run(simulated=False).cause
+    assert exit_code(cause) == 4
+    assert "too large by a factor of 2" in cause.what
+    assert "position: null" in cause.next_step
+    again = made(bus, 1.0, (old, new))
+    assert isinstance(again.run(simulated=False, limits=replace(LIMITS, accept_speed_unit=True)).cause, Enough)
+
+
+@both
+def test_a_simulated_drive_without_an_angle_goes_on_with_a_note(made, bus):
+    rig = made(bus, 1.0, NO_ANGLE[bus])
+    assert isinstance(rig.run().cause, Enough)
+    assert not rig.asked
+    assert any("not looked at" in text for _, text in rig.log.events)
+
+
+@both
+def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
+    rig, plain = made(bus, 1.0), made(bus, 1.0, NO_ANGLE[bus])
+    for one in (rig, plain):
+        one.log.on = True
+        assert isinstance(one.run().cause, Enough)
+    assert rig.log.run["speed_unit"]["ratio"] == pytest.approx(1.0, abs=0.005)
+    assert speed_look.warnings(rig.log.run) == ()
+    # No cycle of its own; on Modbus its requests take time on the line, which shifts the noise.
+    assert rig.log.cycles == pytest.approx(plain.log.cycles, abs=0 if bus is canopen else 20)
+
+
+ANGLES = {
+    "a counter of turns": "counts_per_turn: 1\n  type: i32",
+    "one turn only": "counts_per_turn: 4096\n  wrap_counts: 4096\n  type: u16",
+    "a float": "counts_per_turn: 1\n  type: f32",
+}
+
+
+@pytest.mark.parametrize("kind", ANGLES)
+@pytest.mark.parametrize("factor", [1.0, 10.0])
+def test_other_angles(made, kind, factor):
+    rig = made(canopen, factor, (SPEED, angle("index: 0x2100\n  " + ANGLES[kind])), worn=True)
+    cause = rig.run().cause
+    if factor == 1.0:
+        assert isinstance(cause, Enough)
+        assert rig.log.run["speed_unit"]["ratio"] == pytest.approx(1.0, abs=0.03)
+    else:
+        assert "too small by a factor of" in cause.what
+        assert float(cause.what.rsplit(" ", 1)[1]) == pytest.approx(factor, rel=0.06)
+        assert_stopped_in_time(rig)
+
+
+def spoiled(rig, read):
+    """The simulated drive's 6064h as ``read`` makes it of the true count."""
+    live = rig.node.store.live
+    true = live[0x6064 << 8]
+    live[0x6064 << 8] = lambda: read(true())
+
+
+def test_an_angle_that_counts_backwards(made, seen):
+    rig = made(canopen, 1.0)
+    spoiled(rig, lambda counts: -counts)
+    cause = rig.run(simulated=False).cause
+    assert exit_code(cause) == 4
+    assert "a sign is inverted" in cause.what
+    assert "607Eh" in cause.next_step
+    assert_stopped_in_time(rig)
+    seen(83, cause.what, code=4)
+
+
+def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
+    rig = made(canopen, 10.0)
+    spoiled(rig, lambda counts: 1234)
+    cause = rig.run(simulated=False, confirm_speed=rig.says(False)).cause
+    assert exit_code(cause) == 4
+    (_, _, why), = rig.asked
+    assert "doesn't move" in why
+    assert_stopped_in_time(rig)
+    seen(84, f"{why}; {cause.what}", code=4)
+
+
+def test_an_angle_that_stands_still_in_a_simulated_drive(made):
+    rig = made(canopen, 1.0)
+    spoiled(rig, lambda counts: 0)
+    cause = rig.run().cause
+    assert exit_code(cause) == 4
+    assert "doesn't move" in cause.what
+
+
+@pytest.mark.parametrize(("increments", "turns"), [(1, 1), (8192, 0), (0, 1)])
+def test_no_increments_for_a_turn_are_none(made, increments, turns):
+    rig = made(canopen, 1.0)
+    rig.node.store.values[0x608F01] = increments
+    rig.node.store.values[0x608F02] = turns
+    assert isinstance(rig.run(simulated=False, confirm_speed=rig.says(True)).cause, Enough)
+    assert len(rig.asked) == 1
