@@ -106,7 +106,7 @@ def _flat(model: BaseModel) -> str:
 
 
 _HEX = {"mask", "value", "onward", "off", "quick_stop", "fault_reset", "speed_bits", "torque_bits", "reverse_bits",
-        "index", "consumer_index", "reaction_index"}
+        "index", "consumer_index", "reaction_index", "vendor", "product", "revision", "si_unit"}
 
 
 def _value(name: str, value: Any) -> str:
