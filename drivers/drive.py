@@ -181,7 +181,7 @@ class Drive(Protocol):
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
 
-    A drive may also be a `Looking` one, a `Positioned` one, and one that `StopsFeeding`.
+    A drive may also be a `Looking`, a `Telling` and a `Positioned` one, and one that `StopsFeeding`.
     """
 
     @property
@@ -219,6 +219,19 @@ class Looking(Protocol):
     """
 
     def look(self) -> Sample | None: ...
+
+
+@runtime_checkable
+class Telling(Protocol):
+    """A drive that notices what others do on its bus and what doesn't end a run.
+
+    ``remarks`` gives what was noticed since it was asked last; ``summary`` what there is to say of all of the run.
+    A line each, cheap to ask for in every cycle.
+    """
+
+    def remarks(self) -> tuple[str, ...]: ...
+
+    def summary(self) -> tuple[str, ...]: ...
 
 
 @runtime_checkable

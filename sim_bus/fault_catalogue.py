@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from sim_bus import fault_drive as drive
 from sim_bus import fault_frames as frames
 from sim_bus.fault_hooks import Misbehaviour
-from sim_bus.fault_kinds import Kind, factor, listing_of, make_from, parse_from, plain, share
+from sim_bus.fault_kinds import Kind, factor, listing_of, make_from, parse_from, plain, seconds, share
 from sim_bus.fault_script import Scripted
 
 _OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
@@ -30,6 +30,27 @@ def _object(text: str) -> tuple[int, int]:
         raise ValueError("an object, such as 6072h or 1016h:1")
     return int(found[1], 16), int(found[2] or 0)
 
+
+def _again(text: str) -> bool:
+    if text not in ("once", "again"):
+        raise ValueError("once or again")
+    return text == "again"
+
+
+def _written(text: str) -> tuple[int, int, int, int]:
+    """6072h=100 or 1016h:1=0: object, value, and its size in bytes, as CiA 301 and 402 have it."""
+    where, _, value = text.partition("=")
+    index, sub = _object(where)
+    if not re.fullmatch(r"[0-9]{1,10}|[0-9A-Fa-f]{1,8}h", value):
+        raise ValueError("an object and what is written to it, such as 6072h=100")
+    number = int(value[:-1], 16) if value.endswith("h") else int(value)
+    size = 4 if index in _LONG or 0x1400 <= index < 0x1C00 else 1 if index in _SHORT else 2
+    if number >> 8 * size:
+        raise ValueError(f"a value of at most {size} bytes")
+    return index, sub, number, size
+
+
+_LONG, _SHORT = {0x1006, 0x1016, 0x6080, 0x6085, 0x60FF}, {0x100D, 0x6060}
 
 KINDS: dict[str, Kind[Misbehaviour]] = {
     "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(frames.Dead)),
@@ -60,6 +81,16 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
     "duplicate-node": Kind(26, "a second drive answers under the same node ID", plain(frames.SecondNode)),
     "replayed-feedback": Kind(26, "so many frames of a recording, taken at rest, go before each of the drive's own",
                               lambda v: frames.Replayed(_frames(v)), "1", "FRAMES"),
+    "foreign-heartbeat": Kind(56, "another node bears the host's number: its heartbeat comes so often",
+                              lambda v: frames.ForeignHeartbeat(seconds(v)), "1s", "TIME"),
+    "tool-writes": Kind(57, "a tool writes an object by SDO, once",
+                        lambda v: frames.ToolWrites(*_written(v)), "1016h:1=0", "OBJECT=VALUE"),
+    "setting-changed": Kind(58, "an object is changed at the drive's own panel",
+                            lambda v: frames.SettingChanged(*_written(v)[:3]), "6007h=0", "OBJECT=VALUE"),
+    "foreign-setpoints": Kind(59, "another master sends setpoints in RPDO4, or switches that on again and again",
+                              lambda v: frames.ForeignSetpoints(_again(v)), "once", "once|again"),
+    "sdo-master": Kind(60, "another master writes controlword and speed by SDO, in every cycle",
+                       plain(frames.SdoMaster)),
     "wrong-identity": Kind(29, "1018h:1, the vendor, is another one",
                            plain(lambda: frames.Otherwise(0x1018, 1))),
     "fault-at-start": Kind(30, "the drive is in fault when the host comes",

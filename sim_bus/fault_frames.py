@@ -132,6 +132,77 @@ class SecondMaster(Misbehaviour):
         return ((can_id, data),)
 
 
+class ForeignHeartbeat(Misbehaviour):
+    """Another node bears the number 127, the host's: its heartbeat comes every so often."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_us = round(1e6 * every_s)
+        self._next_us = 0
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        now_us = self.scene.node.time_us
+        if now_us >= self._next_us:
+            self._next_us = now_us + self._every_us
+            self.scene.foreign(_HEARTBEAT + 127, b"\x05")
+        return ((can_id, data),)
+
+
+class ToolWrites(Misbehaviour):
+    """A tool writes one object by SDO, once; everybody on the bus hears it."""
+
+    def __init__(self, index: int, sub: int, value: int, size: int) -> None:
+        self._request = bytes((0x23 | (4 - size) << 2,)) + index.to_bytes(2, "little") + bytes((sub,)) + (
+            value.to_bytes(4, "little"))
+
+    def begin(self) -> None:
+        self.scene.foreign(_REQUEST + self.scene.node.id, self._request)
+
+
+class SettingChanged(Misbehaviour):
+    """One object gets another value from the drive's own panel: nothing of it is on the bus."""
+
+    def __init__(self, index: int, sub: int, value: int) -> None:
+        self._key, self._value = index << 8 | sub, value
+
+    def begin(self) -> None:
+        self.scene.node.store.write(self._key, self._value)
+
+
+class ForeignSetpoints(Misbehaviour):
+    """Another master sends enable operation and a speed of 500 counts in RPDO4, at each SYNC.
+
+    ``again``: and it switches that RPDO on again, by SDO, whenever it finds it off.
+    """
+
+    def __init__(self, again: bool) -> None:
+        self._again = again
+
+    def begin(self) -> None:
+        self.scene.node.store.write(0x1403 << 8 | 2, 1)        # synchronous: acts beside the host's
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id == SYNC and node.sync_seen:
+            if self._again and int(node.store.number(0x1403 << 8 | 1)) >> 31:
+                switch_on = bytes.fromhex("23031401") + (0x500 + node.id).to_bytes(4, "little")
+                self.scene.foreign(_REQUEST + node.id, switch_on)
+            self.scene.foreign(0x500 + node.id, bytes.fromhex("0f00f4010000"))
+        return ((can_id, data),)
+
+
+class SdoMaster(Misbehaviour):
+    """Another master writes enable operation and a speed of 500 counts by SDO, after each SYNC."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id != SYNC or not node.sync_seen:
+            return ((can_id, data),)
+        wishes = [(_REQUEST + node.id, bytes.fromhex(one)) for one in ("23ff6000f4010000", "2b4060000f000000")]
+        for wish in wishes:
+            self.scene.put(*wish)
+        return ((can_id, data), *wishes)
+
+
 class Answers(Misbehaviour):
     """Base of those that meddle with SDO. ``index`` and ``sub`` name the object."""
 

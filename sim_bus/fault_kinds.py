@@ -29,6 +29,14 @@ def share(text: str) -> float:
     return number
 
 
+def seconds(text: str) -> float:
+    """A time such as 1s or 200ms. Raises ValueError."""
+    number = float(text[:-2]) / 1000.0 if text.endswith("ms") else float(text.removesuffix("s"))
+    if not 0.001 <= number <= 3600.0:
+        raise ValueError("a time from 1ms to 3600s")
+    return number
+
+
 def factor(text: str) -> float:
     """What a reported quantity may be multiplied by. Raises ValueError."""
     if not 0.01 <= float(text) <= 100.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.cia402.mapping import layout, write_pdo, written
+from drivers.cia402.mapping import layout, slow_syncs, switch_off_others, write_pdo, written
 from drivers.cia402.objects import consumer_heartbeat
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.shape import Shape
@@ -20,10 +20,17 @@ LEAST_CYCLES = 5
 """The watchdog must not bite on account of a lost frame or two."""
 
 
-def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape) -> bool:
-    """Map both pairs of PDOs; whether the slow one carries the torque demand 6074h too."""
+def map_pdos(
+    table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape, period_s: float
+) -> tuple[bool, dict[int, int]]:
+    """Map both pairs of PDOs, and switch off what other RPDOs the drive has.
+
+    Whether the slow pair carries the torque demand 6074h too; and the COB-IDs that were switched off, by the RPDO's
+    number.
+    """
     with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
-    pdos = layout(with_demand, shape)
+    pdos = layout(with_demand, shape, slow_syncs(period_s))
+    others: dict[int, int] = {}
 
     def work() -> tuple[str, bool]:
         for pdo in pdos:
@@ -31,7 +38,14 @@ def map_pdos(table: Table, objects: Objects, node: int, profile: CanopenProfile,
         return "as wanted", True
 
     table.attempt("PDO mapping", ", ".join(map(written, pdos)), "1600h, 1A00h", work)
-    return with_demand
+    try:
+        others = switch_off_others(objects, pdos)
+    except PreflightRefused as error:
+        table.row("other RPDOs", "off", error.what, False, error.where, error.next_step)
+    if others:
+        on = ", ".join(f"RPDO{number} ({cob_id & 0x7FF:X}h)" for number, cob_id in others.items())
+        table.row("other RPDOs", "off", f"off (were on: {on})", True, "1400h and on")
+    return with_demand, others
 
 
 def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
@@ -39,6 +53,12 @@ def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> in
     if not profile.cyclic.has_period:
         raise ObjectRefused("not in the profile", where="1006h")
     return objects.change(0x1006, 0, round(period_s * 1e6), 32)
+
+
+def set_slow_syncs(objects: Objects, period_s: float) -> None:
+    """With every how many SYNCs the second TPDO comes (1801h:2), at another rate. Raises ObjectRefused."""
+    if objects.read(0x1801, 2) > 1:            # with every SYNC anyway where it carries the statusword
+        objects.write(0x1801, 2, slow_syncs(period_s), 8)
 
 
 def set_timing(

@@ -24,14 +24,18 @@ from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_do
 from drivers.cia402.limits import set_limits
 from drivers.cia402.link import CanLink
 from drivers.cia402.look import keep_stepping, look, push
+from drivers.cia402.mapping import slow_syncs
 from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
 from drivers.cia402.parameters import check_parameters
 from drivers.cia402.position import Angle, find_angle
+from drivers.cia402.read_back import ReadBack
 from drivers.cia402.reported import Reported
 from drivers.cia402.sdo import Objects
 from drivers.cia402.shape import RPDO1, RPDO1_SPEED, shape_of
 from drivers.cia402.sign_of_life import HEARTBEAT_S, SignOfLife
+from drivers.cia402.standing import Standing
 from drivers.cia402.state import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
+from drivers.cia402.strangers import Strangers
 from drivers.cia402.units import find_units
 from drivers.cia402.watch import STOPPED, Watch
 from drivers.clock import Clock
@@ -52,10 +56,13 @@ NMT = 0x000
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
 FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
 """The first SYNCs, at standstill, are given so long: how soon this drive answers is then known, and what is late."""
+QUICK_STOP_OPTION = 0x605A
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
 STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
 """Wall time that feedback may take in stepped time, and after a cycle that brought none."""
+MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
+"""A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
 _NO_WORD = b""
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
@@ -85,19 +92,25 @@ class Cia402Drive:
         self._rate_is_named = rate_hz is not None
         self._profile = profile
         self._node = node
-        self._host_node = host_node
         self._rated_torque_nm = rated_torque_nm
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
         self._watch = Watch(node, clock)
+        self._strangers = Strangers(self._link, self._watch, clock, node=node, number=host_node)
         self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
+        if self._life.asks:
+            self._strangers.own_questions()
+        self._read_back = ReadBack(
+            self._watch, lambda request: self._link.send(0x600 + node, request), self._strangers.tell, node
+        )
+        self._objects.on_answer(self._read_back.take)
+        self._strangers.on_write = self._on_write
+        self._standing = Standing(self._objects, self._link, node, self.period_s)
+        self._fed = True
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
         self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
         self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
-        self._link.handlers[SYNC] = self._on_foreign_sync
-        for identifier in (self._rpdo1_id, self._rpdo2_id, 0x700 + host_node):
-            self._link.handlers[identifier] = self._watch.on_foreign
         self._identity: Identity | None = None
         self._stage = ""               # as announced
         self._taken = False
@@ -108,15 +121,20 @@ class Cia402Drive:
         self._layout = self._shape.feedback
         self._wide = self._shape.wide
         self._feedback = self._new_feedback()
+        self._strangers.own(SYNC, "SYNC", lambda data: self._feedback.on_foreign_sync())
+        for number in range(1, 5):
+            self._strangers.own(0x100 * (1 + number) + node, rpdo_kind(number, 0x100 * (1 + number) + node))
         self._has_target = self._shape.target_torque
         self._slow_layout = self._shape.slow(False)
         self._watchdog_s = self._allowed_silence_s = 0.0
         self._angle: Angle | None = None
+        self._shown_s = clock.now_s()  # when the mode was last displayed
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
         self._reported = Reported()
         self._sent_code = 0
         self._since_mode_sent = 0
+        self._mode_overwritten = False
         self._contradictions = 0
         self._heard = True
         self._ticks = Ticks(clock, self.period_s)
@@ -194,16 +212,20 @@ class Cia402Drive:
         checks.clear_targets(table, objects, self._profile)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
-        with_demand = arming.map_pdos(table, objects, self._node, self._profile, self._shape)
+        with_demand, others = arming.map_pdos(table, objects, self._node, self._profile, self._shape, self.period_s)
+        for number, cob_id in others.items():
+            self._strangers.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
+        self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.mode else {}), **others}
         self._slow_layout = self._shape.slow(with_demand)
         self._life.pace(limits.watchdog_s / 5.0)
+        self._life.host_node = self._strangers.settle_number(table)
         heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
         self._watchdog_s = limits.watchdog_s
         feed_s = arming.arm_watchdog(
             table,
             objects,
             self._profile.watchdog,
-            host_node=self._host_node,
+            host_node=self._life.host_node,
             watchdog_s=limits.watchdog_s,
             period_s=self.period_s,
             beat=self._life.feed,
@@ -211,6 +233,7 @@ class Cia402Drive:
             accept_none=limits.accept_no_watchdog,
         )
         self._life.keep_to(feed_s)
+        self._watch_settings(limits.watchdog_s if feed_s else 0.0)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
             limits.watchdog_s if feed_s else 0.0, own.kept,
@@ -243,10 +266,36 @@ class Cia402Drive:
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
         with suppress(ObjectRefused):  # it follows the SYNC alone then
             arming.set_period(self._objects, self._profile, self.period_s)
+        with suppress(ObjectRefused):
+            arming.set_slow_syncs(self._objects, self.period_s)
+        self._standing.set_period(self.period_s)
         self._life.feed()
         self._feedback = self._new_feedback()
         self._cycles = self._missed = self._late = self._contradictions = 0
         self._start(0.0 if measuring else 0.5)
+
+    def _watch_settings(self, watchdog_s: float) -> None:
+        """What preflight set stays as it is in motion: it is read back there."""
+        watchdog, back = self._profile.watchdog, self._read_back
+        back.clear()
+        reaction = watchdog.reaction_index, watchdog.reaction_sub
+        guards = [arming.GUARD_TIME, arming.LIFE_TIME_FACTOR] if self._life.asks else [watchdog.consumer_index]
+        for (index, sub), data in self._objects.stands.items():
+            if index in guards or (index, sub) == reaction:
+                if watchdog_s:
+                    title = "the watchdog's reaction" if (index, sub) == reaction else "the drive's watchdog"
+                    back.watch(title, index, sub, data, often=True)
+            elif 0x1400 <= index < 0x1600:
+                back.watch(f"the switch of RPDO{index - 0x1400 + 1}", index, sub, data)
+            elif index == QUICK_STOP_OPTION:
+                back.watch("the quick-stop option", index, sub, data, often=True)
+            elif index not in (0x1006, 0x1017, 0x6060, MARKER_INDEX):
+                back.watch("the drive's own limit", index, sub, data)
+        back.watch_setpoint("the target velocity", 0x60FF)
+        if self._has_target:
+            back.watch_setpoint("the target torque", 0x6071)
+        if self._shape.mode:
+            back.watch_setpoint("the mode of operation", 0x6060)
 
     def _start(self, stall_share: float = 0.5) -> None:
         """Operational from now on, and watched. Standing still for this share of the watchdog's time is an error."""
@@ -257,6 +306,7 @@ class Cia402Drive:
         self._link.send(NMT, bytes((START, self._node)))
         self._link.drain()
         self._ticks = Ticks(self.clock, self.period_s, stall_share * self._watchdog_s)
+        self._shown_s = self.clock.now_s()
         self._watch.start(self._allowed_silence_s)
 
     def _pause(self) -> None:
@@ -271,10 +321,17 @@ class Cia402Drive:
         """From the next cycle on move towards operation enabled in ``mode``."""
         if mode not in self._codes:
             raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
+        self._strangers.refuse_shared()
         self._wish, self._in_operation = Wish.ENABLED, False
 
     def quick_stop(self) -> None:
-        """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling."""
+        """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling.
+
+        Its option (605Ah) goes before it: somebody may have set that to coasting since it was read back last.
+        """
+        if self._wish is Wish.ENABLED and self._fed:
+            with suppress(CommunicationLost):      # the cycle that follows says so
+                self._read_back.put_back(QUICK_STOP_OPTION, 0)
         self._wish = Wish.QUICK_STOP
 
     def disable(self) -> None:
@@ -303,21 +360,62 @@ class Cia402Drive:
         self._check()
         now_s = self.clock.now_s()
         self._life.feed_when_due(now_s)
+        if self._standing.by_sdo or not self._fed:
+            return self._exchange_without_setpoints(now_s)
         code, shown_code = self._codes[command.mode], self._reported.shown_code
         self._since_mode_sent += 1
-        if code != self._sent_code or (code != shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES):
+        again = code != shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES
+        if code != self._sent_code or again or self._mode_overwritten:
             if self._shape.mode:
                 self._link.send(self._rpdo2_id, RPDO2.pack(code))
-            self._sent_code, self._since_mode_sent = code, 0
+            self._sent_code, self._since_mode_sent, self._mode_overwritten = code, 0, False
         word = controlword_towards(self._reported.state, self._wish)
         self._link.send(
             self._rpdo1_id,
             RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
             self._ticks.check,
         )
+        self._read_back.sent(0x60FF, speed_raw)
+        self._read_back.sent(0x6071, torque_raw)
+        self._read_back.sent(0x6060, code)
+        sample = self._finish(now_s)
+        if self._wish is not Wish.QUICK_STOP:
+            self._read_back.step(now_s)
+        elif (sample.fresh or self._others_drive) and self._standing.undone(
+            now_s, self._reported.state, self._others_drive
+        ):
+            self._stand()
+        return sample
+
+    def _exchange_without_setpoints(self, now_s: float) -> Sample:
+        """Of a drive whose RPDOs were switched off, or which is left to its own watchdog.
+
+        Then nothing goes out but, in stepped time, the SYNC that moves time on.
+        """
+        if self._fed:
+            self._standing.push(self._reported.state, self._wish)
+        return self._finish(now_s, self._fed or self.clock.stepped)
+
+    @property
+    def _others_drive(self) -> bool:
+        """Were setpoints of somebody else heard under our own RPDOs' identifiers?"""
+        foreign = self._watch.foreign
+        return any(foreign[rpdo_kind(n, 0x100 * (1 + n) + self._node)] for n in (1, 2))
+
+    def _stand(self) -> None:
+        """The quick stop is undone by somebody, or not taken: by SDO, then, and without any RPDO in the drive."""
+        done = self._standing.take_over(self._watchdog_s, self._life.feed)
+        self._strangers.tell(
+            f"the quick stop did not stand: {done} RPDOs were switched off in the drive, and it was asked for by SDO"
+        )
+        self._ticks.put_off()
+
+    def _finish(self, now_s: float, sync: bool = True) -> Sample:
+        """The SYNC, and what comes back for it."""
         feedback = self._feedback
         feedback.begin(now_s)
-        self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
+        if sync:
+            self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         fresh = bool(feedback.data)
@@ -335,6 +433,8 @@ class Cia402Drive:
             self._watch.on_contradiction()
         self._ticks.check_end()
         self._check()
+        if now_s - self._shown_s > max(MODE_STALE_S, MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s):
+            self._reported.shown_code = 0      # whatever it was, nobody knows any more
         return self._sample(now_s, age_s, fresh)
 
     def _check(self) -> None:
@@ -424,6 +524,19 @@ class Cia402Drive:
             self._ticks.put_off()
         return clock.now_s() - sync_s
 
+    def stop_feeding(self) -> None:
+        """No sign of life, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
+        self._fed = False
+        self._life.end()
+
+    def remarks(self) -> tuple[str, ...]:
+        """What others did on the bus since this was asked last; see `drivers.drive.Telling`."""
+        return self._strangers.remarks()
+
+    def summary(self) -> tuple[str, ...]:
+        """What others wrote to the drive in all of the run."""
+        return self._strangers.summary()
+
     def keep_alive(self) -> None:
         """A sign of life between two cycles, without a SYNC: in stepped time a peer takes a silent host for a dead one.
 
@@ -431,9 +544,10 @@ class Cia402Drive:
         """
         self._life.feed_between()
 
-    def _on_foreign_sync(self, data: bytes) -> None:
-        self._feedback.on_foreign_sync()
-        self._watch.on_foreign(data)
+    def _on_write(self, index: int, sub: int) -> None:
+        """Somebody else wrote an object of the drive."""
+        self._mode_overwritten |= index == 0x6060
+        self._read_back.soon(index, sub)
 
     def _on_slow_feedback(self, data: bytes) -> None:
         if self._wide and len(data) == 2 + self._slow_layout.size:
@@ -441,6 +555,7 @@ class Cia402Drive:
             data = data[2:]
         if len(data) == self._slow_layout.size:
             values = self._slow_layout.unpack(data)
+            self._shown_s = self.clock.now_s()
             self._reported.take_slow(values[0], values[1] if len(values) > 1 else None)
 
     def _sample(self, time_s: float, age_s: float, fresh: bool) -> Sample:
@@ -465,6 +580,11 @@ class Cia402Drive:
         finally:
             self._link.close()
         return left
+
+
+def rpdo_kind(number: int, identifier: int) -> str:
+    """An RPDO of the drive, as it is named in messages."""
+    return f"setpoints (RPDO{number}, {identifier:03X}h)"
 
 
 __all__ = ["HOST_NODE", "Cia402Drive"]

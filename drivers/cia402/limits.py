@@ -90,6 +90,7 @@ def _set(
 
         if own.stays(limit, braking(shown(wanted)), braking(shown(before))):
             si = abs(shown(before)) * {"rpm": RPM, "rated": rated_nm}.get(one.unit, 1.0)
+            objects.stands[one.index, one.sub] = before
             own.keep(table, limit, title, wished, f"{shown(before):.6g}{unit}", si, where)
             return
         back = objects.change_bytes(one.index, one.sub, wanted)
@@ -148,9 +149,11 @@ def _limit(
     raw = max(1, rounding(value / per_lsb * (1.0 + slack)))
     wanted, where = f"{raw * per_lsb:.6g} {unit}", name(index)
     try:
-        before = objects.read(index)
+        data = objects.read_bytes(index)
+        before = int.from_bytes(data, "little")
         found = f"{before * per_lsb:.6g} {unit}"
         if own.stays(limit, raw, before):
+            objects.stands[index, 0] = data
             own.keep(table, limit, title, wanted, found, before * per_lsb, where)
             return
         back = objects.change(index, 0, raw, bits)

@@ -39,6 +39,7 @@ class CanLink:
         self._clock = clock
         self._tap = tap
         self.handlers: dict[int, Handler] = {}
+        self.remote_handlers: dict[int, Handler] = {}      # of remote frames, which carry no data
         self._shut = ""                # why nothing is sent any more
         self.error_frames = 0
         self.passive = 0               # how often the adapter said that it is error-passive
@@ -103,9 +104,9 @@ class CanLink:
         identifier, data = message.arbitration_id, bytes(message.data)
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
-        handler = self.handlers.get(identifier)
         # A remote frame (another master's node guarding) carries no state; 29-bit identifiers are no CANopen of ours.
-        if handler is not None and not (message.is_remote_frame or message.is_extended_id):
+        handler = (self.remote_handlers if message.is_remote_frame else self.handlers).get(identifier)
+        if handler is not None and not message.is_extended_id:
             handler(data)
         return identifier, data
 

@@ -23,9 +23,13 @@ from drivers.cia402.shape import STANDARD, Shape
 from drivers.errors import PreflightRefused
 
 DISABLED = 1 << 31
-SLOW_SYNCS = 5
-"""The second TPDO (mode display, torque demand) comes with every fifth SYNC: it is looked at by people and by mode
-switches, not by the loop, and the bus is short."""
+SLOW_SYNCS, SLOW_S = 5, 0.1
+"""The second TPDO (mode display, torque demand) comes with every fifth SYNC: people, mode switches and
+the guard look at it, not the control, and the bus is short. On a slow cycle it comes sooner: a mode that was lost must
+show within a tenth of a second, or a cycle."""
+_LEAST_RPDOS, _MOST_RPDOS = 8, 64
+"""RPDOs that a drive is asked for: the first ones in any case, since some numbers may be left out, then while there are
+more."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +54,24 @@ class Pdo:
         return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
 
 
-def layout(with_demand: bool, shape: Shape = STANDARD) -> tuple[Pdo, ...]:
-    """RPDO1, TPDO1, RPDO2 (where the mode may change), TPDO2; ``with_demand`` adds 6074h where the drive has it."""
+def slow_syncs(period_s: float) -> int:
+    """With every how many SYNCs the second TPDO comes."""
+    return max(1, min(SLOW_SYNCS, round(SLOW_S / period_s)))
+
+
+def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
+    """RPDO1, TPDO1, RPDO2 (where the mode may change), TPDO2; ``with_demand`` adds 6074h where the drive has it.
+
+    ``slow``: see `slow_syncs`.
+    """
     targets = (TARGET_TORQUE, TARGET_VELOCITY) if shape.target_torque else (TARGET_VELOCITY,)
-    slow = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
+    shown = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
     first: tuple[tuple[int, int, int], ...]
     second: tuple[tuple[int, int, int], ...]
     if shape.wide:
-        first, second, syncs = (shape.torque, VELOCITY_ACTUAL), (STATUSWORD, *slow), 1
+        first, second, syncs = (shape.torque, VELOCITY_ACTUAL), (STATUSWORD, *shown), 1
     else:
-        first, second, syncs = (STATUSWORD, shape.torque, VELOCITY_ACTUAL), slow, SLOW_SYNCS
+        first, second, syncs = (STATUSWORD, shape.torque, VELOCITY_ACTUAL), shown, slow
     modes = (Pdo(True, 2, 1, (MODE,)),) if shape.mode else ()
     return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
 
@@ -94,6 +106,30 @@ def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
             where=name(pdo.communication),
             next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
         )
+
+
+def switch_off_others(objects: Objects, ours: tuple[Pdo, ...]) -> dict[int, int]:
+    """Every enabled RPDO that isn't ours is switched off (bit 31 of its COB-ID), and comes back with the rest.
+
+    Its number and the COB-ID that it had. Through it another master's setpoints would act beside ours (CiA 301, 1400h).
+    Raises ObjectRefused or PreflightRefused where it can't be switched off.
+    """
+    found: dict[int, int] = {}
+    own = {pdo.number for pdo in ours if pdo.receive}
+    for number in range(1, _MOST_RPDOS + 1):
+        index = 0x1400 + number - 1
+        cob_id = None if number in own else objects.read_if_there(index, 1)
+        if cob_id is None and number not in own and number > _LEAST_RPDOS:
+            break
+        if cob_id is None or cob_id & DISABLED:
+            continue
+        if not objects.change(index, 1, cob_id | DISABLED, 32) & DISABLED:
+            raise PreflightRefused(
+                f"RPDO{number} (COB-ID {cob_id & 0x7FF:X}h) stays on: another master's setpoints could act through it",
+                where=name(index, 1), next_step="Switch it off at the drive, by its own tool",
+            )
+        found[number] = cob_id
+    return found
 
 
 def _entries(objects: Objects, pdo: Pdo) -> list[int]:

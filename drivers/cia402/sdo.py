@@ -59,6 +59,7 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         self._asked = bytes(8)
         self._answers = 0              # to the request at hand
         self.doubled = 0               # answers to one that was answered already
+        self.aside: Callable[[bytes], None] = lambda data: None
         link.handlers[self.tx_cobid] = self._take
 
     def send_request(self, request: bytes) -> None:
@@ -69,6 +70,7 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
         super().send_request(request)
 
     def _take(self, data: bytes) -> None:
+        self.aside(data)
         if is_answer(self._asked, data):
             self._answers += 1
             self.doubled += self._answers > 1
@@ -92,6 +94,11 @@ class Objects:
         self._node = node
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
+        self.stands: dict[tuple[int, int], bytes] = {}     # what `change` last read back, or was found right and left
+
+    def on_answer(self, take: Callable[[bytes], None]) -> None:
+        """Have ``take`` see every SDO answer of the drive, also those that nobody here waits for."""
+        self._client.aside = take
 
     @property
     def doubled(self) -> int:
@@ -154,7 +161,8 @@ class Objects:
                 self._changed.add((index, subindex))
                 self.on_restore(lambda: self.write(index, subindex, before, bits))
             self.write(index, subindex, value, bits)
-        return self.read(index, subindex, signed=signed)
+        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
+        return int.from_bytes(back, "little", signed=signed)
 
     def change_bytes(self, index: int, subindex: int, data: bytes) -> bytes:
         """As `change`, for an object of any type."""
@@ -164,7 +172,8 @@ class Objects:
                 self._changed.add((index, subindex))
                 self.on_restore(lambda: self.write_bytes(index, subindex, before))
             self.write_bytes(index, subindex, data)
-        return self.read_bytes(index, subindex)
+        back = self.stands[index, subindex] = self.read_bytes(index, subindex)
+        return back
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called by `restore`."""

@@ -23,7 +23,8 @@ class SignOfLife:
     ) -> None:
         self._link = link
         self._clock = clock
-        self._host_node = host_node
+        self.host_node = host_node
+        self._ended = False
         self._guarding = Guarding(watch, lambda: link.ask(0x700 + node)) if _guarded(profile) else None
         self._asks = self._guarding is not None
         link.handlers[0x700 + node] = watch.on_heartbeat if self._guarding is None else self._guarding.on_frame
@@ -37,11 +38,17 @@ class SignOfLife:
 
     def feed(self) -> None:
         """One now; the next is due a while later."""
+        if self._ended:
+            return
         if self._guarding is not None and self._asks:
             self._guarding.feed()
         else:
-            self._link.send(0x700 + self._host_node, bytes((OPERATIONAL,)))
+            self._link.send(0x700 + self.host_node, bytes((OPERATIONAL,)))
         self._next_s = self._clock.now_s() + self._every_s
+
+    def end(self) -> None:
+        """None any more: the drive's watchdog is to act."""
+        self._ended = True
 
     def feed_when_due(self, now_s: float) -> None:
         """Called in every cycle."""

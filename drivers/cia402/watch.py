@@ -4,7 +4,7 @@ Each kind of trouble is kept until it has been raised, once, in the order in whi
 goes on exchanging is then not disturbed by it again.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 
 from drivers.clock import Clock
@@ -19,8 +19,11 @@ PRE_OPERATIONAL = 0x7F
 _NMT_NAMES = {STOPPED: "stopped", OPERATIONAL: "operational", PRE_OPERATIONAL: "pre-operational"}
 
 FOREIGN_FRAMES, FOREIGN_S = 3, 1.0
-"""So many frames within this time that only we send (SYNC, the drive's RPDOs, our heartbeat) are another master's; and
-so many that only the drive sends, besides its own, another drive's."""
+"""So many frames within this time that only the drive sends, besides its own, are another drive's."""
+FOREIGN_IN_A_RUN = 2
+"""So many frames of one kind that only we send (SYNC, the drive's RPDOs, our heartbeat) are another node's, however far
+apart: CAN's checksum lets no frame become another one by accident. Before the start it takes `FOREIGN_FRAMES`, for what
+another run left in a queue is then still under way."""
 
 START_GRACE_S = 0.5
 """A heartbeat that was under way when the node was started still says pre-operational."""
@@ -81,6 +84,7 @@ class Watch:
         self._troubles: list[tuple[str, TdhilError]] = []
         self._raised: set[str] = set()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
+        self.foreign: Counter[str] = Counter()     # frames of somebody else since the start, by their kind
         self._contradicted_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._started_s = 0.0
         self._operational = False
@@ -148,17 +152,27 @@ class Watch:
                 ),
             )
 
-    def on_foreign(self, _data: bytes) -> None:
-        """A frame of the kinds that we send came in: somebody else drives this drive, or is about to."""
-        if self._no_accident(self._foreign_s):
-            self._keep(
-                "master",
-                CommunicationLost(
-                    "a second master is on the bus: it sends SYNC, setpoints or a host's heartbeat of its own",
-                    where=f"node {self._node}",
-                    next_step="Take it off the bus, or give it other identifiers, and start anew",
-                ),
+    def on_foreign(self, kind: str, why: str = "") -> None:
+        """A frame of a kind that we send came in: somebody else drives this drive, or is about to.
+
+        ``kind``: as people call it; ``why`` it matters, where it isn't a master's.
+        """
+        self.foreign[kind] += 1
+        if self.expect_operational:
+            certain = self.foreign[kind] >= FOREIGN_IN_A_RUN
+        else:
+            certain = self._no_accident(self._foreign_s)
+        if certain:
+            self.interference(
+                why or f"a second master is on the bus: it sends {kind} of its own",
+                f"node {self._node}",
+                "Take it off the bus, or give it other identifiers, and start anew",
+                kind="master",
             )
+
+    def interference(self, what: str, where: str, next_step: str, *, kind: str) -> None:
+        """Somebody else changes this drive or drives it; raised by `check`, once for each ``kind``."""
+        self._keep(kind, CommunicationLost(what, where=where, next_step=next_step))
 
     def on_contradiction(self) -> None:
         """A frame of feedback that the drive can't have sent, if it sent the one before it for the same SYNC."""
@@ -207,6 +221,7 @@ class Watch:
         """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""
         self._heard_s = self._started_s = self._clock.now_s()
         self._operational = False
+        self.foreign.clear()
         self.allowed_silence_s = allowed_silence_s
         self.expect_operational = True
 

@@ -24,7 +24,7 @@ def conclude(
     from tdhil.identify import identify
     from tdhil.identify.identification import Verdict
     from tdhil.identify.options import Options
-    from tdhil.protocol import no_watchdog, speed_look
+    from tdhil.protocol import no_watchdog, others, speed_look
     from tdhil.report.document import result_document
 
     asked = run.get("identify", {})
@@ -32,7 +32,10 @@ def conclude(
     options = Options(**known)
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
-    said = (*(warnings or ()), *_stop_warnings(run), *no_watchdog.warnings(run), *speed_look.warnings(run))
+    said = (
+        *(warnings or ()), *_stop_warnings(run), *no_watchdog.warnings(run), *speed_look.warnings(run),
+        *others.warnings(run),
+    )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
     stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from threading import Event, Thread
 from typing import Any, Generic, Protocol, TypeVar
 
-from drivers.drive import Command, Drive, Mode, PowerState, Sample
+from drivers.drive import Command, Drive, Mode, PowerState, Sample, Telling
 from drivers.errors import DriveFault, ModeNotConfirmed
 from tdhil.errors import Interrupted
 from tdhil.protocol.guard import Guard
@@ -52,6 +52,8 @@ class Bench:
         self.last: Sample | None = None
         self.beside: Watcher | None = None         # what a stage does beside every cycle, behind the guard
         self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
+        self.remarks: list[str] = []       # what others did on the drive's bus
+        self._telling = drive if isinstance(drive, Telling) else None
         self._stop_request = stop_request
         self._watch = watch
 
@@ -68,6 +70,8 @@ class Bench:
         sample = self.drive.exchange(command)
         self.log.cycle(command, sample)
         self.last = sample
+        if self._telling is not None:
+            self._note(self._telling)
         self.guard.check_sample(command, sample)
         self.guard.check_pace(self.drive.counters)
         if self.beside is not None:
@@ -81,12 +85,19 @@ class Bench:
         sample = self.drive.exchange(command)
         try:
             self.log.cycle(command, sample)
+            if self._telling is not None:
+                self._note(self._telling)
             if self._watch is not None:
                 self._watch(command, sample)
         except Exception as error:
             self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
             del self.stop_side_troubles[10:]
         return sample
+
+    def _note(self, drive: Telling) -> None:
+        for line in drive.remarks():
+            self.remarks.append(line)
+            self.log.event(self.now_s, "bus", line)
 
     def cycles(self, seconds: float) -> int:
         """How many cycles last that long."""

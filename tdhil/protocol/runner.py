@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample
 from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
-from tdhil.protocol import no_watchdog
+from tdhil.protocol import no_watchdog, others
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.braking_probe import NOT_YET, slow_down
 from tdhil.protocol.choose_mode import choose_mode, keep_within, no_torque
@@ -90,6 +90,8 @@ class Runner:
                         self._log.event(self._drive.clock.now_s(), "stop", trouble)
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
+            with suppress(Exception):
+                others.tell(self._drive, self._log.configure, self._say)
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
             try:

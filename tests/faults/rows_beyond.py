@@ -20,7 +20,29 @@ LATE: dict[int, Row] = {
             "the plan is dropped, not waited for; it was before, and nothing was sent meanwhile"),
 }
 
+SECOND = f"{HERE}test_second_master_rows.py::"
+STRANGERS = "tests/drivers/test_strangers.py::"
+
 SECOND_MASTER: dict[int, Row] = {
+    56: Row("another node bears the host's number: its heartbeat feeds the drive's watchdog",
+            "a free number from the start; QS in motion, however slow it is", "0, 5",
+            (f"{SECOND}test_noticed_and_stopped", f"{SECOND}test_a_number_that_is_taken_from_the_start",
+             f"{STRANGERS}test_a_number_that_another_node_bears_is_not_taken",
+             f"{STRANGERS}test_one_that_comes_before_motion_is_refused")),
+    57: Row("a tool writes watchdog or reaction in motion", "read back at once, QS", "5",
+            (f"{SECOND}test_noticed_and_stopped",)),
+    58: Row("watchdog, quick stop or a limit changed at the drive's panel in motion", "read back, QS", "5",
+            (f"{SECOND}test_noticed_and_stopped",
+             f"{STRANGERS}test_a_setting_that_somebody_changes_in_motion_ends_the_run")),
+    59: Row("a second master's setpoints in another RPDO", "that RPDO is off; QS, at rest", "5",
+            (f"{SECOND}test_noticed_and_stopped", f"{STRANGERS}test_other_rpdos_are_switched_off_and_given_back")),
+    60: Row("a second master's setpoints by SDO, or by another fieldbus", "QS, at rest", "5",
+            (f"{SECOND}test_noticed_and_stopped",
+             f"{STRANGERS}test_a_speed_in_the_drive_that_is_not_ours_ends_the_run")),
+    61: Row("a stray SDO that the cycle undoes", "told in log, result and at the end", "0, 9",
+            (f"{SECOND}test_stray_writes_that_the_cycle_undoes_are_told",)),
+    62: Row("a drive that doesn't take the quick stop", "the host falls silent; WD", "6, 8",
+            (f"{SECOND}test_a_drive_that_does_not_take_the_quick_stop",)),
 }
 
 MODBUS: dict[int, Row] = {

@@ -47,7 +47,7 @@ CASES = (
     Case(24, "sdo-abort", 4, ("6072h", "0x08000020"), "refused"),
     Case(25, "sdo-timeout", 5, ("6072h", "does not answer", "bit rate"), "refused"),
     Case(26, "second-master", 4, ("6041h", "another master", "nothing was written"), "refused"),
-    Case(26, "second-master" + IN_MOTION, 8, ("second master", "Take it off"), confirmed=False),
+    Case(26, "second-master" + IN_MOTION, 5, ("second master", "Take it off")),
     Case(26, "duplicate-node", 4, ("node 1", "answered twice", "node-ID of its own"), "refused"),
     Case(26, "duplicate-node" + IN_MOTION, 6, ("boot-up",)),
     Case(26, "replayed-feedback" + IN_MOTION, 5, ("TPDO1", "somebody else")),

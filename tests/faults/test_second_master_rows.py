@@ -1,0 +1,69 @@
+"""Rows of the fault table that another node, master, tool or panel causes on CANopen, judged on the true shaft.
+
+A host that is killed leaves the shaft to the drive's watchdog: what these show is that the watchdog is never left in
+somebody else's hands. A run is refused, takes another number, or has come to rest before anybody could kill it.
+"""
+
+import pytest
+
+from tdhil.record.reader import read_run
+
+IN_MOTION = "@speed+15s"       # at 4 rad/s
+
+STOPPED = (
+    (56, "foreign-heartbeat" + IN_MOTION, 1.1, ("77Fh", "watchdog for a dead host")),
+    (56, "foreign-heartbeat" + IN_MOTION + "=20s", 20.2, ("77Fh", "watchdog for a dead host")),
+    (57, "tool-writes" + IN_MOTION, 0.2, ("1016h:1", "8323572 (7F01F4h) was set, 0 stands there now")),
+    (57, "tool-writes" + IN_MOTION + "=6007h=0", 0.2, ("6007h", "3 was set, 0 stands")),
+    (58, "setting-changed" + IN_MOTION, 6.2, ("6007h", "the watchdog's reaction was changed")),
+    (58, "setting-changed" + IN_MOTION + "=1016h:1=0", 6.2, ("1016h:1", "the drive's watchdog was changed")),
+    (58, "setting-changed" + IN_MOTION + "=605Ah=0", 6.2, ("605Ah", "6 was set, 0 stands")),
+    (59, "foreign-setpoints" + IN_MOTION, 0.1, ("RPDO4, 501h", "second master")),
+    (59, "foreign-setpoints" + IN_MOTION + "=again", 5.0, ("RPDO4, 501h", "second master")),
+    (60, "sdo-master" + IN_MOTION, 0.1, ("by SDO", "second master")),
+)
+
+
+@pytest.mark.parametrize(("row", "fault", "notice_s", "words"), STOPPED, ids=[row[1] for row in STOPPED])
+def test_noticed_and_stopped(row, fault, notice_s, words, rehearse, seen):
+    run = rehearse("--fault", fault)
+    run.assert_ended(5, *words)
+    standstill_s = run.assert_stopped(run.fault_s, notice_s)
+    assert "at rest" in run.done.document["stop"]
+    assert max(run.shaft.speed_rad_s[run.shaft.time_s >= run.fault_s]) < 10.0
+    seen(row, f"`{fault}`: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
+
+
+def test_a_number_that_is_taken_from_the_start_is_not_the_host_s(rehearse, seen):
+    run = rehearse("--fault", "foreign-heartbeat", "--max-time", 40)
+    assert run.done.document.get("error") is None, run.done.err
+    preflight = [event.text for event in read_run(run.log).events if event.kind == "preflight"]
+    (line,) = [text for text in preflight if text.startswith("host's node number")]
+    assert "126, since another node bears 127" in line
+    run.shaft.assert_at_rest()
+    seen(56, f"`foreign-heartbeat`: {line}", None, run.assert_log_whole(), run.done.code)
+
+
+def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
+    run = rehearse(
+        "--fault", "tool-writes@speed+15s=6040h=6", "--fault", "tool-writes@speed+18s=6060h=4", "--max-time", 40
+    )
+    assert run.done.document.get("error") is None, run.done.err
+    warnings = " ".join(run.done.document["warnings"])
+    for text in ("6040h = 6h was written by somebody else, 1 time", "6060h = 4h was written by somebody else, 1 time"):
+        assert text in warnings
+        assert text in run.done.err
+    events = [event.text for event in read_run(run.log).events if event.kind == "bus"]
+    assert events == ["somebody else wrote 6040h = 6h by SDO", "somebody else wrote 6060h = 4h by SDO"]
+    assert run.shaft.at_rest_from() <= run.shaft.time_s[-1] - 1.0
+    seen(61, f"told at the end: {warnings}", None, run.assert_log_whole(), run.done.code)
+
+
+def test_a_drive_that_does_not_take_the_quick_stop_is_left_to_its_watchdog(rehearse, seen):
+    """It is deaf to every controlword: the host's sign of life ends, and the drive's own reaction brakes the shaft."""
+    run = rehearse("--fault", f"stuck-state{IN_MOTION}", "--fault", "emcy@speed+16s")
+    assert run.done.code in (6, 8)
+    assert run.shaft.events("host heartbeat lost")
+    standstill_s = run.assert_stopped(run.fault_s, 6.0)
+    seen(62, f"`stuck-state`, then an EMCY: {run.done.document['stop']}", standstill_s, run.assert_log_whole(),
+         run.done.code)
