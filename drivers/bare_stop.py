@@ -79,6 +79,7 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
     quiet_since_s: float | None = None
     best, asked, follows = math.inf, 0, True
     troubles: list[str] = []
+    coasted: Seen | None = None
     ended: Ended | None = None
     while ended is None:
         try:
@@ -101,6 +102,8 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
         else:
             now_s = heard_s = clock.now_s()
             first, follows = first or last, last.follows
+            if coasted is None and last.state is PowerState.OFF and not last.near_zero:
+                coasted = last
             if not last.near_zero or follows:
                 quiet_since_s = None
             elif quiet_since_s is None:
@@ -116,8 +119,11 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
         if ended is None and now_s - begun_s > longest_s:
             ended = Ended.TURNING if last is not None else Ended.NO_ANSWER
         clock.wait_until(clock.now_s() + PAUSE_S)
+    let_go = () if coasted is None else (
+        f"its torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: it ran out unbraked",
+    )
     return BareStopReport(
-        ended, first, last, clock.now_s() - begun_s, asked, (*target.remarks(), *dict.fromkeys(troubles))
+        ended, first, last, clock.now_s() - begun_s, asked, (*target.remarks(), *let_go, *dict.fromkeys(troubles))
     )
 
 

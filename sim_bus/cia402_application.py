@@ -4,8 +4,9 @@ Every way to a stop goes through speed control, from torque mode too: quick stop
 disable operation with ramp (605Bh, 605Ch), fault reaction (605Eh). Ramp by option code: 1 slow-down ramp 6084h,
 2 quick-stop ramp 6085h, 3 torque limit; 5, 6, 7 are 1, 2, 3 and then stay in quick stop active.
 
-A quick stop that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps
-coming: another command has to be seen first.
+A drive may have a quick stop that doesn't brake from the torque modes: it then switches off (`Settings`). A quick stop
+that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps coming: another
+command has to be seen first.
 """
 
 from collections.abc import Callable
@@ -45,6 +46,7 @@ class Settings:
     window_s: float = 0.0                # 606Eh
     standstill_rad_s: float = 0.05       # 606Fh
     standstill_s: float = 0.1            # 6070h
+    torque_quick_stop: bool = True       # does a quick stop on command decelerate from a torque mode?
 
 
 def _ignore(_text: str) -> None:
@@ -88,6 +90,9 @@ class Application:
         command = sm.decode(word)
         if self._own_stop and command is not Command.ENABLE:
             self._own_stop = False
+        coasts = self.mode in {Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
+        if command is Command.QUICK_STOP and coasts and self.state is State.ENABLED:
+            self._enter(State.SWITCH_ON_DISABLED)
         while self._obey(command):
             pass
         self._weighed = (word, self.state)

@@ -82,6 +82,7 @@ class WornProfile:
             settings.accel_rad_s2 = settings.decel_rad_s2 = float("inf")
         if stop.option_code is None:
             settings.quick_stop_option = _QUICK_STOP_RAMP + (4 if stop.ends == "quick_stop" else 0)
+        settings.torque_quick_stop = stop.decelerates_in_torque_mode
         if not profile.modes.mapped:
             store.variable(0x6060, 0).pdo_mappable = False
 

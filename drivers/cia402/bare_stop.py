@@ -5,7 +5,9 @@ with its next frame (transition 16 of the state machine). Then the same word goe
 that one of them stands in the drive when the SYNC comes; a master that watches the state sees the stop and gives up.
 Where even that is undone, the RPDO that carries 6040h is switched off in the drive (bit 31 of 1400h:1).
 
-A drive whose quick stop is set to coast (605Ah = 0) gets another one first, or the halt bit if it refuses that.
+A drive whose quick stop is set to coast (605Ah = 0) gets another one first, or the halt bit if it refuses that. One
+that is in torque mode, and whose profile doesn't say that a quick stop decelerates there, gets speed mode at zero
+first, as a run does it: its quick stop would let a turning shaft go.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ BY_SDO_TRIES, BY_RPDO_TRIES = 3, 6
 """So many attempts by SDO alone, then so many with a burst of RPDOs, then the RPDO is switched off."""
 BURST, BURST_PAUSE_S = 200, 0.0005
 NEAR_ZERO_RAD_S, NEAR_ZERO_LSB = 0.05, 3
+MODE_S, MODE_PAUSE_S = 0.5, 0.01
+"""A drive may take so long to change to speed mode, and is asked again after the second."""
 _RPDOS = 4
 _CONTROLWORD = 0x6040
 _COAST, _BRAKE_AND_HOLD = 0, 6
@@ -44,6 +48,9 @@ class Cia402Target:
         self._link = CanLink(bus, clock)
         self._objects = Objects(self._link, node)
         self._node = node
+        self._profile = profile
+        self._clock = clock
+        self._stays_in_torque_mode = False
         self._rad_s_per_lsb = profile.speed.rpm_per_lsb * RPM
         self._word = QUICK_STOP
         self._prepared = False
@@ -59,6 +66,7 @@ class Cia402Target:
         """SDO; then RPDOs; then without the other master's RPDO. Raises CommunicationLost or ObjectRefused."""
         if not self._prepared:
             self._prepare()
+        self._leave_torque_mode()
         if attempt > BY_SDO_TRIES + BY_RPDO_TRIES:
             self._switch_off_rpdos()
         elif attempt > BY_SDO_TRIES:
@@ -105,6 +113,39 @@ class Cia402Target:
                 self._word = ENABLE_OPERATION | HALT
                 self._said.append("its quick stop is set to coast (605Ah = 0): the halt bit was used instead")
         self._keep_time()
+
+    def _leave_torque_mode(self) -> None:
+        """Speed mode at zero (60FFh, then 6060h), and a moment for 6061h to follow; nothing where it isn't needed.
+
+        A drive that doesn't follow gets the quick stop all the same: there is nothing better to be had over the bus.
+        """
+        profile = self._profile
+        if profile.quick_stop.decelerates_in_torque_mode or self._stays_in_torque_mode:
+            return
+        speed_modes = [code for code in profile.modes.speed if self._supports(code)]
+        if self._shown() not in profile.modes.torque or not speed_modes:
+            return
+        if decode(self._objects.read(0x6041)) is not State.OPERATION_ENABLED:
+            return
+        self._objects.write(0x60FF, 0, 0, 32)
+        self._objects.write(0x6060, 0, speed_modes[0], 8)
+        deadline_s = self._clock.now_s() + MODE_S
+        while self._shown() not in profile.modes.speed:
+            if self._clock.now_s() > deadline_s:
+                self._stays_in_torque_mode = True
+                self._said.append("it stays in torque mode, where its quick stop may not brake the shaft")
+                return
+            self._link.pump_until(lambda: False, MODE_PAUSE_S)
+        said = "it was in torque mode, where its quick stop may not brake: speed mode at zero came first"
+        if said not in self._said:
+            self._said.append(said)
+
+    def _shown(self) -> int:
+        return self._objects.read(0x6061, signed=True)
+
+    def _supports(self, code: int) -> bool:
+        supported = self._objects.read_if_there(0x6502)
+        return supported is None or code < 1 or bool(supported >> code - 1 & 1)
 
     def _keep_time(self) -> None:
         """A simulated drive whose time a host used to step goes on by itself, or it would never come to rest."""

@@ -109,11 +109,19 @@ def said(report: BareStopReport) -> list[str]:
             lines.append(f"{when}: {seen.text}, {seen.speed:.3g} {seen.unit}")
     lines += [f"! {remark}" for remark in report.remarks]
     verdict = {
-        Ended.AT_REST: "The shaft is at rest. The drive was not disabled: it may be holding it.",
+        Ended.AT_REST: f"The shaft is at rest. {_holds(report)}",
         Ended.TURNING: "The shaft was NOT seen at rest. Use the hard-wired emergency stop now.",
         Ended.NO_ANSWER: "NO ANSWER: whether the shaft turns is not known. Use the hard-wired emergency stop.",
     }[report.ended]
     return [*lines, verdict]
+
+
+def _holds(report: BareStopReport) -> str:
+    from drivers.drive import PowerState
+
+    if report.last is not None and report.last.state in (PowerState.OFF, PowerState.READY, PowerState.FAULT):
+        return "The drive's torque is off: nothing but a brake holds it."
+    return "The drive was not disabled: it may be holding it."
 
 
 def _document(report: BareStopReport, code: ExitCode) -> dict[str, object]:

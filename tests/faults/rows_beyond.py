@@ -43,6 +43,14 @@ SECOND_MASTER: dict[int, Row] = {
             (f"{SECOND}test_stray_writes_that_the_cycle_undoes_are_told",)),
     62: Row("a drive that doesn't take the quick stop", "the host falls silent; WD", "6, 8",
             (f"{SECOND}test_a_drive_that_does_not_take_the_quick_stop",)),
+    63: Row("`tdhil stop` in torque mode, where the drive's quick stop lets go", "speed mode at zero first", "0",
+            ("tests/drivers/test_bare_stop.py::test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns",),
+            "braked to rest, never off while it turned"),
+    64: Row("the drive's own limits are tighter than rig.yaml's", "they stay, or R; widened by name only", "0, 4",
+            ("tests/drivers/test_preflight.py::test_a_tighter_limit_of_the_drive_s_own_stays",
+             "tests/drivers/test_preflight.py::test_it_is_widened_by_name_and_no_other_with_it",
+             "tests/protocol/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
+            "kept, and the run keeps within them"),
 }
 
 MODBUS: dict[int, Row] = {
