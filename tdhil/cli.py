@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import logging
-import os
 import sys
 from collections.abc import Callable, Sequence
 
 from tdhil import __version__
+from tdhil.commands.streams import sheltered
 
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
@@ -26,29 +27,32 @@ _COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    namespace = argparse.Namespace()
+    with sheltered():
+        try:
+            code = _main(list(sys.argv[1:] if argv is None else argv), namespace)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
+            return 130
+        except BrokenPipeError:
+            return 141      # whoever read our output has gone
+        except Exception as error:
+            return _report(error, getattr(namespace, "json", None) is True)
+    return code
+
+
+def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
     # Libraries log what we report ourselves, with where and what next.
     for library in ("can", "canopen"):
         logging.getLogger(library).addHandler(logging.NullHandler())
         logging.getLogger(library).propagate = False
     parser = build_parser(_chosen(arguments))
-    namespace = parser.parse_args(arguments)
+    parser.parse_args(arguments, namespace)
     if namespace.command is None:
         parser.print_help(sys.stderr)
         return 2
-    try:
-        code = int(namespace.run(namespace))
-        sys.stdout.flush()
-    except KeyboardInterrupt:
-        print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
-        return 130
-    except BrokenPipeError:
-        # Whoever read our output has gone; nothing may be written at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
-    except Exception as error:
-        return _report(error, getattr(namespace, "json", None) is True)
-    return code
+    return int(namespace.run(namespace))
 
 
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
@@ -98,6 +102,10 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
     return add_arguments
 
 
+_THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOMEM, errno.EIO, errno.EROFS})
+"""Its state, not a mistake of ours: open files, disk, memory, a terminal that is gone."""
+
+
 def _report(error: Exception, as_json: bool) -> int:
     """One message for an error of the tree; a traceback only for what is a mistake of ours."""
     from tdhil.errors import ExitCode, TdhilError, exit_code
@@ -105,6 +113,8 @@ def _report(error: Exception, as_json: bool) -> int:
     code = exit_code(error)
     if isinstance(error, TdhilError):
         print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
+    elif isinstance(error, OSError) and error.errno in _THE_SYSTEM_S:
+        print(f"tdhil: the system refused: {error.strerror or error}", file=sys.stderr)  # noqa: T201
     else:
         import traceback
 

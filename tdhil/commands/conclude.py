@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.commands.after_looks import after_looks, working_confidence_of
-from tdhil.errors import ExitCode
+from tdhil.commands.streams import OutputLost
+from tdhil.errors import ExitCode, UsageError
 from tdhil.record.recording import Recording
 
 
@@ -29,7 +30,10 @@ def conclude(
 
     asked = run.get("identify", {})
     known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}
-    options = Options(**known)
+    try:
+        options = Options(**known)
+    except (TypeError, ValueError) as error:
+        raise UsageError(str(error), where=log, next_step="Say --model, --confidence or --tolerance anew") from error
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     said = (
@@ -60,13 +64,18 @@ def save_report(document: Mapping[str, Any], recording: Recording, path: Path | 
 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
-    """Stdout: one JSON document, or the card."""
-    if as_json:
-        json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-        sys.stdout.write("\n")
-        return
+    """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
     from rich.console import Console
 
     from tdhil.report.card import print_card
 
-    print_card(document, Console(highlight=False))
+    try:
+        if as_json:
+            json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+            sys.stdout.write("\n")
+        else:
+            print_card(document, Console(highlight=False))
+        sys.stdout.flush()
+    except (BrokenPipeError, OutputLost):
+        print_card(document, Console(file=sys.stderr, highlight=False))
+        raise

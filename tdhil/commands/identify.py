@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -142,6 +143,28 @@ def _check_files(namespace: argparse.Namespace, options: Resolved) -> None:
         check_trace_path(Path(trace), "--trace")
 
 
+def _load_the_end(report: bool) -> None:
+    """What stop, result and messages need, before anything moves: later there may be no descriptor left to read it."""
+    import traceback  # noqa: F401
+
+    import scipy.optimize
+    import scipy.signal
+    import scipy.special
+    import scipy.stats  # noqa: F401
+    from rich.console import Console
+
+    from tdhil.commands import conclude, stop_signals  # noqa: F401
+    from tdhil.identify import identify  # noqa: F401
+    from tdhil.identify.identification import Verdict  # noqa: F401
+    from tdhil.protocol import no_watchdog, runner, stop  # noqa: F401
+    from tdhil.report import card, document, html  # noqa: F401
+
+    with Console(file=io.StringIO()).status(""):
+        pass      # rich loads its spinners when it needs them
+    if report:
+        from tdhil.report import page, pictures  # noqa: F401
+
+
 def _run(
     namespace: argparse.Namespace,
     options: Resolved,
@@ -164,6 +187,7 @@ def _run(
     from tdhil.record.writer import RunWriter
     from tdhil.report.live import LiveDisplay
 
+    _load_the_end(namespace.report is not None)
     place = LogPlace(Path(options["log"]))
     writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open)
     writer.path = place.path
@@ -279,8 +303,10 @@ def _finish(
         document, code = conclude(log.recording(complete=True), log.run, path)
     with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
         log.result(document)
-    print_result(document, as_json)
-    save_report(document, log.recording(complete=True), report)
+    try:
+        print_result(document, as_json)
+    finally:
+        save_report(document, log.recording(complete=True), report)
     return int(code)
 
 

@@ -92,8 +92,10 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
     console = stderr_console()
     for problem in found.problems:
         console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
-    print_result(document, namespace.json)
-    save_report(document, found.recording, namespace.report)
+    try:
+        print_result(document, namespace.json)
+    finally:
+        save_report(document, found.recording, namespace.report)
     whole = found.recording.complete and aborted_stage(found.recording) is None
     return int(code if whole or code is not ExitCode.OK else ExitCode.PARTIAL)
 

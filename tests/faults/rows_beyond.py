@@ -106,6 +106,7 @@ STAGES: dict[int, Row] = {
              "tests/protocol/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
 }
 
+STREAMS = "tests/path/test_streams.py::"
 FILES = "tests/path/test_files_of_a_run.py::"
 COMMAND_LINE: dict[int, Row] = {
     95: Row("rig.yaml confirms in the operator's place (run: yes, accept_no_watchdog …)", "refused, with the line and "
@@ -136,6 +137,13 @@ COMMAND_LINE: dict[int, Row] = {
              (f"{FILES}test_no_file_of_somebody_else_is_touched",
               f"{FILES}test_a_replay_s_report_goes_over_nothing_either"),
              "named with the option; not even a log was begun"),
+    101: Row("stdout full, closed or ASCII only at the end of a run; no descriptor left",
+             "the run ends as it should, the card goes to stderr, the result is in the log",
+             "3 (full), else as the result",
+             (f"{STREAMS}test_a_full_device_at_the_end_of_a_run", f"{STREAMS}test_no_stdout_at_all",
+              f"{STREAMS}test_an_encoding_that_lacks_our_signs",
+              f"{STREAMS}test_nothing_is_loaded_once_the_shaft_may_move"),
+             "no module is loaded once the shaft may move"),
 }
 
 LOG: dict[int, Row] = {

@@ -1,0 +1,121 @@
+"""stdout and stderr as they are found: closed, full, or unable to write '²'. No run and no result is lost over them."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO, cast
+
+from tdhil.errors import ExitCode, TdhilError
+
+_PLAIN = {
+    "·": ".", "²": "2", "³": "3", "¹": "1", "⁻": "-", "±": "+-", "×": "x", "°": "deg", "µ": "u", "μ": "u", "–": "-",
+    "—": "-", "−": "-", "…": "...", "→": "->", "←": "<-", "↵": "", "≤": "<=", "≥": ">=", "≈": "~", "‰": "permille",
+    "ω": "w", "α": "a", "τ": "tau", "σ": "sigma", "Ω": "Ohm", "Δ": "d", "π": "pi", "✓": "ok", "✗": "X", "▸": ">",
+    "’": "'", "“": '"', "”": '"', "„": '"', "é": "e", "ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss",
+}
+_HANDLER = "tdhil"
+
+
+class OutputLost(TdhilError):
+    """stdout took no more: the disk behind it is full, or the terminal is gone. What was to be said went to stderr."""
+
+    exit_code = ExitCode.PARTIAL
+
+
+class Watched:
+    """A stream whose refusals are its own: of stdout an `OutputLost`, of stderr nothing, for there is no place left."""
+
+    def __init__(self, stream: TextIO, *, needed: bool) -> None:
+        self._stream = stream
+        self._needed = needed
+        self._lost = False
+
+    def write(self, text: str) -> int:
+        if not self._lost:
+            self._try(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        if not self._lost:
+            self._try(self._stream.flush)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except (OSError, ValueError) as error:
+            self._lost = True
+            gone = isinstance(error, BrokenPipeError)
+            forget(self._stream)
+            if self._needed and gone:
+                raise
+            if self._needed:
+                reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+                step = "Free some space, or write elsewhere"
+                raise OutputLost(f"can't be written: {reason}", where="stdout", next_step=step) from error
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def sheltered() -> Iterator[None]:
+    """Before anything is opened or printed.
+
+    A closed stdout or stderr would give its number to the next file that is opened, which might be the log. Where a
+    stream can't encode a sign, one that resembles it is written, in stdout and stderr alike.
+    """
+    _fill_descriptors()
+    codecs.register_error(_HANDLER, _resembling)
+    former = sys.stdout, sys.stderr
+    err = sys.stderr if sys.stderr is not None else io.StringIO()
+    for stream in (sys.stdout, err):
+        if hasattr(stream, "reconfigure"):
+            with suppress(OSError, ValueError):
+                stream.reconfigure(errors=_HANDLER)
+    sys.stderr = cast(TextIO, Watched(err, needed=False))
+    sys.stdout = cast(TextIO, Watched(sys.stdout, needed=True)) if sys.stdout is not None else sys.stderr
+    try:
+        yield
+    finally:
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = former
+
+
+def forget(stream: TextIO) -> None:
+    """Whatever still waits in ``stream``, or is written to it, goes nowhere."""
+    with suppress(OSError, ValueError, AttributeError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+    with suppress(OSError, ValueError):
+        stream.flush()
+
+
+def _fill_descriptors() -> None:
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            with suppress(OSError):
+                os.open(os.devnull, os.O_RDWR)      # the lowest free one: this
+
+
+def _resembling(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    text = error.object[error.start:error.end]
+    known = "".join(_PLAIN.get(sign, "?") for sign in text)
+    try:
+        known.encode(error.encoding)
+    except (UnicodeEncodeError, LookupError):
+        known = "?" * len(text)
+    return known, error.end

@@ -1,0 +1,160 @@
+"""stdout and stderr that are closed, full or speak ASCII only: the run ends as it should, and its result isn't lost."""
+
+from __future__ import annotations
+
+import errno
+import io
+import subprocess
+import sys
+
+import pytest
+from path_runs import QUICK, clean_environment
+
+from tdhil.cli import main
+from tdhil.commands.conclude import conclude
+from tdhil.errors import UsageError
+from tdhil.record.reader import read_run
+
+FULL = "/dev/full"
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """A whole run, whose stdout is full: (exit code, stderr, log). What is printed at its end a replay prints too."""
+    log, err = tmp_path_factory.mktemp("streams") / "run.mcap", io.StringIO()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        open(FULL, "w", encoding="utf-8") as stdout,  # noqa: PTH123
+    ):
+        patch.setattr(sys, "stdout", stdout)
+        patch.setattr(sys, "stderr", err)
+        code = main(["identify", "--simulate", *map(str, QUICK), "--seed", "4", "--periods", "3", "--log", str(log)])
+    return code, err.getvalue(), log
+
+
+@pytest.fixture(scope="module")
+def log(ended):
+    return ended[2]
+
+
+def run(monkeypatch, stdout, *arguments, stderr=None):
+    err = stderr or io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stdout)
+    monkeypatch.setattr(sys, "stderr", err)
+    code = main([str(argument) for argument in arguments])
+    return code, "" if stderr is not None else err.getvalue()
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252", "koi8-r"])
+@pytest.mark.parametrize("arguments", [(), ("--json",)])
+def test_an_encoding_that_lacks_our_signs(log, monkeypatch, encoding, arguments):
+    raw = io.BytesIO()
+    code, err = run(monkeypatch, io.TextIOWrapper(raw, encoding=encoding, errors="strict"), "replay", *arguments, log)
+    sys.stdout.flush()
+    text = raw.getvalue().decode(encoding)
+    assert code == 0, err
+    assert "Traceback" not in err
+    assert ("kg" in text) if not arguments else (text.count("{") == text.count("}") > 5)
+    if encoding == "ascii" and not arguments:
+        assert "kg.m2" in text
+
+
+def test_a_full_device(log, monkeypatch):
+    with open(FULL, "w", encoding="utf-8") as stdout:  # noqa: PTH123
+        code, err = run(monkeypatch, stdout, "replay", log)
+    assert code == 3
+    assert "stdout: can't be written: No space left on device" in err
+    assert "kg·m²" in err                  # the card
+    assert "Traceback" not in err
+
+
+def test_a_full_device_at_the_end_of_a_run(ended):
+    code, err, log = ended
+    assert code == 3, err
+    assert "stdout: can't be written: No space left on device" in err
+    assert "Traceback" not in err
+    assert "kg·m²" in err
+    kept = read_run(log)
+    assert kept.complete
+    assert kept.result is not None
+    assert kept.result["inertia_kg_m2"]["value"] > 0
+
+
+def test_any_command_into_a_full_device(monkeypatch):
+    with open(FULL, "w", encoding="utf-8") as stdout:  # noqa: PTH123
+        code, err = run(monkeypatch, stdout, "profiles")
+    assert code == 3
+    assert "stdout: can't be written" in err
+    assert "Traceback" not in err
+
+
+def test_no_stdout_at_all(log, monkeypatch):
+    code, err = run(monkeypatch, None, "replay", log)
+    assert code == 0
+    assert "kg·m²" in err
+
+
+def test_neither_stdout_nor_stderr(log, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert main(["replay", str(log)]) == 0
+
+
+@pytest.mark.parametrize("buffering", [1, -1])
+def test_a_dead_stderr_takes_no_cause_with_it(monkeypatch, tmp_path, buffering):
+    with open(FULL, "w", encoding="utf-8", buffering=buffering) as stderr:  # noqa: PTH123
+        assert run(monkeypatch, io.StringIO(), "replay", tmp_path / "none.mcap", stderr=stderr)[0] == 2
+
+
+def test_closed_descriptors_are_given_to_no_file():
+    script = "import os, sys; os.close(1); os.close(0)\n" \
+             "from tdhil.cli import main; main(['profiles', 'show', 'nothing'])\n" \
+             "sys.exit(0 if min(os.open('/dev/null', 0), 9) > 2 else 1)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60, env=clean_environment())
+    assert done.returncode == 0, done.stderr
+
+
+def test_ctrl_c_while_a_command_is_being_loaded(monkeypatch, capsys):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tdhil.cli._builder", interrupted)
+    assert main(["identify"]) == 130
+    assert capsys.readouterr().err == "tdhil: interrupted\n"
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOSPC, errno.EIO, errno.ENOMEM])
+def test_what_the_system_refuses_is_said_in_one_line(monkeypatch, capsys, number):
+    def refused(_):
+        raise OSError(number, "the system's word")
+
+    monkeypatch.setattr("tdhil.cli._builder", refused)
+    assert main(["identify"]) == 1
+    assert capsys.readouterr().err == "tdhil: the system refused: the system's word\n"
+
+
+def test_an_unknown_model_in_a_log():
+    with pytest.raises(UsageError, match=r"run\.mcap: model must be .*'magic'.*--model"):
+        conclude(None, {"identify": {"model": "magic"}}, "run.mcap")      # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fault", [(), ("--fault", "sto@hold+1s")])
+def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
+    """Later there may be no descriptor left to load it with, or no disk."""
+    script = f"""
+import sys
+from tdhil.commands import confirm
+before = set()
+whole = confirm.confirm_motion
+def noted(*args, **named):
+    whole(*args, **named)
+    before.update(sys.modules)
+confirm.confirm_motion = noted
+from tdhil.cli import main
+main({["identify", "--simulate", *map(str, QUICK), "--seed", "4", "--periods", "3", *fault]!r})
+assert before
+print(sorted(name for name in set(sys.modules) - before), file=sys.stderr)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, cwd=tmp_path,
+                          env=clean_environment())
+    assert done.stderr.splitlines()[-1] == "[]"
