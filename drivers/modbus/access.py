@@ -122,6 +122,11 @@ class Access:
         words = to_words(counts, register.type, self._order)
         self.once(self.write_request(register.address, words), timeout_s, register_name(register))
 
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Registers that stand otherwise than before."""
+        return tuple(f"register {address}" for _, address in self._undo)
+
     def restore(self) -> tuple[str, ...]:
         """Undo every change, the last one first; what could not be given back, a line each."""
         failed: list[str] = []

@@ -49,6 +49,7 @@ from drivers.modbus.standstill import Standstill
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
 from drivers.table import Table
 from drivers.ticks import Ticks
+from drivers.wider import SPEED, TORQUE, OwnLimits
 from profiles.modbus_schema import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
@@ -166,10 +167,11 @@ class ModbusDrive:
             limits.accept_no_watchdog,
         )
         watched, shared = True, False
+        own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
-            set_limits(table, access, profile, limits, rated_nm, found)
+            set_limits(table, access, profile, limits, rated_nm, found, own)
             self._angle = find_angle(table, access, profile)
             read_back = check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
             checks.check_modes(table, access, profile)
@@ -211,6 +213,8 @@ class ModbusDrive:
             filters=filters,
             torque_setpoint=register_name(target.register_) if target is not None else "none",
             quick_stop_holds=profile.quick_stop.ends == "quick_stop",
+            kept_torque_nm=own.kept.get(TORQUE),
+            kept_speed_rad_s=own.kept.get(SPEED),
             fed_by_any_client=shared,
         )
 
@@ -557,6 +561,11 @@ class ModbusDrive:
                 if self._modes:
                     clear_setpoints(Table(), self._access, self._profile, self._off_word())
                 left = self._access.restore()
+            else:
+                left = tuple(
+                    f"{where}: the drive is not known to be disabled, so what stood there before was not given back"
+                    for where in self._access.changed
+                )
         except CommunicationLost as error:
             left = (str(error),)
         finally:

@@ -1,5 +1,7 @@
 """Limits of rig.yaml written into the drive's own parameters (`set_to`), and read back.
 
+A limit that the drive has tighter stays so, unless the operator takes a wider one by name (`drivers.wider`).
+
 Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down. A ramp up is
 set as steep as the quick stop and no steeper, for it stays in the drive where a run dies; ramps down are left alone,
 since a drive's own stops rest on them.
@@ -12,12 +14,13 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from drivers.drive import Limits
-from drivers.errors import CommandRejected
+from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.parameters import Parameters, show, where_of
 from drivers.modbus.registers import to_counts
 from drivers.modbus.scales import RPM, per_count
 from drivers.table import Table
+from drivers.wider import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from profiles.modbus_schema import ModbusProfile, Parameter, Register
 
 _SLACK = 1e-9
@@ -31,21 +34,75 @@ class Setting(NamedTuple):
     per_count: float
 
 
+_LIMIT = {
+    "torque_limit": TORQUE, "torque_limit_reverse": TORQUE, "speed_limit": SPEED, "speed_limit_reverse": SPEED,
+    "quick_stop_time": QUICK_STOP, "quick_stop_deceleration": QUICK_STOP,
+}
+
+
 def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float,
-               found: Parameters) -> None:
-    """Every parameter with `set_to` but the watchdog, which comes last of all; a row each."""
+               found: Parameters, own: OwnLimits) -> None:
+    """Every parameter with `set_to` but the watchdog, which comes last of all; a row each. ``own``: which may be."""
     kinds = set()
     for parameter in profile.parameters:
         if parameter.set_to is None or parameter.set_to == "watchdog":
             continue
         kinds.add(parameter.set_to)
-        write_setting(table, access, parameter, limits, rated_nm, found.values)
+        if parameter.set_to in _LIMIT:
+            _write_limit(table, access, parameter, limits, rated_nm, found.values, own)
+        else:
+            write_setting(table, access, parameter, limits, rated_nm, found.values)
     for kind, title in (("speed_limit", "speed limit"), ("torque_limit", "torque limit")):
         if kind not in kinds:
             text = "the drive's own can't be set over the bus: set it by hand"
             if kind == "torque_limit":
                 text += "; only the guard and the setpoint hold it"
             table.note(title, text, "profile")
+
+
+def _write_limit(
+    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float],
+    own: OwnLimits,
+) -> None:
+    """One of the drive's own limits: left alone where it is the tighter one, unless that may be widened."""
+    register, where, limit = parameter.register_, where_of(parameter), _LIMIT[parameter.set_to or ""]
+    assert register is not None
+    try:
+        setting = wanted_setting(parameter, limits, rated_nm, values)
+        before = access.read(register)
+    except (CommandRejected, PreflightRefused) as error:
+        table.row(parameter.title, "set from rig.yaml", error.what, False, error.where or where, error.next_step)
+        return
+
+    def bound(counts: int) -> float:
+        """What the counts allow, in one unit; a time that a ramp takes is its deceleration, of 0 none at all."""
+        value = counts * setting.per_count
+        if parameter.set_to != "quick_stop_time":
+            return value
+        from_rpm = values.get(parameter.times or "", limits.speed_rad_s / RPM)
+        return abs(from_rpm) / value if value > 0.0 else math.inf
+
+    def shown(counts: int) -> str:
+        return show(counts * setting.per_count, parameter)
+
+    if own.stays(limit, bound(setting.counts), bound(before)):
+        si = bound(before) * {"rpm": RPM, "rpm_s": RPM, "rated": rated_nm, "s": RPM}.get(parameter.unit, 1.0)
+        own.keep(table, limit, parameter.title, shown(setting.counts), shown(before), si, where)
+        return
+    if not parameter.writable_in_operation:
+        write_setting(table, access, parameter, limits, rated_nm, values)
+        return
+    mend = parameter.advice or "The drive took the value but didn't keep it: is it locked, or its range narrower?"
+    try:
+        back = access.change(register, setting.counts)
+    except PreflightRefused as error:
+        step = parameter.advice or error.next_step
+        table.row(parameter.title, shown(setting.counts), error.what, False, error.where or where, step)
+        return
+    own.written(
+        table, limit, parameter.title, shown(setting.counts), shown(back), shown(before), back == setting.counts,
+        where, mend, wider=own.wider(limit, bound(setting.counts), bound(before)),
+    )
 
 
 def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Register, float, int]]:

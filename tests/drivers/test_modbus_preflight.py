@@ -1,5 +1,6 @@
 """Before motion: the marker, the whole table on a right drive, and every wrong of a register map, on a bank of ours."""
 
+import dataclasses
 import json
 
 import pytest
@@ -415,3 +416,75 @@ def test_a_ramp_up_is_as_steep_as_the_quick_stop_and_no_steeper(bank, generic):
     drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
     drive.close()
     assert bank.words[39] == 30
+
+
+# -- the drive's own limits ------------------------------------------------------------------------------------
+
+TIGHT = {36: 400, 37: 0x10000 - 400, 38: 100, 39: 500}
+"""40 rpm both ways, 80 N·m, 50 rpm/s: tighter than 15 rad/s, 300 N·m and 1 rad/s² everywhere."""
+OF_LIMIT = {"speed": {36, 37}, "torque": {38}, "quick-stop": {39}}
+
+
+class QuickClock(SteppedClock):
+    """Of a drive that is taken for a real one, without its waits."""
+
+    stepped = False
+
+
+def real(words, **limits):
+    """A drive without the simulator's marker; its preflight, and the bank."""
+    bank = Bank(marker=False)
+    bank.words |= words
+    drive = drive_on(bank, load_modbus_profile("generic/modbus"), clock=QuickClock())
+    drive.connect()
+    return drive.preflight(dataclasses.replace(LIMITS, **limits)), bank, drive
+
+
+def test_limits_that_are_tighter_stay_and_the_run_keeps_within_them():
+    found, bank, _ = real(TIGHT)
+    assert not found.refused
+    assert {at: bank.words[at] for at in TIGHT} == TIGHT
+    assert found.kept_torque_nm == pytest.approx(80.0)
+    assert found.kept_speed_rad_s == pytest.approx(40.0 * 0.10471975512)
+    rows = [check for check in found.checks if "kept: tighter than rig.yaml's" in check.found]
+    assert len(rows) == 4 and all("--accept-wider-limit" in row.next_step for row in rows)
+
+
+@pytest.mark.parametrize("limit", sorted(OF_LIMIT))
+def test_a_limit_is_widened_by_name_no_other_with_it_and_given_back(limit):
+    found, bank, drive = real(TIGHT, accept_wider=frozenset({limit}))
+    assert {at for at in TIGHT if bank.words[at] != TIGHT[at]} == OF_LIMIT[limit]
+    rows = [check for check in found.checks if f"wider, accepted by --accept-wider-limit {limit}" in check.found]
+    assert len(rows) == len(OF_LIMIT[limit]) and all("was " in row.found for row in rows)
+    drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    assert drive.close() == ()
+    assert {at: bank.words[at] for at in TIGHT} == TIGHT
+
+
+def test_wider_limits_are_tightened_unasked_and_both_values_are_told():
+    found, bank, _ = real({39: 1})
+    rows = {check.name: check for check in found.checks}
+    assert rows["highest torque"].found == "0.375 of rated torque (was 2 of rated torque)"
+    assert rows["deceleration of a quick stop"].found == "9.6 rpm/s (was 0.1 rpm/s)"
+    assert found.kept_torque_nm is None and bank.words[38] == 375
+
+
+def test_a_quick_stop_told_as_a_time_is_wider_where_it_is_longer():
+    for counts, kept in ((100, True), (60000, False)):
+        profile = changed(load_modbus_profile("generic/modbus"), quick_stop_deceleration={
+            "set_to": "quick_stop_time", "unit": "s", "per_lsb": 0.001})
+        bank = Bank(marker=False)
+        bank.words[39] = counts
+        drive = drive_on(bank, profile, clock=QuickClock())
+        drive.connect()
+        assert not drive.preflight(LIMITS).refused
+        assert (bank.words[39] == counts) is kept, bank.words[39]
+
+
+def test_a_simulated_drive_has_nobodys_settings():
+    bank = Bank()
+    bank.words |= TIGHT
+    drive = drive_on(bank, load_modbus_profile("generic/modbus"))
+    drive.connect()
+    assert not drive.preflight(LIMITS).refused
+    assert bank.words[38] == 375
