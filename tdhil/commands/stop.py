@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, UsageError, exit_code
 
 if TYPE_CHECKING:
     from drivers.bare_stop import BareStopReport, Target
@@ -21,6 +21,8 @@ NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
     "Keep the hard-wired one within reach."
 )
+
+NOT_CONFIRMED = "STOP NOT CONFIRMED: use the hard-wired emergency stop now."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """0 at rest, 8 still turning, 5 no answer. Ctrl-C ends the watching only: what was asked for stays asked for."""
+    """0 at rest, 8 wherever that wasn't seen: still turning, no answer, no way to the drive.
+
+    Ctrl-C ends the watching only: what was asked for stays asked for.
+    """
     from drivers.bare_stop import bare_stop
     from drivers.clock import MonotonicClock
     from tdhil.commands.connection import connection_of
@@ -51,14 +56,34 @@ def run(namespace: argparse.Namespace) -> int:
         )
     print(NO_EMERGENCY_STOP, file=sys.stderr)  # noqa: T201
     clock = MonotonicClock()
-    with _open_target(options, connection, clock) as target:
-        report = bare_stop(target, clock)
+    try:
+        with _open_target(options, connection, clock) as target:
+            report = bare_stop(target, clock)
+    except Exception as error:         # no way to the drive, or none any more; an adapter's driver raises what it likes
+        if exit_code(error) is ExitCode.USAGE:
+            raise
+        return _not_reached(error, as_json=namespace.json is True)
+    except KeyboardInterrupt:
+        print(NOT_CONFIRMED, file=sys.stderr)  # noqa: T201
+        raise
     code = _exit_code(report)
     if namespace.json is True:
         print(json.dumps(_document(report, code), ensure_ascii=False, indent=2))  # noqa: T201
     else:
         for line in said(report):
             print(line)  # noqa: T201
+    return int(code)
+
+
+def _not_reached(error: Exception, *, as_json: bool) -> int:
+    """Whoever asks for a stop must not read a mere connection error."""
+    code = ExitCode.STOP_NOT_CONFIRMED
+    if as_json:
+        document = {"ended": "not reached", "error": str(error), "remarks": [], "said": NOT_CONFIRMED,
+                    "emergency_stop": False, "exit_code": int(code)}
+        print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
+    print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
+    print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
     return int(code)
 
 
@@ -95,7 +120,7 @@ def _exit_code(report: BareStopReport) -> ExitCode:
     return {
         Ended.AT_REST: ExitCode.OK,
         Ended.TURNING: ExitCode.STOP_NOT_CONFIRMED,
-        Ended.NO_ANSWER: ExitCode.COMMUNICATION,
+        Ended.NO_ANSWER: ExitCode.STOP_NOT_CONFIRMED,
     }[report.ended]
 
 
@@ -110,8 +135,8 @@ def said(report: BareStopReport) -> list[str]:
     lines += [f"! {remark}" for remark in report.remarks]
     verdict = {
         Ended.AT_REST: f"The shaft is at rest. {_holds(report)}",
-        Ended.TURNING: "The shaft was NOT seen at rest. Use the hard-wired emergency stop now.",
-        Ended.NO_ANSWER: "NO ANSWER: whether the shaft turns is not known. Use the hard-wired emergency stop.",
+        Ended.TURNING: f"The shaft was NOT seen at rest. {NOT_CONFIRMED}",
+        Ended.NO_ANSWER: f"NO ANSWER: whether the shaft turns is not known. {NOT_CONFIRMED}",
     }[report.ended]
     return [*lines, verdict]
 
@@ -136,6 +161,7 @@ def _document(report: BareStopReport, code: ExitCode) -> dict[str, object]:
         "took_s": report.took_s,
         "asked": report.asked,
         "remarks": list(report.remarks),
+        "said": "" if code is ExitCode.OK else NOT_CONFIRMED,
         "emergency_stop": False,
         "exit_code": int(code),
     }

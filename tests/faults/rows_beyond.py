@@ -70,6 +70,26 @@ MODBUS: dict[int, Row] = {
         "read back during the run: QS, naming register, old and new value", "5",
         (HERE + "test_modbus_second_master.py",),
     ),
+    73: Row(
+        "the drive's own torque or speed limit, or quick stop, is tighter than rig.yaml's (Modbus)",
+        "it stays and the run keeps within it; made wider by name only, old and new value told, given back", "",
+        ("tests/drivers/test_modbus_preflight.py::test_limits_that_are_tighter_stay_and_the_run_keeps_within_them",
+         "tests/drivers/test_modbus_preflight.py::test_a_limit_is_widened_by_name_no_other_with_it_and_given_back"),
+        "kept as found; `--accept-wider-limit torque`: 0.375 of rated torque (was 0.1 …: wider, accepted by …)",
+    ),
+    74: Row(
+        "`tdhil stop` in torque mode where a quick stop doesn't decelerate, and where the drive's watchdog coasts",
+        "speed mode at zero first, the stop word again while the shaft turns: braked to rest, never let go", "0",
+        ("tests/drivers/test_modbus_bare_stop.py::test_it_brakes_to_rest_and_never_lets_go",),
+        "every shipped Modbus profile, in each of its modes",
+    ),
+    75: Row(
+        "`tdhil stop` against a dead host, a closed port, a dead hub, a device that isn't there",
+        "8 and: STOP NOT CONFIRMED: use the hard-wired emergency stop now", "8",
+        ("tests/path/test_stop_command.py::test_where_nobody_is_reached",
+         "tests/path/test_stop_command.py::test_a_hub_that_dies_while_it_stops"),
+        "the sentence on stdout, in the JSON document too",
+    ),
 }
 
 UNITS: dict[int, Row] = {

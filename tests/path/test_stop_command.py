@@ -1,6 +1,7 @@
 """`tdhil stop`: against drives in a process of their own, turned by somebody else, dead, or gone mad."""
 
 import signal
+import socket
 import sys
 
 import can
@@ -8,6 +9,7 @@ import pytest
 from path_runs import QUICK, host, peer, process, tdhil, wait_for
 
 NODE = 1
+SENTENCE = "STOP NOT CONFIRMED: use the hard-wired emergency stop now"
 REAL_TIME = ("--seed", 1)
 
 
@@ -149,9 +151,50 @@ def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
 def test_nobody_answers(tmp_path):
     with peer(tmp_path, *REAL_TIME) as drive:
         done = tdhil("stop", *drive.options, "--node", 5)
-    assert done.code == 5
+    assert done.code == 8
     assert "NO ANSWER" in done.out
-    assert "hard-wired emergency stop" in done.out
+    assert SENTENCE in done.out
+
+
+def closed_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+MODBUS_TCP = ("--host", "127.0.0.1", "--port")
+HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
+
+
+@pytest.mark.parametrize("dead", ["closed Modbus port", "silent Modbus host", "closed hub", "hub that says nothing",
+                                  "no serial device"])
+@pytest.mark.parametrize("as_json", [(), ("--json",)], ids=["text", "json"])
+def test_where_nobody_is_reached(dead, as_json, no_bus_of_the_user):
+    """Whatever stands between here and the drive: 8 and the sentence, never a mere connection error."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        mute = listening.getsockname()[1]
+        line = {
+            "closed Modbus port": (*MODBUS_TCP, closed_port()), "silent Modbus host": (*MODBUS_TCP, mute),
+            "closed hub": (*HUB, f"port={closed_port()}"), "hub that says nothing": (*HUB, f"port={mute}"),
+            "no serial device": ("--serial", "/dev/there-is-none"),
+        }[dead]
+        done = tdhil("stop", *line, *as_json)
+    assert done.code == 8, done.err + done.out
+    assert SENTENCE in done.out
+    assert "Traceback" not in done.err
+    if as_json:
+        assert done.document["exit_code"] == 8 and SENTENCE in done.document["said"]
+
+
+def test_a_hub_that_dies_while_it_stops(turning):
+    drive, master = turning
+    master.turn()
+    master.objects.write(0x6085, 0, 120, 32)
+    with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stdout=-1, stderr=-1) as child:
+        assert wait_for("stop", lambda: master.state() == 0x07)
+        drive.child.kill()
+        out, err = child.communicate(timeout=60)
+    assert child.returncode == 8, err
+    assert SENTENCE in out + err and "Traceback" not in err
 
 
 def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
@@ -164,7 +207,7 @@ def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
     monkeypatch.setattr(bare_stop, "SLOWER", 0.5)
     done = stop(drive)
     assert done.code == 8
-    assert "NOT seen at rest" in done.out
+    assert "NOT seen at rest" in done.out and SENTENCE in done.out
     assert drive.shaft.state[-1] == "quick stop active"
 
 
