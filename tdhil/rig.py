@@ -211,6 +211,7 @@ class Rig(DataModel):
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
+    name: str | None = Field(default=None, min_length=1, max_length=200, description="of the rig, for reports and logs")
     drive: Literal["canopen", "modbus"] | None = None
     bus: Bus = Bus()
     node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
@@ -275,6 +276,11 @@ class Rig(DataModel):
         for part in dotted.split("."):
             value = getattr(value, "json_" if part == "json" else part)
         return value
+
+    @property
+    def file(self) -> str:
+        """The file that it was read from; '' for none."""
+        return self._file
 
     @property
     def folder(self) -> Path:

@@ -11,7 +11,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -70,7 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
     result.add_argument("--model", choices=MODELS, help="of the shaft (default auto: the simplest that fits)")
     result.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
-    result.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
+    result.add_argument("--report", type=Path, metavar="FILE",
+                        help="the result with pictures in one file: report.html, or report.pdf on A4")
+    result.add_argument("--operator", metavar="NAME", help="who ran it, for log and report")
+    result.add_argument("--note", metavar="TEXT", help="whatever else log and report shall say of this run")
     result.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     simulated = parser.add_argument_group("simulated rig")
     simulated.add_argument("--simulate", action="store_const", const=True,
@@ -173,6 +176,7 @@ def _run(
     rig: Rig | None,
     console: Console,
 ) -> int:
+    from tdhil.commands.conclude import print_result, save_report
     from tdhil.commands.confirm import confirm_motion, confirm_speed
     from tdhil.commands.log_file import LogPlace
     from tdhil.commands.peer import open_drive
@@ -209,7 +213,8 @@ def _run(
         )
         place.motion = True
 
-    log = RunLog(writer, configuration(options, connection, peer, rig))
+    said = {"operator": namespace.operator, "note": namespace.note}
+    log = RunLog(writer, configuration(options, connection, peer, rig) | said)
     data = rig.drive_data if rig is not None else None
     trace = None if options["trace"] is None else Path(options["trace"])
     say = partial(console.print, style="dim", markup=False, highlight=False)
@@ -241,22 +246,26 @@ def _run(
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
             console.print(f"tdhil: --fault {fault} never came: this run did not reach its moment", style="yellow",
                           markup=False, soft_wrap=True)
-        code = _finish(
-            outcome, log, str(place.name(stub=stub())), bool(options["json"]), console, namespace.report
-        )
+        code, document = _finish(outcome, log, str(place.name(stub=stub())), bool(options["json"]), console)
     except BaseException:
         with suppress(LogError):  # the first cause stays the cause
             log.close()
         place.settle(stub=stub())
         raise
     try:
-        log.close()
-    except LogError as error:
-        # Stdout has its one document already; and where the log was what ended the run, all is said.
-        if not isinstance(outcome.cause, LogError):
-            console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
-        code = code or int(exit_code(error))
-    place.settle(stub=stub())
+        if document is not None:
+            print_result(document, bool(options["json"]))
+    finally:            # whoever should have read stdout may be gone: log and report are finished all the same
+        try:
+            log.close()
+        except LogError as error:
+            # Stdout has its one document already; and where the log was what ended the run, all is said.
+            if not isinstance(outcome.cause, LogError):
+                console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
+            code = code or int(exit_code(error))
+        place.settle(stub=stub())
+        if document is not None:
+            save_report(document, log.recording(complete=True), namespace.report)      # it names the log's SHA-256
     return code
 
 
@@ -291,23 +300,19 @@ def _task(
 
 
 def _finish(
-    outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console, report: Path | None = None
-) -> int:
-    """Identify and print, or say what ended the run."""
-    from tdhil.commands.conclude import conclude, print_result, save_report
+    outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console
+) -> tuple[int, dict[str, Any] | None]:
+    """Identify, or say what ended the run; the exit code, and the result, still to be printed, if there is one."""
+    from tdhil.commands.conclude import conclude
     from tdhil.record.errors import LogError
 
     if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
-        return _failed(outcome, path, as_json, console)
+        return _failed(outcome, path, as_json, console), None
     with console.status("identifying …") if console.is_terminal else nullcontext():
         document, code = conclude(log.recording(complete=True), log.run, path)
     with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
         log.result(document)
-    try:
-        print_result(document, as_json)
-    finally:
-        save_report(document, log.recording(complete=True), report)
-    return int(code)
+    return int(code), document
 
 
 def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> int:

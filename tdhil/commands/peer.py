@@ -30,8 +30,8 @@ class PeerPlan:
 
     @property
     def epoch_ns(self) -> int:
-        """Wall clock at control time zero for the log's time stamps; stepped runs start at 0, so that they repeat."""
-        return 0 if self.stepped else time.time_ns()
+        """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
+        return time.time_ns()
 
 
 def plan_peer(options: Resolved, connection: Connection) -> PeerPlan:

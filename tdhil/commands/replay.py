@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
-    parser.add_argument("--report", type=Path, metavar="report.html", help="the result with pictures, as one HTML file")
+    parser.add_argument("--report", type=Path, metavar="FILE",
+                        help="the result with pictures in one file: report.html, or report.pdf on A4")
+    parser.add_argument("--operator", metavar="NAME", help="who ran it, for the report (default: as the log says)")
+    parser.add_argument("--note", metavar="TEXT", help="what else the report shall say (default: as the log says)")
     parser.add_argument("--model", choices=MODELS, help="of the shaft (default: the run's, or auto)")
     parser.add_argument("--confidence", type=share, metavar="P", help="of the interval (default: the run's, or 0.95)")
     parser.add_argument("--tolerance", type=share, metavar="SHARE",
@@ -85,6 +89,10 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
     ended = find_ended(found.configuration, found.events)
     _refuse_empty(found, ended, path)
     configuration: dict[str, Any] = found.configuration | ({} if ended is None else {"ended": asdict(ended)})
+    configuration |= _said(namespace)
+    if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
+        began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
+        configuration["started"] = began.isoformat(timespec="seconds")
     asked = _asked(namespace)
     if asked:
         configuration = configuration | {"identify": {**configuration.get("identify", {}), **asked}}
@@ -135,7 +143,7 @@ def _run_trace(namespace: argparse.Namespace, path: Path) -> int:
     if scale is None:
         warnings = (*warnings, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
     asked = {"tolerance": 0.05, "confidence": 0.95} | _asked(namespace)
-    document, code = conclude(recording, {"identify": asked}, str(path), warnings)
+    document, code = conclude(recording, {"identify": asked} | _said(namespace), str(path), warnings)
     print_result(document, namespace.json)
     save_report(document, recording, namespace.report)
     return int(code)
@@ -171,6 +179,10 @@ def _is_log(path: Path) -> bool:
     except OSError as error:
         raise NothingRecoverable(f"can't be read ({error.strerror or error})", where=str(path)) from error
     return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
+
+
+def _said(namespace: argparse.Namespace) -> dict[str, str]:
+    return {name: getattr(namespace, name) for name in ("operator", "note") if getattr(namespace, name) is not None}
 
 
 def _asked(namespace: argparse.Namespace) -> dict[str, float | str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from tdhil import __version__
@@ -22,6 +23,8 @@ def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig
     """
     return {
         "tdhil": __version__,
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "rig_file": None if rig is None or not rig.file else rig.file,
         "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
         "drive": connection.drive,
         "bus": {name: {"value": value, "source": source} for name, value, source in connection.rows()},

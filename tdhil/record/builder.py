@@ -34,6 +34,11 @@ class RecordingBuilder:
     def __len__(self) -> int:
         return len(self._flags)
 
+    @property
+    def first_time_s(self) -> float:
+        """Control time of the first sample; there must be one."""
+        return self._values[0]
+
     def add(self, sample: Sample) -> None:
         """One cycle's feedback."""
         self.add_values(sample[0], sample[4], sample[5], fresh=sample[3], limited=sample[10])

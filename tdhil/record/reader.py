@@ -21,6 +21,7 @@ from tdhil.record.plain import structure
 from tdhil.record.recording import Excitation, Level, Ramp, Recording, Stage
 
 SAMPLES: Final = 8_000_000             # 25 bytes each; two hours at 1 kHz
+_CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
 RARE: Final = 20_000                   # stages, events, problems
 RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
 
@@ -29,7 +30,8 @@ RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and
 class Run:
     """A run as the log has it. ``complete`` is False where the file wasn't closed or some of it is lost.
 
-    ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none.
+    ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none. ``epoch_ns`` is the
+    wall clock at control time zero, 0 where the log doesn't tell.
     """
 
     recording: Recording
@@ -39,6 +41,7 @@ class Run:
     stages: tuple[Stage, ...]
     complete: bool
     problems: tuple[str, ...]
+    epoch_ns: int = 0
 
 
 def read_run(path: Path, *, salvage: bool = False) -> Run:
@@ -86,6 +89,7 @@ class _Reading:
         self._budget = RARE_BYTES
         self._whole = False
         self._lost = False
+        self._epoch_ns: int | None = None
         self._take: dict[int, Callable[[Any], None]] = {
             channels.SAMPLE: self._sample,
             channels.STAGE: self._stage,
@@ -97,6 +101,8 @@ class _Reading:
         for found in messages(path, salvage=salvage):
             if isinstance(found, Ours):
                 self._message(found.number, found.payload)
+                if self._epoch_ns is None and len(self._builder):
+                    self._epoch_ns = self._epoch_of(found.log_time_ns)
             elif isinstance(found, Damage):
                 self._problem(str(found))
             else:
@@ -115,7 +121,14 @@ class _Reading:
             stages=tuple(self._stages),
             complete=complete,
             problems=tuple(self._problems),
+            epoch_ns=self._epoch_ns or 0,
         )
+
+    def _epoch_of(self, log_time_ns: int) -> int:
+        """From the first sample; what lies before this century is the zero of a stepped log."""
+        time_s = self._builder.first_time_s
+        epoch_ns = log_time_ns - round(time_s * 1e9) if abs(time_s) < 1e9 else 0
+        return epoch_ns if epoch_ns > _CENTURY_NS else 0
 
     def _message(self, number: int, payload: bytes) -> None:
         try:

@@ -31,7 +31,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
 class RunWriter:
-    """One run.mcap. ``epoch_ns`` is the wall clock at control time zero, 0 for stepped runs so that files repeat.
+    """One run.mcap. ``epoch_ns`` is the wall clock at control time zero.
 
     ``queue_size`` counts records; None takes the default of stepped or real time.
     ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in

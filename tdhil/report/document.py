@@ -48,7 +48,8 @@ def result_document(
         "warnings": list(found.warnings),
         "simulated": recording.simulated,
         "complete": recording.complete,
-        "ended": run.get("ended"),
+        "ended": _mapping(run.get("ended")),
+        **_provenance(run),
         "log": log,
         "cycles": run.get("counters"),
         "cycle": run.get("cycle"),
@@ -64,6 +65,55 @@ def result_document(
     cleaned = _finite(document)
     assert isinstance(cleaned, dict)
     return cleaned
+
+
+def _provenance(run: Mapping[str, Any]) -> dict[str, Any]:
+    """When, where, by whom and on which drive; None for what the log doesn't say. A log may say anything."""
+    bench, drive, profile = (_mapping(run.get(name)) or {} for name in ("bench", "identity", "profile"))
+    limits = _mapping(bench.get("limits")) or {}
+    numbers = ("vendor", "product", "revision", "serial")
+    identity = {"name": text_of(drive.get("name"))} | {name: _count(drive.get(name)) for name in numbers}
+    rig = {
+        "name": text_of(bench.get("name")),
+        "file": text_of(run.get("rig_file")),
+        "load": text_of(bench.get("load")),
+        "limits": {str(name): value for name, value in limits.items() if isinstance(value, int | float)},
+    }
+    return {
+        "date": text_of(run.get("started")),
+        "operator": text_of(run.get("operator")),
+        "note": text_of(run.get("note")),
+        "rig": rig if bench else None,
+        "drive": identity if drive else None,
+        "profile": {name: text_of(profile.get(name)) or "" for name in ("name", "title")} if profile else None,
+        "connection": _connection(run),
+        "recorded_by": text_of(run.get("tdhil")),
+    }
+
+
+def _connection(run: Mapping[str, Any]) -> str | None:
+    """``canopen, interface socketcan, channel can0``: what says where the drive was reached."""
+    found = [text for text in (text_of(run.get("drive")),) if text]
+    for name, row in (_mapping(run.get("bus")) or {}).items():
+        value = row.get("value") if isinstance(row, Mapping) else None
+        if value not in (None, "", "-", [], {}):
+            found.append(f"{name} {text_of(str(value))}")
+    return "embedded simulator" if run.get("embedded_simulator") is True else ", ".join(found) or None
+
+
+def text_of(value: object) -> str | None:
+    """A text of a log or a drive as it may be shown: one line that can be printed."""
+    if not isinstance(value, str) or not value.strip():
+        return None
+    return " ".join("".join(sign if sign.isprintable() else " " for sign in value).split())[:500]
+
+
+def _mapping(value: object) -> dict[str, Any] | None:
+    return {str(name): part for name, part in value.items()} if isinstance(value, Mapping) else None
+
+
+def _count(value: object) -> int:
+    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else 0
 
 
 def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:

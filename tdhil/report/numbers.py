@@ -8,17 +8,34 @@ def with_interval(value: float, low: float, high: float, unit: str) -> str:
     half = 0.5 * (high - low)
     if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
         return f"{value:.5g} {unit}"
-    decimals = max(0, 1 - math.floor(math.log10(half)))
-    shown = (f"{round(number, decimals) + 0.0:.{decimals}f}" for number in (value, low, high))     # no minus zero
+    shown = (_digits(number, half) for number in (value, low, high))
     return "{} ({} to {}) ".format(*shown) + unit
+
+
+def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
+    """The three as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
+    ends = [number for number in (low, high) if number is not None]
+    half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
+
+    def shown(number: float | None) -> str:
+        if number is None:
+            return "open"
+        return _digits(number, half) if half > 0.0 and math.isfinite(half) else f"{number:.4g}"
+
+    return shown(value), shown(low), shown(high)
 
 
 def plus_minus(value: float, half_width: float) -> str:
     """``83.9 ± 3.0``, decimals as in `with_interval`."""
     if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
         return f"{value:.4g}"
-    decimals = max(0, 1 - math.floor(math.log10(half_width)))
-    return f"{value:.{decimals}f} ± {half_width:.{decimals}f}"
+    return f"{_digits(value, half_width)} ± {_digits(half_width, half_width)}"
+
+
+def _digits(number: float, half_width: float) -> str:
+    """To the second significant digit of the half-width, tens and hundreds included."""
+    decimals = 1 - math.floor(math.log10(half_width))
+    return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # no minus zero
 
 
 def percent(half_width: float, value: float) -> str:

@@ -10,14 +10,14 @@ from tdhil.record.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import FigureBase
 
 _COLUMNS = 1200           # as many as a screen can show: each is a line from the least to the greatest value in it
 _SHADES = ("#f2f2f2", "#ffffff")
 _SEGMENT = "#1f5fa8"
 
 
-def draw_run(figure: Figure, recording: Recording) -> None:
+def draw_run(figure: FigureBase, recording: Recording) -> None:
     """Nothing is smoothed: every column spans all that was reported in its time."""
     speed_axes, torque_axes = figure.subplots(2, 1, sharex=True)
     for axes, signal, label in (
@@ -43,9 +43,8 @@ def draw_run(figure: Figure, recording: Recording) -> None:
                 # short stages stand side by side: their names go up and down in turn
                 height = 1.02 if stage.end_s - stage.start_s > 0.1 * length or number % 2 == 0 else 1.10
                 speed_axes.text(middle, height, stage.name, transform=speed_axes.get_xaxis_transform(), ha="center",
-                                va="bottom", fontsize=8)
+                                va="bottom", fontsize="small")
     torque_axes.set_xlabel("time, s")
-    figure.tight_layout()
 
 
 def _shade(axes: Axes, recording: Recording) -> None:

@@ -7,13 +7,13 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.figure import FigureBase
 
 OURS, PAPER, DARK, QUIET = "#1f5fa8", "#c2410c", "0.15", "0.55"
 Part = Mapping[str, Any]
 
 
-def draw_lines(figure: Figure, document: Part) -> None:
+def draw_lines(figure: FigureBase, document: Part) -> None:
     """Above: what every line shows by itself, the model through it, and J. Below: what the model leaves."""
     points = document["lines"]
     hertz = [point["hertz"] for point in points]
@@ -29,16 +29,15 @@ def draw_lines(figure: Figure, document: Part) -> None:
     if paper is not None and paper["inertia_kg_m2"] is not None:
         top.axhline(paper["inertia_kg_m2"], color=PAPER, lw=1.2, ls="--", label="the paper's slope")
     top.set_ylabel("Im(T/ω) / 2πf, kg·m²")
-    top.legend(fontsize=9, loc="best")
+    top.legend(fontsize="small", loc="best")
     below.bar(hertz, [point["residual_sd"] for point in points], width=_width(hertz), color=QUIET)
     below.axhline(1.0, color=DARK, lw=0.8, ls=":")
     below.set(xlabel="frequency, Hz", ylabel="residual,\nst. dev.")
     for axes in (top, below):
         axes.grid(alpha=0.3)
-    figure.tight_layout()
 
 
-def draw_budget(figure: Figure, document: Part) -> None:
+def draw_budget(figure: FigureBase, document: Part) -> None:
     """One bar for each source, largest on top."""
     lines = sorted((line for line in document["budget"] if line["half_width_kg_m2"] is not None),
                    key=lambda line: float(line["half_width_kg_m2"]))
@@ -46,14 +45,13 @@ def draw_budget(figure: Figure, document: Part) -> None:
     halves = [line["half_width_kg_m2"] for line in lines]
     colours = [QUIET if line["source"] == "torque scale" else OURS for line in lines]
     bars = axes.barh([line["source"] for line in lines], halves, color=colours)
-    axes.bar_label(bars, [f"{half:.2g}" for half in halves], padding=4, fontsize=9)
+    axes.bar_label(bars, [f"{half:.2g}" for half in halves], padding=4, fontsize="small")
     axes.margins(x=0.12)
     axes.set_xlabel("half-width that it alone leaves, kg·m²")
     axes.grid(axis="x", alpha=0.3)
-    figure.tight_layout()
 
 
-def draw_friction(figure: Figure, document: Part) -> None:
+def draw_friction(figure: FigureBase, document: Part) -> None:
     """The points, and the straight line of T_c and B through them."""
     points = document["friction_curve"]
     speeds = [point["speed_rad_s"] for point in points]
@@ -68,12 +66,11 @@ def draw_friction(figure: Figure, document: Part) -> None:
         axes.plot(ends, [sign * coulomb["value"] + viscous["value"] * end for end in ends], color=OURS, lw=1.4,
                   label="T$_c$ + B ω of the result")
     axes.set(xlabel="speed, rad/s", ylabel="friction torque, N·m")
-    axes.legend(fontsize=9)
+    axes.legend(fontsize="small")
     axes.grid(alpha=0.3)
-    figure.tight_layout()
 
 
-def draw_opinions(figure: Figure, document: Part) -> None:
+def draw_opinions(figure: FigureBase, document: Part) -> None:
     """Every inertia that this run speaks of, on one axis."""
     rows: list[tuple[str, Part, str]] = []
     inertia, paper = document["inertia_kg_m2"], document["paper"]
@@ -98,7 +95,6 @@ def draw_opinions(figure: Figure, document: Part) -> None:
     axes.margins(y=0.15)
     axes.set_xlabel("kg·m² at the motor shaft")
     axes.grid(axis="x", alpha=0.3)
-    figure.tight_layout()
 
 
 def _bars(estimates: Sequence[Part]) -> list[list[float]]:

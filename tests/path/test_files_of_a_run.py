@@ -151,16 +151,14 @@ def test_a_replay_s_report_goes_over_nothing_either(bench, monkeypatch):
     assert "rig-2.yaml" in done.err
 
 
-def test_a_report_that_comes_there_during_the_run_is_not_overwritten(tmp_path):
+def test_a_report_that_comes_there_during_the_run_is_not_overwritten(tmp_path, monkeypatch):
     from tdhil.report import html
 
-    html_page, html.report_page = html.report_page, lambda *_: "page"
-    try:
-        (tmp_path / "r.html").write_text("mine")
-        (tmp_path / "r-2.html").write_text("mine too")
-        assert html.write_report({}, None, tmp_path / "r.html") == tmp_path / "r-3.html"      # type: ignore[arg-type]
-    finally:
-        html.report_page = html_page
+    monkeypatch.setattr(html, "report_of", lambda *_: None)
+    monkeypatch.setattr(html, "report_page", lambda *_: "page")
+    (tmp_path / "r.html").write_text("mine")
+    (tmp_path / "r-2.html").write_text("mine too")
+    assert html.write_report({"log": "run.mcap"}, None, tmp_path / "r.html") == tmp_path / "r-3.html"
     assert [(tmp_path / f"r{n}.html").read_text() for n in ("", "-2", "-3")] == ["mine", "mine too", "page"]
 
 

@@ -1,5 +1,8 @@
 """`--report`: one page, the same from a run and from its replay, and never in the way of either."""
 
+from datetime import datetime
+from hashlib import sha256
+
 import pytest
 from path_runs import QUICK, identify, tdhil
 
@@ -10,7 +13,8 @@ pytest.importorskip("jinja2")
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    done = identify(folder, "--simulate", *QUICK, "--seed", 4, "--periods", 4, "--report", folder / "live.html")
+    done = identify(folder, "--simulate", *QUICK, "--seed", 4, "--periods", 4, "--report", folder / "live.html",
+                    "--operator", "A. Person", "--note", "after the repair")
     assert done.code == 0, done.err
     return done
 
@@ -31,8 +35,33 @@ def test_the_replay_gives_the_same_page_and_the_same_numbers_to_the_last_bit(run
         assert again.document[part] == run.document[part]
     assert page.read_bytes() == (run.log.parent / "live.html").read_bytes()
     text = page.read_text(encoding="utf-8")
-    assert "SIMULATED" in text
+    assert sha256(run.log.read_bytes()).hexdigest() in text
+    for wanted in ("SIMULATED", "A. Person", "after the repair"):
+        assert wanted in text
     assert "speed change" in text
+
+
+def test_json_says_when_on_what_and_by_whom(run):
+    found = run.document
+    assert datetime.fromisoformat(found["date"]).utcoffset() is not None
+    assert (found["operator"], found["note"]) == ("A. Person", "after the repair")
+    assert found["drive"]["serial"] == 1
+    assert found["profile"]["name"] == "generic/cia402"
+    assert found["rig"]["limits"]["torque_nm"] == 400.0
+    again = tdhil("replay", "--json", "--operator", "B. Other", run.log).document
+    assert again["operator"] == "B. Other"
+    assert {name for name in again if again[name] != found[name]} == {"operator"}
+
+
+def test_a_pdf_is_written_where_the_name_says_so(run):
+    page = run.log.parent / "report.PDF"
+    assert tdhil("replay", run.log, "--report", page).code == 0
+    before = page.read_bytes()
+    assert before.startswith(b"%PDF-")
+    refused = tdhil("replay", run.log, "--report", page)
+    assert refused.code == 2
+    assert "is there already" in refused.err
+    assert page.read_bytes() == before
 
 
 @pytest.mark.parametrize(("name", "said"), [("run.mcap", "the log itself"), ("no/r.html", "no such folder")])

@@ -20,6 +20,17 @@ from tdhil.identify import (
 from tdhil.identify.identification import LinePoint
 from tdhil.record.recording import Excitation, Level, Recording, Segment, Stage
 
+RUN = {
+    "tdhil": "0.1.0", "started": "2026-03-04T05:06:07+01:00", "operator": "A. <Person>", "note": "after\x1b[31m repair",
+    "rig_file": "rig.yaml", "drive": "canopen", "embedded_simulator": False,
+    "bus": {"channel": {"value": "can0", "source": "-c"}, "bitrate": {"value": 500000, "source": "-b"}},
+    "identity": {"vendor": 0x2A, "product": 402, "revision": 1, "serial": 987654, "name": "Drive \x1b]0;x"},
+    "profile": {"name": "vendor/model", "title": "A drive"},
+    "bench": {"name": "Hall B", "load": "string", "limits": {"torque_nm": 400.0, "speed_min_rad_s": 0.5,
+                                                             "speed_max_rad_s": 10.0}},
+}
+"""The configuration of a run, with what a drive or a person may write into it."""
+
 
 def around(value, half):
     return Estimate(value, value - half, value + half)

@@ -7,11 +7,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from findings import bare, full, open_sided, recording
+from findings import RUN, bare, full, open_sided, recording
 
 from tdhil.errors import UsageError
+from tdhil.report.content import report_of
 from tdhil.report.document import result_document
-from tdhil.report.html import check_report_path, report_page, write_report
+from tdhil.report.html import check_report_path, report_page, sha256_of, write_report
 from tdhil.report.picture_run import envelope
 
 pytest.importorskip("matplotlib")
@@ -45,7 +46,7 @@ class Balanced(HTMLParser):
 
 def page(found, **changes):
     own = recording(**changes)
-    return report_page(result_document(found, own, {}, "run.mcap"), own)
+    return report_page(report_of(result_document(found, own, RUN, "run.mcap"), own))
 
 
 @pytest.mark.parametrize("make", [full, bare, open_sided])
@@ -68,8 +69,12 @@ def test_everything_is_on_it():
     for wanted in (
         "J_r = 104.0 (99.9 to 108.1) kg·m²  ±3.9 %", "J_r + J_L = 130.0 (128.0 to 132.0) kg·m²",
         "repeatability, this drive: 104.00 (103.55 to 104.45) kg·m²  ±0.43 %", "SIMULATED",
-        "does not agree", "motor side J_r", "9 of 3200 cycles without feedback", "scatter from period to period",
+        "does not agree", "J_r, the motor&#39;s side: repeatability", "9 of 3200 cycles without feedback",
+        "scatter from period to period",
         "111.5 kg·m²", "116.20 ± 0.80",
+        "Hall B · 2026-03-04 05:06 UTC+01:00", "A. &lt;Person&gt;", "after [31m repair", "987654", "Drive ]0;x",
+        "vendor 2Ah, product 192h, revision 1h", "vendor/model (A drive)", "canopen, channel can0, bitrate 500000",
+        "speed 0.5 to 10 rad/s; torque 400 N·m", "drill string",
     ):
         assert wanted in text, wanted
     assert "friction &lt;b&gt;bends&lt;/b&gt; &amp; more" in text
@@ -84,7 +89,7 @@ def test_a_refusal_has_no_number_and_no_banner_on_a_real_drive():
 
 
 def test_open_sides_are_open():
-    assert page(open_sided()).count("<td>open</td>") == 3
+    assert page(open_sided()).count('<td class="number">open</td>') == 3
     assert "J_r + J_L left open by the data" in page(open_sided())
 
 
@@ -94,6 +99,36 @@ def test_the_same_result_is_the_same_file(tmp_path):
     write_report(document, own, tmp_path / "a.html")
     write_report(document, own, tmp_path / "b.html")
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_no_file_is_ever_written_over(tmp_path):
+    own, old = recording(), tmp_path / "report.html"
+    old.write_text("somebody's own")
+    with pytest.raises(UsageError, match="is there already"):
+        check_report_path(old, tmp_path / "run.mcap")
+    assert write_report(result_document(full(), own, {}, "run.mcap"), own, old) == tmp_path / "report-2.html"
+    assert old.read_text() == "somebody's own"
+
+
+def test_it_names_the_log_by_its_hash(tmp_path):
+    log = tmp_path / "run.mcap"
+    log.write_bytes(b"abc")
+    own = recording()
+    write_report(result_document(full(), own, {}, str(log)), own, tmp_path / "r.html")
+    wanted = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"       # FIPS 180-2, appendix B.1
+    assert sha256_of(log) == wanted
+    assert wanted in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert sha256_of(tmp_path / "nowhere") == ""
+
+
+@pytest.mark.parametrize("run", [
+    {"bench": 3, "identity": "x", "profile": [], "bus": {"a": 1}, "ended": "text", "started": "yesterday", "note": 7},
+    {"bench": {"limits": {"torque_nm": "much"}, "name": ["a"]}, "identity": {"serial": -1, "name": {}}, "ended": {}},
+])
+def test_a_hostile_log_makes_a_page_all_the_same(run):
+    own = recording()
+    document = result_document(bare(), own, run, "run.mcap")
+    assert "No number" in report_page(report_of(document, own))
 
 
 def test_what_can_not_be_done_is_said_in_one_line(tmp_path, monkeypatch):

@@ -1,0 +1,391 @@
+"""What a report says, in order, whatever it is written as: HTML and PDF show the same blocks.
+
+Everything comes from the result document and the recording; lengths of pictures are in inches of a page 7 inches wide.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from tdhil.record.recording import Recording
+from tdhil.report.card_parts import estimate_text, inertia_text
+from tdhil.report.document import SIMULATED
+from tdhil.report.numbers import minutes, plus_minus, rounded
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+Part = Mapping[str, Any]
+WIDTH_IN = 7.0
+
+_COLOURS = {"valid": "green", "valid_wide": "yellow", "not_identifiable": "red", "model_rejected": "red"}
+_VERDICTS = {
+    "valid": "valid: the repeatability is as good as was asked for",
+    "valid_wide": "valid, but wide: the intervals hold, and the repeatability is wider than was asked for",
+    "not_identifiable": "not identifiable: these data can't tell the inertia",
+    "model_rejected": "model rejected: these data contradict every model that was tried",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The box at the top; ``colour`` green, yellow or red."""
+
+    colour: str
+    value: str
+    lines: tuple[str, ...]
+    verdict: str
+    reason: str
+    advice: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Names and what they are."""
+
+    rows: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Column:
+    """``share`` of the table's width; numbers stand on the right."""
+
+    title: str
+    share: float
+    number: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of as many texts as there are columns."""
+
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """``draw`` fills a figure of 7 by ``height_in`` inches; ``names_left``: long words stand beside its axis."""
+
+    draw: Callable[[FigureBase], None]
+    height_in: float
+    caption: str
+    names_left: bool = False
+
+
+Block = Text | Pairs | Table | Picture
+
+
+@dataclass(frozen=True)
+class Section:
+    """Blocks under a heading."""
+
+    heading: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of it. ``simulated`` is '' for what really turned."""
+
+    title: str
+    subtitle: str
+    simulated: str
+    answer: Answer
+    warnings: tuple[str, ...]
+    sections: tuple[Section, ...]
+    footer: str
+
+
+def report_of(document: Part, recording: Recording, sha256: str = "") -> Report:
+    """The report of a result; ``sha256`` is that of the log it comes from."""
+    rig = document["rig"] or {}
+    facts = [name for name in (rig.get("name"), shown_date(document["date"])) if name]
+    return Report(
+        title="Moment of inertia at the motor shaft",
+        subtitle=" · ".join(facts),
+        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        answer=_answer(document),
+        warnings=tuple(document["warnings"]),
+        sections=tuple(section for section in _sections(document, recording, sha256) if section.blocks),
+        footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+    )
+
+
+def shown_date(text: str | None) -> str:
+    """``2026-11-22 05:17 UTC+01:00``; '' for none."""
+    if not text:
+        return ""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return ""
+    return f"{moment:%Y-%m-%d %H:%M} {moment.tzname() or ''}".strip()
+
+
+def _answer(document: Part) -> Answer:
+    inertia, shaft = document["inertia_kg_m2"], document["compliant"]
+    value, lines = "No number", []
+    if inertia is not None:
+        value = f"{'J_r' if shaft else 'J'} = {inertia_text(inertia, '_total')}"
+        lines.append(f"at {100.0 * inertia['confidence']:g} % confidence, the drive's torque scale included")
+        if shaft is not None:
+            total = shaft["total_inertia_kg_m2"]
+            open_or = "left open by the data" if total is None else f"= {estimate_text(total, 'kg·m²')}"
+            lines.append(f"of a compliant shaft's motor side; J_r + J_L {open_or}")
+        if document["gear_ratio"] != 1.0:
+            lines.append(f"at the main shaft {inertia_text(document['inertia_main_shaft_kg_m2'], '_total')}")
+        if inertia["high_total"] > inertia["high"]:
+            lines.append(f"repeatability, this drive: {inertia_text(inertia)}")
+    return Answer(
+        colour=_COLOURS.get(document["verdict"], "red"),
+        value=value,
+        lines=tuple(lines),
+        verdict=_VERDICTS.get(document["verdict"], str(document["verdict"])),
+        reason=_sentence(document["reason"]),
+        advice=_sentence(document["advice"]),
+    )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""
+
+
+def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Section]:
+    from tdhil.report.picture_run import draw_run
+    from tdhil.report.pictures import draw_budget, draw_friction, draw_lines, draw_opinions
+
+    yield Section("The run", (Pairs(tuple(_run_rows(document, recording))),))
+    if len(recording.time_s):
+        picture = Picture(partial(draw_run, recording=recording), 2.9, "As reported, nothing smoothed. Green: steady "
+                          "levels. Blue: the excitation, its settling lighter.")
+        yield Section("Speed and torque", (picture,))
+    if document["inertia_kg_m2"] is not None or document["second_opinions"]:
+        rows = len(document["second_opinions"]) + 4
+        picture = Picture(
+            partial(draw_opinions, document=document), 0.55 + 0.2 * rows,
+            "The result, and what other routes through the same data say. A second opinion shares friction and torque "
+            "scale with the result, and little else: where the two differ by more than their intervals, one of the "
+            "assumptions is wrong.", names_left=True,
+        )
+        yield Section("All that this run says of the inertia", (picture, *_opinions(document)))
+    if document["lines"]:
+        picture = Picture(
+            partial(draw_lines, document=document), 3.0,
+            "At each excited frequency by itself the ratio of torque to acceleration looks like another inertia, "
+            "because the drive reports speed and torque late. The model explains all of them with one J, the band. "
+            "Below: what it leaves unexplained, in standard deviations; about 1 is chance.",
+        )
+        yield Section("Torque against acceleration, line by line", (picture,))
+    if document["budget"]:
+        picture = Picture(
+            partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
+            "The half-width that each source alone would leave. They add up in squares, about. The torque scale counts "
+            "in the interval to quote, and not in the repeatability.", names_left=True,
+        )
+        yield Section("What makes it unsure", (picture, _budget(document)))
+    if document["friction_curve"]:
+        picture = Picture(partial(draw_friction, document=document), 1.8,
+                          "Torque at steady speed, load included; no lag touches it.")
+        yield Section("Friction over speed", (picture, _friction(document)))
+    yield Section("Numbers", tuple(_numbers(document)))
+    if document["lines"]:
+        yield Section("Lines", (_lines(document),))
+    if document["stages"]:
+        yield Section("Stages", (_stages(document),))
+    yield Section("What it rests on", (Pairs(tuple(_grounds(document, recording, sha256))),))
+
+
+# -- what the run was ----------------------------------------------------------------------------------------
+
+
+def _run_rows(document: Part, recording: Recording) -> Iterator[tuple[str, str]]:
+    rig, drive, profile = (document[name] or {} for name in ("rig", "drive", "profile"))
+    yield "rig", rig.get("name") or rig.get("file") or "not named (name: in rig.yaml)"
+    yield "date", shown_date(document["date"]) or "not recorded"
+    yield "operator", document["operator"] or "not named (--operator)"
+    if document["note"]:
+        yield "note", document["note"]
+    if drive:
+        yield "drive", drive["name"] or "no name of its own"
+        yield "identity", ", ".join(f"{name} {drive[name]:X}h" for name in ("vendor", "product", "revision"))
+        yield "serial number", str(drive["serial"]) if drive["serial"] else "not told by the drive"
+    if profile:
+        yield "profile", profile["name"] + (f" ({profile['title']})" if profile.get("title") else "")
+    if document["connection"]:
+        yield "connection", document["connection"]
+    if limits := rig.get("limits"):
+        yield "limits", _limits(limits)
+    if rig.get("load"):
+        yield "load", {"none": "none", "string": "drill string"}.get(rig["load"], rig["load"])
+    yield "gear, motor to main shaft", f"{document['gear_ratio']:g}"
+    if recording.excitation is not None:
+        yield "excitation", _excitation(recording)
+    if len(recording.time_s):
+        length = float(recording.time_s[-1] - recording.time_s[0])
+        yield "recorded", f"{len(recording.time_s)} samples in {minutes(length)}"
+    if ended := document["ended"]:
+        yield "ended by", f"{ended['where']}: {ended['what']}" if ended["where"] else ended["what"]
+
+
+def _limits(limits: Part) -> str:
+    named = (
+        ("speed {} to {} rad/s", ("speed_min_rad_s", "speed_max_rad_s")), ("torque {} N·m", ("torque_nm",)),
+        ("time {} s", ("time_s",)), ("quick stop {} rad/s²", ("quick_stop_rad_s2",)),
+        ("watchdog {} s", ("watchdog_s",)),
+    )
+    return "; ".join(text.format(*(f"{limits[key]:g}" for key in keys)) for text, keys in named
+                     if all(key in limits for key in keys))
+
+
+def _excitation(recording: Recording) -> str:
+    found = recording.excitation
+    assert found is not None
+    text = f"{found.kind} in {found.mode} mode"
+    if found.segments and found.segments[0].lines_hz:
+        lines = found.segments[0].lines_hz
+        about = " and ".join(f"{one.offset_rad_s:.3g}" for one in found.segments[:3])
+        span = f"{len(lines)} lines, {min(lines):.3g} to {max(lines):.3g} Hz"
+        text += f", {span if len(lines) > 1 else f'{lines[0]:.3g} Hz'}, about {about} rad/s"
+    return text
+
+
+# -- tables --------------------------------------------------------------------------------------------------
+
+_ESTIMATES = (
+    ("viscous friction B", "viscous_nm_s_rad", "N·m·s/rad"),
+    ("Coulomb friction T_c, constant load included", "coulomb_nm", "N·m"),
+    ("lag of the reported speed", "speed_lag_s", "s"),
+    ("lag of the reported torque", "torque_lag_s", "s"),
+    ("delay of the torque report behind the speed report", "skew_s", "s"),
+)
+_COMPLIANT = (
+    ("behind the spring J_L", "load_inertia_kg_m2", "kg·m²"),
+    ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
+    ("spring k", "stiffness_nm_rad", "N·m/rad"),
+    ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
+    ("resonance", "resonance_hz", "Hz"),
+    ("antiresonance", "antiresonance_hz", "Hz"),
+)
+
+
+def _numbers(document: Part) -> Iterator[Block]:
+    """Every estimate, the interval to quote first."""
+    rows: list[tuple[str, ...]] = []
+
+    def add(title: str, part: Part | None, unit: str, kind: str = "") -> None:
+        if part is not None:
+            rows.append((title, *rounded(part["value"], part["low" + kind], part["high" + kind]), unit))
+
+    inertia, shaft = document["inertia_kg_m2"], document["compliant"]
+    side = "J_r, the motor's side" if shaft else "J"
+    add(f"{side} at the motor shaft, torque scale included", inertia, "kg·m²", "_total")
+    if document["gear_ratio"] != 1.0:
+        add(f"{side} at the main shaft, torque scale included", document["inertia_main_shaft_kg_m2"], "kg·m²", "_total")
+    add(f"{side}: repeatability, this drive", inertia, "kg·m²")
+    for title, key, unit in _ESTIMATES:
+        add(title, document[key], unit)
+    if shaft is not None:
+        for title, key, unit in _COMPLIANT:
+            add(title, shaft[key], unit)
+    if rows:
+        columns = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
+                   Column("to", 0.12, True), Column("unit", 0.12))
+        yield Table(columns, tuple(rows))
+        yield Text("Where nothing is said of the torque scale it is taken for exact: such intervals compare runs on "
+                   "this drive.")
+
+
+def _opinions(document: Part) -> Iterator[Block]:
+    words = {True: "agrees", False: "does not agree", None: "nothing to compare with"}
+    for one in document["second_opinions"]:
+        yield Text(f"{_sentence(one['route'])[:-1]}: {estimate_text(one['inertia_kg_m2'], 'kg·m²')}, "
+                   f"{words[one['agrees']]}. {_sentence(one['note'])}")
+
+
+def _budget(document: Part) -> Table:
+    inertia = document["inertia_kg_m2"]
+    lines = sorted(document["budget"], key=lambda line: -(line["half_width_kg_m2"] or 0.0))
+    rows = []
+    for line in lines:
+        half = line["half_width_kg_m2"]
+        share = f"{100.0 * half / inertia['value']:.2g}" if half is not None and inertia is not None else ""
+        rows.append((line["source"], "open" if half is None else f"{half:.2g}", share, line["note"]))
+    return Table((Column("source", 0.2), Column("± kg·m²", 0.11, True), Column("± %", 0.11, True), Column("", 0.58)),
+                 tuple(rows))
+
+
+def _friction(document: Part) -> Table:
+    """Two points to a row: a curve may have many."""
+    cells = [(f"{p['speed_rad_s']:.2f}", plus_minus(p["torque_nm"]["value"], _half(p["torque_nm"])))
+             for p in document["friction_curve"]]
+    middle = (len(cells) + 1) // 2
+    rows = [(*cells[k], *(cells[middle + k] if middle + k < len(cells) else ("", ""))) for k in range(middle)]
+    head = (Column("speed, rad/s", 0.25, True), Column("torque, N·m", 0.25, True))
+    return Table(head + head, tuple(rows))
+
+
+def _lines(document: Part) -> Table:
+    rows = []
+    for p in document["lines"]:
+        seen, damping = p["apparent_inertia_kg_m2"], p["apparent_damping_nm_s_rad"]
+        rows.append((
+            f"{p['hertz']:.4g}", plus_minus(seen["value"], _half(seen)), _as(p["fitted_inertia_kg_m2"], _half(seen)),
+            plus_minus(damping["value"], _half(damping)), _as(p["fitted_damping_nm_s_rad"], _half(damping)),
+            f"{p['residual_sd']:.2f}",
+        ))
+    heads = (("frequency, Hz", 0.14), ("Im(T/ω)/2πf, kg·m²", 0.22), ("model", 0.12), ("Re(T/ω), N·m·s/rad", 0.22),
+             ("model", 0.12), ("residual, sd", 0.18))
+    return Table(tuple(Column(title, share, True) for title, share in heads), tuple(rows))
+
+
+def _stages(document: Part) -> Table:
+    rows = tuple((s["name"], s["outcome"], minutes(s["duration_s"]), s.get("detail", "")) for s in document["stages"])
+    heads = (Column("stage", 0.14), Column("outcome", 0.14), Column("duration", 0.12, True), Column("", 0.6))
+    return Table(heads, rows)
+
+
+def _grounds(document: Part, recording: Recording, sha256: str) -> Iterator[tuple[str, str]]:
+    yield "model", document["model"]
+    if (inertia := document["inertia_kg_m2"]) is not None:
+        yield "the repeatability holds if", "; ".join(inertia["conditional_on"])
+        yield "confidence of every interval", f"{100.0 * inertia['confidence']:g} %"
+    yield "torque scale, 1 sd", f"{100.0 * recording.torque_scale_rel_sd:g} %"
+    if document["reference_inertia_kg_m2"] is not None:
+        yield "reference J (rig.yaml)", f"{document['reference_inertia_kg_m2']:g} kg·m²"
+    if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
+        r2 = "" if paper["r2"] is None else f", r² {paper['r2']:.3f}"
+        raw = paper["raw_rate"]["inertia_kg_m2"]
+        yield "the paper's method", (f"{paper['inertia_kg_m2']:.5g} kg·m²{r2}"
+                                     + ("" if raw is None else f"; at the raw rate {raw:.4g} kg·m²"))
+    if (test := document["residual"]) is not None and test["p_value"] is not None:
+        yield "residual test", f"p = {test['p_value']:.2g}, {test['degrees_of_freedom']:.3g} degrees of freedom"
+    yield "used", f"{document['periods_used']} periods, {document['samples_used']} samples"
+    yield "whole", "yes" if document["complete"] else "no: the log ended before the run did"
+    yield "log", document["log"]
+    if sha256:
+        yield "SHA-256 of the log", sha256
+    if document["recorded_by"]:
+        yield "recorded by", f"tdhil {document['recorded_by']}"
+    yield "evaluated by", f"tdhil {document['tdhil']}"
+
+
+def _half(part: Part) -> float:
+    return 0.5 * (part["high"] - part["low"]) if part["high"] is not None and part["low"] is not None else math.inf
+
+
+def _as(value: float, half: float) -> str:
+    """With the decimals that the measured one beside it has."""
+    return plus_minus(value, half).split(" ")[0]

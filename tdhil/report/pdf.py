@@ -1,0 +1,347 @@
+"""The report as PDF on A4: pictures and letters as vectors, by matplotlib alone (docs/decisions/0009).
+
+A sheet is filled from the top. A heading stays with what follows it, a picture with its caption, and a table on one
+sheet unless it is longer than that: then it is split between rows, and its head repeated. All lengths are in points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+from tdhil.report.content import WIDTH_IN, Answer, Column, Pairs, Picture, Report, Section, Table, Text
+from tdhil.report.page import lay_out, repeatable_figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDE, HIGH = 595.28, 841.89
+LEFT, TOP, BOTTOM = 46.0, 44.0, 796.0
+INNER = WIDE - 2.0 * LEFT
+BODY, SMALL = 8.6, 7.6
+_LEADING = 1.36
+_COLOURS = {"green": "#1a7f37", "yellow": "#8a6100", "red": "#b42318"}
+_DARK, _QUIET, _RULE = "#222222", "#666666", "#cccccc"
+
+Draw = Callable[["_Sheets", float], None]
+"""Draws a piece at a height from the sheet's top."""
+
+
+def pdf_bytes(report: Report) -> bytes:
+    """The whole file; the same report gives the same bytes."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    data = BytesIO()
+    with _fonts(), PdfPages(data, metadata=_metadata(report)) as pages:
+        for figure in sheets_of(report):
+            pages.savefig(figure)
+    return data.getvalue()
+
+
+def sheets_of(report: Report) -> list[Figure]:
+    """The sheets as figures of A4, with their feet."""
+    with _fonts():
+        sheets = _Sheets(report.simulated)
+        _write(sheets, report)
+        for number, figure in enumerate(sheets.figures, start=1):
+            sheets.foot(figure, report.footer, f"page {number} of {len(sheets.figures)}")
+    return sheets.figures
+
+
+@contextmanager
+def _fonts() -> Iterator[None]:
+    from matplotlib import rc_context
+
+    fonts: Any = {"pdf.fonttype": 42, "font.family": "DejaVu Sans", "font.size": SMALL, "axes.linewidth": 0.6}
+    with repeatable_figures(), rc_context(fonts):
+        yield
+
+
+def _metadata(report: Report) -> dict[str, Any]:
+    title = report.title + (f" ({report.simulated})" if report.simulated else "")
+    return {"Title": title, "Subject": report.subtitle, "Creator": report.footer, "CreationDate": None}
+
+
+class _Sheets:
+    """The sheets so far; ``at`` is where the last one is filled to."""
+
+    def __init__(self, banner: str) -> None:
+        self.figures: list[Figure] = []
+        self.at = BOTTOM
+        self._banner = banner
+        self._top = TOP
+
+    def place(self, height: float, draw: Draw, space: float = 0.0) -> None:
+        """Draw a piece so high that stays together, below a space (none at the top of a sheet)."""
+        if not self.figures or (self.at + space + height > BOTTOM and not self.fresh):
+            self.new()
+        if self.fresh:
+            space = 0.0
+        self.at += space
+        draw(self, self.at)
+        self.at += height
+
+    def room(self, space: float = 0.0) -> float:
+        """What is left on this sheet below a space."""
+        return BOTTOM - self.at - space if self.figures else BOTTOM - TOP
+
+    def new(self) -> None:
+        """Begin another sheet."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(WIDE / 72.0, HIGH / 72.0))
+        FigureCanvasAgg(figure)
+        self.figures.append(figure)
+        self.at = TOP
+        if self._banner:
+            self.box(TOP - 18.0, 15.0, LEFT, INNER, "#a21caf")
+            self.line(LEFT + 6.0, TOP - 18.0 + 10.8, self._banner, SMALL, color="white", weight="bold")
+            self.at = TOP + 6.0
+        self._top = self.at
+
+    @property
+    def fresh(self) -> bool:
+        """Is nothing on the last sheet yet?"""
+        return bool(self.figures) and self.at == self._top
+
+    def foot(self, figure: Figure, left: str, right: str) -> None:
+        """Below everything on a sheet."""
+        at = HIGH - 26.0
+        for text, x, side in ((left, LEFT, "left"), (right, WIDE - LEFT, "right")):
+            figure.text(x / WIDE, 1.0 - at / HIGH, text, fontsize=6.8, color=_QUIET, ha=side, va="baseline",
+                        parse_math=False)
+
+    # -- on the last sheet -----------------------------------------------------------------------------------
+
+    def line(self, x: float, y: float, text: str, size: float, *, color: str = _DARK, weight: str = "normal",
+             style: str = "normal", side: str = "left") -> None:
+        """One line of text with its baseline at ``y``."""
+        self.figures[-1].text(x / WIDE, 1.0 - y / HIGH, text, fontsize=size, color=color, fontweight=weight,
+                              fontstyle=style, ha=side, va="baseline", parse_math=False)
+
+    def lines(self, x: float, y: float, texts: Sequence[str], size: float, **how: Any) -> None:
+        """Lines below each other; ``y`` is where the first begins."""
+        for number, text in enumerate(texts):
+            self.line(x, y + (number + 0.78) * size * _LEADING, text, size, **how)
+
+    def rule(self, y: float, color: str = _RULE, width: float = 0.5) -> None:
+        """A line across the page."""
+        from matplotlib.lines import Line2D
+
+        figure = self.figures[-1]
+        figure.add_artist(Line2D((LEFT / WIDE, (LEFT + INNER) / WIDE), (1.0 - y / HIGH,) * 2, lw=width, color=color))
+
+    def box(self, y: float, height: float, x: float, width: float, color: str) -> None:
+        """A filled rectangle, from its top."""
+        from matplotlib.patches import Rectangle
+
+        figure = self.figures[-1]
+        figure.add_artist(Rectangle((x / WIDE, 1.0 - (y + height) / HIGH), width / WIDE, height / HIGH, lw=0.0,
+                                    facecolor=color, transform=figure.transFigure))
+
+    def picture(self, y: float, picture: Picture, height: float) -> None:
+        """A figure within the sheet's."""
+        figure = self.figures[-1]
+        grid = figure.add_gridspec(3, 3, width_ratios=(LEFT, INNER, WIDE - LEFT - INNER),
+                                   height_ratios=(y, height, HIGH - y - height))
+        inside = figure.add_subfigure(grid[1, 1])
+        picture.draw(inside)
+        lay_out(inside, INNER / 72.0, height / 72.0, names_left=picture.names_left)
+
+
+# -- the report ----------------------------------------------------------------------------------------------
+
+
+def _write(sheets: _Sheets, report: Report) -> None:
+    def head(on: _Sheets, y: float) -> None:
+        on.line(LEFT, y + 17.0, report.title, 17.0, weight="bold")
+        on.line(LEFT, y + 31.0, report.subtitle, 9.0, color=_QUIET)
+
+    sheets.place(38.0, head)
+    _answer(sheets, report.answer)
+    for warning in report.warnings:
+        _warning(sheets, warning)
+    for section in report.sections:
+        _section(sheets, section)
+
+
+def _answer(sheets: _Sheets, answer: Answer) -> None:
+    width, colour = INNER - 26.0, _COLOURS[answer.colour]
+    big = wrapped(answer.value, 15.0, width, "bold")
+    lines = [part for line in answer.lines for part in wrapped(line, BODY, width)]
+    verdict = wrapped(answer.verdict, BODY, width, "bold")
+    reason = wrapped(answer.reason, BODY, width)
+    advice = wrapped(answer.advice, BODY, width, style="italic") if answer.advice else []
+    step = BODY * _LEADING
+    height = 16.0 + len(big) * 15.0 * _LEADING + step * (len(lines) + len(verdict) + len(reason) + len(advice)) + 6.0
+
+    def draw(on: _Sheets, y: float) -> None:
+        on.box(y, height, LEFT, INNER, "#f7f7f7")
+        on.box(y, height, LEFT, 5.0, colour)
+        x, down = LEFT + 16.0, y + 8.0
+        on.lines(x, down, big, 15.0, weight="bold")
+        down += len(big) * 15.0 * _LEADING
+        for texts, how in ((lines, {}), (verdict, {"weight": "bold", "color": colour}), (reason, {}),
+                           (advice, {"style": "italic"})):
+            on.lines(x, down, texts, BODY, **how)
+            down += len(texts) * step + (3.0 if texts is not reason else 0.0)
+
+    sheets.place(height, draw, 6.0)
+
+
+def _warning(sheets: _Sheets, warning: str) -> None:
+    texts = wrapped(warning, BODY, INNER - 22.0)
+    height = len(texts) * BODY * _LEADING + 7.0
+
+    def draw(on: _Sheets, y: float) -> None:
+        on.box(y, height, LEFT, INNER, "#fff8e6")
+        on.box(y, height, LEFT, 2.5, _COLOURS["yellow"])
+        on.lines(LEFT + 12.0, y + 3.0, texts, BODY)
+
+    sheets.place(height, draw, 5.0)
+
+
+_HEADING = 21.0         # with the rule below it
+
+
+def _section(sheets: _Sheets, section: Section) -> None:
+    """The heading goes with the first block, or with the first rows of a table that is longer than a sheet."""
+    heading: str | None = section.heading
+    for block in section.blocks:
+        if isinstance(block, Table | Pairs):
+            _table(sheets, heading, block)
+        elif isinstance(block, Picture):
+            _picture(sheets, heading, block)
+        else:
+            _text(sheets, heading, block)
+        heading = None
+
+
+def _headed(sheets: _Sheets, heading: str | None, height: float, draw: Draw, space: float = 5.0) -> None:
+    if heading is None:
+        sheets.place(height, draw, space)
+        return
+
+    def both(on: _Sheets, y: float) -> None:
+        on.line(LEFT, y + 11.0, heading, 10.5, weight="bold")
+        on.rule(y + 15.5, "#888888", 0.7)
+        draw(on, y + _HEADING)
+
+    sheets.place(_HEADING + height, both, 13.0)
+
+
+def _text(sheets: _Sheets, heading: str | None, block: Text) -> None:
+    texts = wrapped(block.text, BODY, INNER)
+    _headed(sheets, heading, len(texts) * BODY * _LEADING, lambda on, y: on.lines(LEFT, y, texts, BODY))
+
+
+def _picture(sheets: _Sheets, heading: str | None, block: Picture) -> None:
+    height = 72.0 * block.height_in * INNER / (72.0 * WIDTH_IN)
+    caption = wrapped(block.caption, SMALL, INNER)
+
+    def draw(on: _Sheets, y: float) -> None:
+        on.picture(y, block, height)
+        on.lines(LEFT, y + height + 2.0, caption, SMALL, color=_QUIET)
+
+    _headed(sheets, heading, height + 2.0 + len(caption) * SMALL * _LEADING, draw)
+
+
+def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
+    columns = block.columns if isinstance(block, Table) else (Column("", 0.27), Column("", 0.73))
+    rows = [_Row(columns, cells) for cells in block.rows]
+    head = _Row(columns, tuple(column.title for column in columns), head=True) if isinstance(block, Table) else None
+    head_height = head.height if head is not None else 0.0
+    height = head_height + sum(row.height for row in rows)
+    above = 13.0 + _HEADING if heading is not None else 5.0
+    if height <= max(sheets.room(above), BOTTOM - TOP - 40.0):
+        _headed(sheets, heading, height, lambda on, y: _draw_rows(on, y, head, rows))
+        return
+    while rows:
+        fit, used = 0, head_height
+        room = sheets.room(above)
+        while fit < len(rows) and used + rows[fit].height <= room:
+            used += rows[fit].height
+            fit += 1
+        if fit == 0 and not sheets.fresh:
+            sheets.new()
+            continue
+        part, rows = rows[: max(fit, 1)], rows[max(fit, 1):]
+        part_height = head_height + sum(row.height for row in part)
+        _headed(sheets, heading, part_height, lambda on, y, part=part: _draw_rows(on, y, head, part))      # type: ignore[misc]
+        heading, above = None, 5.0
+
+
+class _Row:
+    """One row of a table, its cells wrapped to their columns."""
+
+    def __init__(self, columns: Sequence[Column], cells: Sequence[str], head: bool = False) -> None:
+        self.columns, self.head = columns, head
+        self.names = len(columns) == 2 and not any(column.title for column in columns)
+        weight = "bold" if head else "normal"
+        self.cells = [
+            wrapped(cell, SMALL, column.share * INNER - 8.0, weight)
+            for cell, column in zip(cells, columns, strict=True)
+        ]
+        self.height = max(1, *(len(cell) for cell in self.cells)) * SMALL * _LEADING + 4.0
+
+    def draw(self, on: _Sheets, y: float) -> None:
+        """From its top."""
+        if self.head:
+            on.box(y, self.height, LEFT, INNER, "#f1f1f1")
+        x = LEFT
+        for number, (column, cell) in enumerate(zip(self.columns, self.cells, strict=True)):
+            width = column.share * INNER
+            quiet = self.names and number == 0
+            on.lines(x + width - 4.0 if column.number else x + 4.0, y + 2.0, cell, SMALL,
+                     weight="bold" if self.head else "normal", side="right" if column.number else "left",
+                     color=_QUIET if quiet else _DARK)
+            x += width
+        on.rule(y + self.height)
+
+
+def _draw_rows(on: _Sheets, y: float, head: _Row | None, rows: Sequence[_Row]) -> None:
+    for row in ([head] if head is not None else []) + list(rows):
+        row.draw(on, y)
+        y += row.height
+
+
+# -- text ----------------------------------------------------------------------------------------------------
+
+
+def wrapped(text: str, size: float, width: float, weight: str = "normal", style: str = "normal") -> list[str]:
+    """Lines no wider than ``width``; what has no spaces is cut where it must be."""
+    lines: list[str] = []
+    for paragraph in text.splitlines() or [""]:
+        line = ""
+        for whole in paragraph.split():
+            word = whole
+            trial = f"{line} {word}" if line else word
+            if _measured(trial, weight, style) * size <= width:
+                line = trial
+                continue
+            if line:
+                lines.append(line)
+            while len(word) > 1 and _measured(word, weight, style) * size > width:
+                cut = max(1, next((k for k in range(len(word) - 1, 0, -1)
+                                   if _measured(word[:k], weight, style) * size <= width), 1))
+                lines.append(word[:cut])
+                word = word[cut:]
+            line = word
+        lines.append(line)
+    return lines
+
+
+@lru_cache(maxsize=4096)
+def _measured(text: str, weight: str, style: str) -> float:
+    """Width of a line in letters of one point."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    slant: Any = style
+    properties = FontProperties(family="DejaVu Sans", size=10.0, weight=weight, style=slant)
+    width, _, _ = text_to_path.get_text_width_height_descent(text, properties, False)
+    return float(width) / 10.0

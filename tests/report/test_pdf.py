@@ -1,0 +1,112 @@
+"""The report as PDF: A4, nothing outside the margins, no text on another, tables whole, the same twice."""
+
+import io
+import itertools
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import pytest
+from findings import RUN, around, bare, full, open_sided, recording
+
+from tdhil.identify import FrictionPoint
+from tdhil.report.content import report_of
+from tdhil.report.document import result_document
+
+pytest.importorskip("matplotlib")
+
+from matplotlib.backends.backend_pdf import PdfFile, RendererPdf
+
+from tdhil.report.pdf import HIGH, LEFT, WIDE, pdf_bytes, sheets_of, wrapped
+
+LONG = "a word of usual length and " * 40
+
+
+def report(found, run=RUN, **changes):
+    own = recording(**changes)
+    document = result_document(found, own, run, "a/very/long/path/" * 9 + "run.mcap")
+    return report_of(document, own, "0123456789abcdef" * 4)
+
+
+def wordy():
+    """Much of everything: more than a sheet of table, texts that wrap, one without a space."""
+    everything = full()
+    return replace(
+        everything, warnings=(LONG, "x" * 400, "three"), reason=LONG,
+        friction_curve=tuple(FrictionPoint(0.1 * k, around(80.0 + k, 1.5)) for k in range(1, 41)),
+        lines=tuple(replace(everything.lines[0], hertz=0.01 * k) for k in range(1, 90)),
+    )
+
+
+def texts_of(figure):
+    """(text, bounds in points, y up) of what the report itself wrote on a sheet; pictures have their own axes."""
+    figure.dpi = 72
+    renderer = RendererPdf(PdfFile(io.BytesIO()), 72, HIGH / 72.0, WIDE / 72.0)       # letters as wide as in the file
+    found = []
+    for text in figure.texts:
+        box = text.get_window_extent(renderer)
+        found.append((text.get_text(), box.x0, box.y0, box.x1, box.y1))
+    return [one for one in found if one[0]]
+
+
+@pytest.mark.parametrize("make", [full, bare, open_sided, wordy])
+def test_everything_lies_within_the_margins_and_nothing_on_another(make):
+    for figure in sheets_of(report(make(), {**RUN, "note": LONG, "operator": "y" * 300})):
+        assert figure.get_size_inches() * 72.0 == pytest.approx((WIDE, HIGH))
+        texts = texts_of(figure)
+        for text, x0, y0, x1, y1 in texts:
+            assert x0 >= LEFT - 1.0, text
+            assert x1 <= WIDE - LEFT + 1.0, text
+            assert 15.0 <= y0 < y1 <= HIGH - 20.0, text
+        for one, other in itertools.combinations(texts, 2):
+            apart = one[3] <= other[1] or other[3] <= one[1] or one[4] <= other[2] + 1.5 or other[4] <= one[2] + 1.5
+            assert apart, (one[0], other[0])
+        for inside in figure.subfigs:
+            box = inside.bbox.transformed(figure.dpi_scale_trans.inverted())
+            assert 72.0 * box.x0 >= LEFT - 1.0
+            assert 72.0 * box.y0 >= 30.0
+
+
+def test_a_long_table_is_split_with_its_head_and_a_short_one_never():
+    sheets = [[text for text, *_ in texts_of(figure)] for figure in sheets_of(report(wordy()))]
+    heads = [k for k, texts in enumerate(sheets) if "frequency, Hz" in texts]
+    assert len(heads) >= 2
+    rows = [[text for text in texts if re.fullmatch(r"0\.\d\d?", text)] for texts in sheets]
+    assert sum(map(len, rows)) >= 89
+    short = [[text for text, *_ in texts_of(figure)] for figure in sheets_of(report(full()))]
+    assert sum("frequency, Hz" in texts for texts in short) == 1
+
+
+def test_no_sheet_but_the_last_is_half_empty():
+    figures = sheets_of(report(full()))
+    assert len(figures) <= 4
+    for figure in figures[:-1]:
+        lowest = min([y0 for text, _, y0, _, _ in texts_of(figure) if y0 > 40.0])
+        assert lowest < 0.45 * HIGH
+
+
+def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
+    one, other = pdf_bytes(report(full())), pdf_bytes(report(full()))
+    assert one == other
+    assert one.startswith(b"%PDF-")
+    assert len(re.findall(rb"/Type /Page\b", one)) == len(sheets_of(report(full())))
+    assert b"/Subtype /Image" not in one            # vectors
+
+
+@pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext (poppler-utils) here")
+def test_its_text_can_be_read_by_others(tmp_path):
+    (tmp_path / "r.pdf").write_bytes(pdf_bytes(report(full())))
+    said = subprocess.run(["pdftotext", "-layout", tmp_path / "r.pdf", "-"], capture_output=True, text=True, check=True)
+    for wanted in ("J_r = 104.0 (99.9 to 108.1) kg·m² ±3.9 %", "Hall B · 2026-03-04 05:06 UTC+01:00", "987654",
+                   "friction <b>bends</b> & more", "0123456789abcdef", "page 1 of"):
+        assert wanted in said.stdout, wanted
+    assert said.stdout.count("SIMULATED") >= len(sheets_of(report(full())))
+
+
+def test_lines_are_wrapped_to_a_width():
+    assert wrapped("", 8.0, 100.0) == [""]
+    assert "".join(wrapped("x" * 100, 8.0, 60.0)) == "x" * 100
+    lines = wrapped(LONG, 8.0, 200.0)
+    assert " ".join(lines) == LONG.strip()
+    assert len(lines) > 10
