@@ -14,12 +14,14 @@ from profiles.quantities import RPM
 from tdhil import __version__
 from tdhil.commands.task import bench_of, excitation_request, lag_prior, machine_limits
 from tdhil.options import Resolved
-from tdhil.rig import Rig
+from tdhil.rig import Rig, simulated_default_rig
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from tdhil.protocol import excitation
+    from tdhil.protocol.design import Knowledge
     from tdhil.protocol.excitation import Plan, RigGuess
     from tdhil.protocol.planning import Planned
     from tdhil.protocol.settings import MachineLimits
@@ -69,40 +71,40 @@ def plan_dry(
     options: Resolved, rig: Rig | None, simulated: bool, can_torque: bool = True
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
-    from tdhil.protocol import excitation
-    from tdhil.protocol.design import Knowledge, assumed_noise
     from tdhil.protocol.excitation import PlanRefused
-    from tdhil.protocol.guard import Guard
     from tdhil.protocol.planning import plan_acquisition
-    from tdhil.protocol.settings import ControlAssumptions
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)
-    guess, figures = _guess(bench, limits)
-    stated = bench.expected.load_noise_nm
-    noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
-    known = Knowledge(noise, lag_prior(bench))
-    figures += (
-        Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),
-        Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
-        Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
-    )
-    assumptions = ControlAssumptions()
-    if options["rate_hz"]:
-        assumptions = assumptions.at_period(1.0 / options["rate_hz"])
-    room = excitation.MachineLimits(
-        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
-    )
+    guess, known, figures = _assumed(bench, limits)
     left_s = limits.time_s - BEFORE_ACQUIRE_S
     try:
         planned = plan_acquisition(
-            excitation_request(options), _mode(options, can_torque), room, guess, known, left_s
+            excitation_request(options), _mode(options, can_torque), _room(options, limits), guess, known, left_s
         )
     except PlanRefused as error:
         raise PreflightRefused(
-            str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
+            str(error), where="plan of stage 5", next_step=error.next_step
         ) from error
     return planned, figures, limits
+
+
+def refuse_hopeless(options: Resolved, rig: Rig | None, can_torque: bool) -> None:
+    """Before a run touches its drive: PreflightRefused for what no shaft could do within the limits.
+
+    Nothing is known of the shaft yet, nor whether it is a simulated one, whose limits need not be given.
+    """
+    from tdhil.protocol import planning
+    from tdhil.protocol.excitation import PlanRefused
+
+    bench = simulated_default_rig(rig)
+    limits = machine_limits(bench)
+    modes = (options["mode"],) if options["mode"] else ("torque", "speed") if can_torque else ("speed",)
+    guess, known, _ = _assumed(bench, limits)
+    try:
+        planning.refuse_hopeless(excitation_request(options), modes, _room(options, limits), guess, known)
+    except PlanRefused as error:
+        raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step) from error
 
 
 def _mode(options: Resolved, can_torque: bool) -> str:
@@ -114,6 +116,36 @@ def _mode(options: Resolved, can_torque: bool) -> str:
             next_step="Use --mode speed",
         )
     return wanted or ("torque" if can_torque else "speed")
+
+
+def _room(options: Resolved, limits: MachineLimits) -> excitation.MachineLimits:
+    """What a plan may use of the limits at the rate that was asked for."""
+    from tdhil.protocol import excitation
+    from tdhil.protocol.guard import Guard
+    from tdhil.protocol.settings import ControlAssumptions
+
+    assumptions = ControlAssumptions()
+    if options["rate_hz"]:
+        assumptions = assumptions.at_period(1.0 / options["rate_hz"])
+    return excitation.MachineLimits(
+        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
+    )
+
+
+def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tuple[Figure, ...]]:
+    """The rig, its noise and its lags, and what each of them rests on."""
+    from tdhil.protocol.design import Knowledge, assumed_noise
+
+    guess, figures = _guess(bench, limits)
+    stated = bench.expected.load_noise_nm
+    noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
+    known = Knowledge(noise, lag_prior(bench))
+    return guess, known, (
+        *figures,
+        Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),
+        Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
+        Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
+    )
 
 
 def _guess(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, tuple[Figure, ...]]:

@@ -92,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
     from tdhil.commands.connection import can_torque, connection_of
+    from tdhil.commands.dry_run import dry_run, refuse_hopeless
     from tdhil.commands.peer import plan_peer
     from tdhil.commands.rehearsal import list_faults, with_faults
     from tdhil.commands.settings_said import show_settings
@@ -116,13 +117,13 @@ def run(namespace: argparse.Namespace) -> int:
         check_report_path(namespace.report, Path(options["log"]))
     _check_files(namespace, options)
     if namespace.dry_run:
-        from tdhil.commands.dry_run import dry_run
-
         simulated = bool(options["simulate"]) or not connection.configured
         return dry_run(options, rig, simulated, can_torque(connection.profile))
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
-    return _run(namespace, options, connection, peer, suited(rig, peer.plant), console)
+    bench = suited(rig, peer.plant)
+    refuse_hopeless(options, bench, can_torque(connection.profile))
+    return _run(namespace, options, connection, peer, bench, console)
 
 
 def _check_files(namespace: argparse.Namespace, options: Resolved) -> None:

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from drivers.drive import Command, Mode
-from drivers.errors import PreflightRefused
+from drivers.errors import LimitHit, PreflightRefused
 from tdhil.protocol import excitation
 from tdhil.protocol.bench import Bench
 from tdhil.protocol.design import Knowledge, assumed_noise, measured_noise
@@ -35,7 +35,8 @@ class StagePlanner:
     def plan(self, task: Task, speed: SpeedResult, mode: Mode, prior: LagPrior) -> Planned:
         """From what stage 2 has shown; the shaft goes on as it turns meanwhile.
 
-        Raises PreflightRefused where no plan fits the machine, and whatever a cycle raises.
+        Raises LimitHit where no plan fits the shaft within its limits, PreflightRefused where it would have to brake
+        and must not, and whatever a cycle raises.
         """
         bench = self._bench
         request, limits, model = task.request, task.limits, speed.model
@@ -60,8 +61,10 @@ class StagePlanner:
         try:
             planned = bench.compute(work, keep)
         except PlanRefused as error:
-            raise PreflightRefused(
-                str(error), where="plan of stage 5", next_step="Change --amplitude, --offset, --frequency or the limits"
+            raise LimitHit(
+                f"no plan of stage 5 fits this shaft, as stages 2 and 3 have shown it: {error}",
+                where="plan of stage 5",
+                next_step=f"The shaft was stopped. {error.next_step}",
             ) from error
         plan = planned.plan
         if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and bench.guard.no_braking:

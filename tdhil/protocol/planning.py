@@ -10,7 +10,7 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from tdhil.protocol.design.choose import Choice, Knowledge, choose
+from tdhil.protocol.design.choose import Choice, Knowledge, choose, refuse_unfit
 from tdhil.protocol.design.expected import Evidence, half_width, longer
 from tdhil.protocol.design.predicted import predicted
 from tdhil.protocol.design.stopping import MARGIN, interval_confidence, least_scale
@@ -144,6 +144,36 @@ def plan_acquisition(
     return _with_pilot(request, chosen, known, allowed_s)
 
 
+RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
+"""Shares of the inertia and the friction that are assumed: what suits none of these rigs will suit no other."""
+
+
+def refuse_hopeless(
+    request: ExcitationRequest, modes: tuple[str, ...], limits: MachineLimits, guess: RigGuess, known: Knowledge
+) -> None:
+    """PlanRefused where what is asked for fits no rig, in none of ``modes``: that is known before anything moves.
+
+    The words are those of the assumed rig. What depends on the rig is left to be planned once that is known.
+    """
+    first: PlanRefused | None = None
+    for inertia, friction in RIGS:
+        rig = replace(
+            guess, inertia_kg_m2=inertia * guess.inertia_kg_m2, viscous_nm_s_rad=friction * guess.viscous_nm_s_rad,
+            coulomb_nm=max(friction * guess.coulomb_nm, 1e-3 * limits.torque_limit_nm),
+        )
+        for mode in modes:
+            try:
+                if request.kind in ("pulses", "coast-down"):
+                    plan_acquisition(request, mode, limits, rig, known, math.inf)
+                else:
+                    refuse_unfit(limits, rig, wish_of(request, mode), known, request.max_time_s)
+                return
+            except PlanRefused as error:
+                first = first or error
+    if first is not None:
+        raise first
+
+
 def _periodic(kind: str) -> ExcitationKind:
     match kind:
         case "multisine" | "sine" | "step":
@@ -163,7 +193,9 @@ def _swings(
 ) -> Planned:
     """Pulses and coast-down: there is no line to predict, and no scatter of periods to stop by."""
     if request.frequency_hz is not None:
-        raise PlanRefused(f"{kind} has no frequency; use --amplitude, --offset, --periods or --max-time")
+        raise PlanRefused(
+            f"{kind} has no frequency; use --amplitude, --offset, --periods or --max-time", "Leave --frequency out"
+        )
     plan = make_swings(
         kind,
         limits,
@@ -175,7 +207,10 @@ def _swings(
         request.max_time_s,
     )
     if plan.duration_s > left_s:
-        raise PlanRefused(f"time: {kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left")
+        raise PlanRefused(
+            f"time: {kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            "Raise limits.time_s in rig.yaml, or ask for less with --periods or --max-time",
+        )
     return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
 

@@ -8,7 +8,7 @@ from fake_drive import LIMITS, FakeDrive, refused_check
 from run_outcomes import assert_at_rest, outcomes
 
 from drivers.drive import PowerState
-from drivers.errors import PreflightRefused
+from drivers.errors import LimitHit, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.protocol.settings import ExcitationRequest
 
@@ -149,3 +149,16 @@ def test_the_run_keeps_within_the_drive_s_own_limits(world):
     here.runner(confirm=confirm).run()
     (limits,) = seen
     assert (limits.torque_nm, limits.probe_torque_nm, limits.speed_max_rad_s) == (150.0, 150.0, 4.0)
+
+
+def test_a_plan_that_this_shaft_is_too_heavy_for_ends_in_its_own_words(world):
+    """It has moved by then: a limit leaves no room, and the shaft was stopped."""
+    here = world()
+    request = ExcitationRequest(kind="sine", frequency_hz=2.0, amplitude_rad_s=2.0, offset_rad_s=5.0, periods=3)
+    outcome = here.runner(request).run()
+    assert isinstance(outcome.cause, LimitHit)
+    assert exit_code(outcome.cause) == 7
+    assert "as stages 2 and 3 have shown it" in outcome.cause.what
+    assert "The shaft was stopped" in outcome.cause.next_step
+    assert "--amplitude" in outcome.cause.next_step
+    assert outcome.stop.confirmed

@@ -22,6 +22,7 @@ from tdhil.protocol.excitation import (
     PlanRefused,
     RigGuess,
     make_plan,
+    settling_periods,
 )
 from tdhil.record.recording import FloatArray, LagPrior
 
@@ -109,10 +110,28 @@ def choose(
     return Choice(best, best_width, usual_width)
 
 
+def refuse_unfit(
+    limits: MachineLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
+) -> None:
+    """PlanRefused where `choose` would find nothing, without weighing what it would find."""
+    try:
+        _in_time(make_plan(limits, guess, wish), wish, time_s)
+    except PlanRefused:
+        given = wish.kind != "multisine" or wish.frequency_hz is not None or wish.periods is not None
+        if given or time_s is None:
+            raise
+        if not any(True for slope in SLOPES for _ in _candidates(limits, guess, wish, known, time_s, slope)):
+            raise
+
+
 def _candidates(
     limits: MachineLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float, slope: float
 ) -> Iterator[Plan]:
+    speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)
     for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):
+        period_s = 1.0 / proposal.lowest_hz
+        if speeds * (LEAST_COUNTED + settling_periods(period_s)) * period_s > time_s:
+            continue                   # too long before it is looked at, which takes its time
         shape = phased(proposal, limits, guess, wish.mode)
         for share in OFFSET_SHARES:
             asked = replace(wish, shape=shape, frequency_hz=proposal.lowest_hz, offset_share=share)
@@ -132,5 +151,9 @@ def _in_time(plan: Plan, wish: ExcitationWish, time_s: float | None) -> Plan:
     counted = whole - segment.settle_periods
     if counted < LEAST_COUNTED:
         needed = len(plan.segments) * (LEAST_COUNTED + segment.settle_periods) * segment.reference.period_s + between
-        raise PlanRefused(f"time: {time_s:.0f} s are too short, this excitation needs {needed:.0f} s")
+        raise PlanRefused(
+            f"time: {time_s:.0f} s are too short, this excitation needs {needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more (or leave it out; limits.time_s bounds it, too), or a higher"
+            " --frequency",
+        )
     return plan.with_counted(counted)

@@ -10,6 +10,7 @@ from tdhil.protocol.excitation.plan import (
     Plan,
     PlannedSegment,
     make_plan,
+    settling_periods,
 )
 from tdhil.protocol.excitation.shape import Shape
 from tdhil.protocol.excitation.swing import SwingKind, SwingPlan, make_swings
@@ -36,4 +37,5 @@ __all__ = [
     "make_plan",
     "make_swings",
     "make_transition",
+    "settling_periods",
 ]

@@ -12,8 +12,18 @@ TORQUE_RESERVE = 0.15   # share of the torque limit that a plan leaves to the sp
 SPEED_MARGIN = 0.03     # share of the speed window kept free at either end, for what drifts
 
 
+USUAL_STEP = "Change --amplitude, --offset, --frequency or the limits"
+
+
 class PlanRefused(ValueError):
-    """The wished motion doesn't fit; the message names the limit, what was needed, and what there is."""
+    """The wished motion doesn't fit; the message names the limit, what was needed, and what there is.
+
+    ``next_step``: which option would change that.
+    """
+
+    def __init__(self, what: str, next_step: str = USUAL_STEP) -> None:
+        super().__init__(what)
+        self.next_step = next_step
 
 
 @dataclass(frozen=True)

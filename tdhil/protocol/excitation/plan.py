@@ -141,7 +141,7 @@ def make_plan(limits: MachineLimits, guess: RigGuess, wish: ExcitationWish | Non
     shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
     fit = _Fit.of(shape, period, limits, guess, wish.mode)
     amplitude, offsets = _amplitude_and_offsets(fit, wish)
-    settle = max(1, math.ceil(_SETTLE_S / period - 1e-9))
+    settle = settling_periods(period)
     periods = _periods(wish, period, settle)
     return Plan(
         wish.kind,
@@ -261,10 +261,17 @@ def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
     return make(), frequency
 
 
+def settling_periods(period_s: float) -> int:
+    """How many periods go to settling."""
+    return max(1, math.ceil(_SETTLE_S / period_s - 1e-9))
+
+
 def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
     if wish.periods is not None:
         if wish.periods < settle + 1:
-            raise PlanRefused(f"{wish.periods} periods are too few: {settle} go to settling")
+            raise PlanRefused(
+                f"{wish.periods} periods are too few: {settle} go to settling", f"Give --periods {settle + 1} or more"
+            )
         return wish.periods
     if wish.kind == "sine":
         return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))

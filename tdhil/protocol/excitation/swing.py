@@ -111,7 +111,8 @@ def make_swings(
     if len(ways) < _LEAST_SWINGS:
         needed = CALM_S + sum(way.duration_s + CALM_S for way in islice(_again(ways, endless), _LEAST_SWINGS))
         raise PlanRefused(
-            f"time: {len(ways)} ways up and down are too few to tell the inertia, {_LEAST_SWINGS} take {needed:.0f} s"
+            f"time: {len(ways)} ways up and down are too few to tell the inertia, {_LEAST_SWINGS} take {needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more, --periods {_LEAST_SWINGS} or more, or leave both out",
         )
     torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
                way.reference(0.999999 * way.duration_s)[1])]
