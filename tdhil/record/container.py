@@ -11,6 +11,9 @@ Schemas and channels stand in the first chunk, where the CRC covers them. Each c
 system in one piece with its indexes, so what a kill leaves is whole chunks and at most one cut one.
 """
 
+import errno
+import os
+import stat
 from contextlib import suppress
 from struct import Struct
 from typing import Any, Final, Protocol
@@ -46,12 +49,21 @@ class RawFile(Protocol):
     def close(self) -> None: ...
 
 
+class LogGone(OSError):
+    """Somebody else has removed the file, or cut it short, while it was being written."""
+
+
 class Container:
-    """One file being written. Every method but `add` may raise OSError; the file then ends with its last chunk."""
+    """One file being written. Every method but `add` may raise OSError; the file then ends with its last chunk.
+
+    Before each write it is looked whether the file is still there: one that was removed takes all that is written to it
+    without a word, and so does one that was cut short.
+    """
 
     def __init__(self, file: RawFile) -> None:
         self._file = file
         self._offset = 0
+        self._watched = _is_named(file)
         self._compress = zstandard.ZstdCompressor(level=1).compress
         self._parts: list[bytes] = []
         self._size = 0
@@ -129,7 +141,9 @@ class Container:
         self._file.close()
 
     def _put(self, data: bytes) -> None:
-        """Writes all of ``data``, or leaves the file as it was before and raises OSError."""
+        """Writes all of ``data``, or leaves the file as it was before and raises OSError; LogGone where it is gone."""
+        if self._watched:
+            self._look()
         left = memoryview(data)
         try:
             while left:
@@ -144,6 +158,15 @@ class Container:
             raise
         self._offset += len(data)
 
+    def _look(self) -> None:
+        found = os.fstat(self._file.fileno())
+        if not found.st_nlink:
+            raise LogGone(errno.ENOENT, "the file was removed while it was being written")
+        if found.st_size < self._offset:
+            raise LogGone(
+                errno.EIO, f"the file was cut to {found.st_size} of {self._offset} bytes while it was being written"
+            )
+
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=0, metadata_count=0, channel_count=len(CHANNELS), schema_count=len(CHANNELS),
@@ -151,6 +174,15 @@ class Container:
             channel_message_counts={channel: count for channel, count in self._counts.items() if count},
             message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
             message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0))
+
+
+def _is_named(file: RawFile) -> bool:
+    """Is it a plain file whose names are counted? Pipes and devices aren't, and some file systems don't count."""
+    try:
+        found = os.fstat(file.fileno())
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISREG(found.st_mode) and found.st_nlink > 0
 
 
 def _declarations() -> tuple[list[bytes], list[bytes]]:

@@ -27,7 +27,7 @@ class Pump:
     """
 
     def __init__(self, backlog: Backlog, container: Container, syncer: Syncer, epoch_ns: int) -> None:
-        self.failure: Exception | None = None
+        self.failure: BaseException | None = None
         self._backlog = backlog
         self._container = container
         self._syncer = syncer
@@ -39,9 +39,11 @@ class Pump:
         self._told = 0                         # drops that have been logged
 
     def run(self) -> None:
-        """The thread's body; lets no exception out."""
-        self._guarded(self._work)
-        self._backlog.end()
+        """The thread's body; lets no exception out. However it ends, nobody waits for it any more."""
+        try:
+            self._guarded(self._work)
+        finally:
+            self._backlog.end()
         self._backlog.items.clear()
         self._guarded(self._close_chunk)
         self._guarded(self._container.finish)
@@ -51,7 +53,7 @@ class Pump:
     def _guarded(self, step: Callable[[], None]) -> None:
         try:
             step()
-        except Exception as error:             # kept for the run, which raises it in its own thread
+        except BaseException as error:         # kept for the run, which raises it in its own thread
             self.failure = self.failure or error
 
     def _work(self) -> None:

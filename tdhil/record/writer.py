@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 from drivers.drive import Command, RawFrame, Sample
 from tdhil.record import cold
 from tdhil.record.backlog import Backlog
-from tdhil.record.container import Container, RawFile
+from tdhil.record.container import Container, LogGone, RawFile
 from tdhil.record.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.record.event import Event
 from tdhil.record.pump import Pump
@@ -27,6 +27,7 @@ from tdhil.record.sync import Syncer
 
 STEPPED_QUEUE: Final = 1024            # records; small, since in stepped time it can hold much control time
 REAL_TIME_QUEUE: Final = 16384         # some seconds at 250 Hz: what a slow disk may take before records are lost
+ALIVE_EVERY_S: Final = 1.0             # of control time: whether there still is a thread that writes
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -39,8 +40,9 @@ class RunWriter:
 
     Raises `LogUnopened` and, where less than ``min_free_bytes`` are free, `LogRefused`.
 
-    When the thread fails (disk full), the next call raises `LogBroken`, once; after that records are
-    discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close` raises it again.
+    When the thread fails (disk full, file removed or cut short by somebody), the next call raises `LogBroken`, once;
+    after that records are discarded, so that the stop sequence isn't disturbed by a log that is gone, and `close`
+    raises it again.
     `frame` never raises: it is called from inside the drive's own input and output.
     """
 
@@ -56,7 +58,8 @@ class RunWriter:
         opener: Callable[[Path], RawFile] | None = None,
     ) -> None:
         self.path = path
-        self._raised = False
+        self._raised = self._closing = False
+        self._looked_s = 0.0
         self._backlog = Backlog(queue_size or (STEPPED_QUEUE if block else REAL_TIME_QUEUE), block=block)
         try:
             free = shutil.disk_usage(path.absolute().parent).free
@@ -87,6 +90,11 @@ class RunWriter:
 
     def sample(self, sample: Sample) -> None:
         """One cycle's feedback; call it after the cycle's command and frames."""
+        if abs(sample[0] - self._looked_s) >= ALIVE_EVERY_S:
+            self._looked_s = sample[0]
+            if not (self._closing or self._thread.is_alive()):
+                self._pump.failure = self._pump.failure or RuntimeError("its thread has ended")
+                self._backlog.end()
         if not self._backlog.put(sample):
             self._refused()
         elif self._block:
@@ -125,6 +133,7 @@ class RunWriter:
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Writes what waits and finishes the file; idempotent. Raises `LogBroken` if the log isn't whole."""
+        self._closing = True
         self._backlog.end()
         self._backlog.wake.set()
         self._thread.join(timeout_s)
@@ -156,8 +165,10 @@ class RunWriter:
             self._raised = True
             raise failure from self._pump.failure
 
-    def _error(self, kind: type[LogError], what: str, cause: Exception) -> LogError:
+    def _error(self, kind: type[LogError], what: str, cause: BaseException) -> LogError:
         reason = cause.strerror if isinstance(cause, OSError) and cause.strerror else f"{type(cause).__name__}: {cause}"
         full = isinstance(cause, OSError) and cause.errno in _FULL
-        return kind(f"{what}: {reason}", where=str(self.path),
-                    next_step="Free some space, or log to another disk" if full else "Choose another file")
+        next_step = "Free some space, or log to another disk" if full else "Choose another file"
+        if isinstance(cause, LogGone):
+            next_step = "Leave the log alone while a run is under way"
+        return kind(f"{what}: {reason}", where=str(self.path), next_step=next_step)

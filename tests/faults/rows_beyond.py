@@ -124,6 +124,10 @@ STAGES: dict[int, Row] = {
             ("tests/faults/test_stage_rows.py::test_a_shaft_that_does_not_follow_in_speed_mode",
              "tests/protocol/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
              "tests/protocol/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
+    90: Row("a log that is removed, cut short, or whose thread dies", "said at once: QS", "3",
+            ("tests/faults/test_stage_rows.py::test_a_log_that_is_taken_away",
+             "tests/record/test_writer.py::test_a_log_that_was_taken_away_is_told_at_once",
+             "tests/record/test_writer.py::test_a_log_whose_thread_died_is_told_within_a_second")),
 }
 
 STREAMS = "tests/path/test_streams.py::"

@@ -1,7 +1,12 @@
 """Rows beyond the fifty that the guard, the string's rules, the stop and the end of a run answer for."""
 
-import pytest
+import os
+from pathlib import Path
 
+import pytest
+from rehearsal import at
+
+from tdhil.record.pump import Pump
 from tdhil.record.reader import read_run
 
 RIG = """
@@ -56,3 +61,25 @@ def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
     run.assert_ended(7, "does not follow", "apart since", "limit", "brake or the load")
     standstill_s = run.assert_stopped(run.fault_s, 8.0)
     seen(89, run.message, standstill_s, run.assert_log_whole(), run.done.code)
+
+
+def _thread_dies(path):
+    """As where memory runs out in it: whatever it does next raises."""
+    def dead(*_arguments):
+        raise SystemExit("killed")
+
+    Pump._drain = dead
+
+
+@pytest.mark.parametrize(("how", "said"), [
+    (Path.unlink, "removed while it was being written"), (lambda path: os.truncate(path, 100), "was cut to 100 of"),
+    (_thread_dies, "killed"),
+], ids=["removed", "cut short", "thread dies"])
+def test_a_log_that_is_taken_away(how, said, rehearse, monkeypatch, tmp_path, seen):
+    monkeypatch.setattr(Pump, "_drain", Pump._drain)           # put back afterwards
+    acted = at(monkeypatch, "speed", 15.0, lambda sample: how(tmp_path / "run.mcap"))
+    run = rehearse()
+    run.assert_ended(3, "can't be written any more", said, "run.mcap")
+    standstill_s = run.assert_stopped(acted[0], 1.5)
+    assert "the shaft is at rest" in run.done.document["stop"]
+    seen(90, run.message.replace(str(tmp_path), "."), standstill_s, "gone", run.done.code)

@@ -277,3 +277,86 @@ def test_a_stage_that_lost_records_is_marked_so_in_the_log(tmp_path):
     run = read_run(tmp_path / "run.mcap")
     assert run.stages[1:] == tuple(said)
     assert log.recording(complete=True).stages == run.stages
+
+
+# -- a log that somebody takes away --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block", [True, False])
+@pytest.mark.parametrize(("how", "said"), [
+    ("removed", "removed while it was being written"), ("replaced", "removed while"), ("cut", "was cut to 0 of"),
+    ("shortened", "was cut to"),
+])
+def test_a_log_that_was_taken_away_is_told_at_once(tmp_path, block, how, said):
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, epoch_ns=0, block=block)
+    rng = random.Random(1)
+    for cycle in range(500):
+        writer.sample(sample(cycle, rng))
+    written_from = time.monotonic()
+    while path.stat().st_size < 2000 and time.monotonic() - written_from < 10.0:
+        time.sleep(0.02)
+    if how == "removed":
+        path.unlink()
+    elif how == "replaced":
+        other = tmp_path / "other"
+        other.write_bytes(b"x" * 10**6)
+        other.replace(path)
+    else:
+        with path.open("r+b") as file:
+            file.truncate(0 if how == "cut" else 1000)
+    with pytest.raises(LogBroken, match=said) as caught:
+        for cycle in range(500, 500_000):
+            writer.sample(sample(cycle, rng))
+            time.sleep(1e-4)
+    assert exit_code(caught.value) is ExitCode.PARTIAL
+    assert "Leave the log alone" in caught.value.next_step and str(path) == caught.value.where
+    # Once; the stop goes on without a log, and the end says it again.
+    for cycle in range(1000):
+        writer.sample(sample(cycle, rng))
+    with pytest.raises(LogBroken, match=said):
+        writer.close()
+
+
+def test_a_log_that_was_moved_is_whole(tmp_path):
+    """The same file under another name."""
+    path, other = tmp_path / "run.mcap", tmp_path / "elsewhere.mcap"
+    writer = RunWriter(path, epoch_ns=0, block=True)
+    rng = random.Random(1)
+    for cycle in range(2000):
+        writer.sample(sample(cycle, rng))
+        if cycle == 1000:
+            path.rename(other)
+    writer.close()
+    assert read_run(other).complete
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize(("block", "where"), [(True, "at work"), (False, "at work"), (False, "between")])
+def test_a_log_whose_thread_died_is_told_within_a_second(tmp_path, monkeypatch, block, where):
+    """Nothing waits for it for ever, and nothing goes on as if it were written."""
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=block)
+
+    def die(*_arguments):
+        raise SystemExit("killed")
+
+    if where == "at work":
+        monkeypatch.setattr(writer._pump, "_drain", die)
+    else:
+        monkeypatch.setattr(writer._pump, "_guarded", die)
+        writer._backlog.ended = True
+        writer._thread.join(5.0)
+        writer._backlog.ended = False              # as if it had been killed where it could not even say so
+        writer._backlog._alert = 256
+    rng = random.Random(1)
+    begun_s = time.monotonic()
+    with pytest.raises(LogBroken, match="killed" if where == "at work" else "thread has ended"):
+        for cycle in range(100_000):
+            writer.sample(sample(cycle, rng))
+            if where == "at work":
+                time.sleep(1e-4)
+    assert time.monotonic() - begun_s < 5.0
+    if where == "between":
+        assert cycle * 0.004 <= 1.1
+    with pytest.raises(LogBroken):
+        writer.close()
