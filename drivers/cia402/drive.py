@@ -41,6 +41,7 @@ from drivers.cia402.watch import STOPPED, Watch
 from drivers.clock import Clock
 from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.left_behind import LeftBehind
 from drivers.table import Table
 from drivers.ticks import RATES_HZ, Ticks, how_late
 from drivers.wider import OwnLimits
@@ -70,7 +71,8 @@ _REPEAT_MODE_CYCLES = 25
 
 
 class Cia402Drive:
-    """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame.
+    """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame;
+    ``left`` keeps what is changed in the drive, for whoever comes after a host that died.
 
     ``stepped`` asks a simulated peer to let each SYNC advance its time; a real one is refused it.
     """
@@ -86,6 +88,7 @@ class Cia402Drive:
         rated_torque_nm: float | None = None,
         host_node: int = HOST_NODE,
         tap: FrameTap | None = None,
+        left: LeftBehind | None = None,
     ) -> None:
         self.clock = clock
         self.period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
@@ -95,6 +98,7 @@ class Cia402Drive:
         self._rated_torque_nm = rated_torque_nm
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
+        self._left = left
         self._watch = Watch(node, clock)
         self._strangers = Strangers(self._link, self._watch, clock, node=node, number=host_node)
         self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
@@ -200,6 +204,8 @@ class Cia402Drive:
             raise PreflightRefused("preflight before connect", where="driver")
         table, objects, scaling = Table(), self._objects, Table()
         self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
+        if self._left is not None:
+            checks.give_back_left(table, objects, self._left, self._identity)
         checks.check_identity(table, self._identity, self._profile)
         checks.check_state(table, objects, self._units)
         check_parameters(table, objects, self._profile)

@@ -9,10 +9,11 @@ from collections.abc import Callable, Mapping
 
 from drivers.cia402.filters import read_filters
 from drivers.cia402.objects import MODE_NAMES, Units
-from drivers.cia402.sdo import Objects
+from drivers.cia402.sdo import Objects, place
 from drivers.cia402.state import State, decode
 from drivers.drive import Identity, Mode, Preflight
-from drivers.errors import PreflightRefused
+from drivers.errors import ObjectRefused, PreflightRefused
+from drivers.left_behind import LeftBehind
 from drivers.table import Table
 from drivers.wider import SPEED, TORQUE
 from profiles.schema import CanopenProfile
@@ -48,6 +49,27 @@ def check_identity(table: Table, identity: Identity, profile: CanopenProfile) ->
             "1018h",
             f"This is not the drive of profile {profile.name}: choose its own with --profile",
         )
+
+
+def give_back_left(table: Table, objects: Objects, left: LeftBehind, identity: Identity) -> None:
+    """What an earlier run has left in the drive, since its host died: given back where it still stands so."""
+    given, others = [], []
+    for one in left.opened(identity):
+        index, sub = place(one.where)
+        try:
+            if objects.read_bytes(index, sub) == one.after:
+                objects.write_bytes(index, sub, one.before)
+                given.append(one.text)
+            else:
+                others.append(one.where)
+            left.given_back(one.where)
+        except ObjectRefused as error:
+            table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive, by hand")
+    if given:
+        table.note("left by an earlier run", f"{', '.join(given)}: given back now", "log's folder")
+    if others:
+        table.note("left by an earlier run", f"{', '.join(others)}: changed by somebody since, left alone", "")
+    objects.left = left
 
 
 def check_state(table: Table, objects: Objects, units: Units) -> None:

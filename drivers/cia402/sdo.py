@@ -16,6 +16,7 @@ from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from drivers.cia402.link import CanLink
 from drivers.errors import CommunicationLost, ObjectRefused
+from drivers.left_behind import LeftBehind
 
 
 class _LinkNetwork(canopen.Network):  # type: ignore[misc]
@@ -94,6 +95,7 @@ class Objects:
         self._node = node
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
+        self.left: LeftBehind | None = None        # where changes are written down before they are made
         self.stands: dict[tuple[int, int], bytes] = {}     # what `change` last read back, or was found right and left
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
@@ -135,11 +137,7 @@ class Objects:
             return None
 
     def write(self, index: int, subindex: int, value: int, bits: int) -> None:
-        try:
-            data = value.to_bytes(bits // 8, "little", signed=value < 0)
-        except OverflowError as error:
-            raise ObjectRefused(f"{value} doesn't fit into {bits} bits", where=name(index, subindex)) from error
-        self.write_bytes(index, subindex, data, str(value))
+        self.write_bytes(index, subindex, _encoded(value, bits, name(index, subindex)), str(value))
 
     def write_bytes(self, index: int, subindex: int, data: bytes, shown: str = "") -> None:
         """``shown`` is the value as people read it."""
@@ -155,12 +153,11 @@ class Objects:
     def change(self, index: int, subindex: int, value: int, bits: int) -> int:
         """Write, remember what stood there before, and read back what stands there now."""
         signed = value < 0
-        before = self.read(index, subindex, signed=signed)
-        if before != value:
-            if (index, subindex) not in self._changed:
-                self._changed.add((index, subindex))
-                self.on_restore(lambda: self.write(index, subindex, before, bits))
-            self.write(index, subindex, value, bits)
+        before = self.read_bytes(index, subindex)
+        if int.from_bytes(before, "little", signed=signed) != value:
+            after = _encoded(value, bits, name(index, subindex))
+            self._note_change(index, subindex, before, after)
+            self.write_bytes(index, subindex, after, str(value))
         back = self.stands[index, subindex] = self.read_bytes(index, subindex)
         return int.from_bytes(back, "little", signed=signed)
 
@@ -168,12 +165,24 @@ class Objects:
         """As `change`, for an object of any type."""
         before = self.read_bytes(index, subindex)
         if before != data:
-            if (index, subindex) not in self._changed:
-                self._changed.add((index, subindex))
-                self.on_restore(lambda: self.write_bytes(index, subindex, before))
+            self._note_change(index, subindex, before, data)
             self.write_bytes(index, subindex, data)
         back = self.stands[index, subindex] = self.read_bytes(index, subindex)
         return back
+
+    def _note_change(self, index: int, subindex: int, before: bytes, after: bytes) -> None:
+        """How it will be given back; and, for whoever comes after a host that died, what stood there."""
+        where = name(index, subindex)
+        if (index, subindex) not in self._changed:
+            self._changed.add((index, subindex))
+            self.on_restore(lambda: self._give_back(index, subindex, before))
+        if self.left is not None:
+            self.left.changing(where, before, after)
+
+    def _give_back(self, index: int, subindex: int, before: bytes) -> None:
+        self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
+        if self.left is not None:
+            self.left.given_back(name(index, subindex))
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called by `restore`."""
@@ -199,6 +208,19 @@ class Objects:
             where=name(index, subindex),
             next_step="Check that the drive is powered, its node-ID and bit rate, the cable and its termination",
         )
+
+
+def _encoded(value: int, bits: int, where: str) -> bytes:
+    try:
+        return value.to_bytes(bits // 8, "little", signed=value < 0)
+    except OverflowError as error:
+        raise ObjectRefused(f"{value} doesn't fit into {bits} bits", where=where) from error
+
+
+def place(where: str) -> tuple[int, int]:
+    """What `name` wrote → (index, subindex). Raises ValueError."""
+    index, _, subindex = where.partition(":")
+    return int(index.removesuffix("h"), 16), int(subindex or 0)
 
 
 def name(index: int, subindex: int = 0) -> str:

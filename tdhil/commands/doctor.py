@@ -69,6 +69,7 @@ def findings(
     from tdhil.commands.finding import note, of_error
 
     yield from host_findings(Path(options["log"]))
+    yield from _left(Path(options["log"]).parent)
     try:
         options, connection = connection_of(cli, rig, options)
     except DataFileError as error:
@@ -83,6 +84,23 @@ def findings(
         yield from _modbus(options, connection, rig, registers)
     else:
         yield from _canopen(options, connection, rig)
+
+
+def _left(folder: Path) -> Iterator[Finding]:
+    """What runs that died have left in their drives."""
+    from drivers.errors import TdhilError
+    from drivers.left_behind import PREFIX, SUFFIX, read
+    from tdhil.commands.finding import bad, of_error
+
+    for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
+        try:
+            drive, settings = read(path)
+        except TdhilError as error:
+            yield of_error("left in a drive", error)
+            continue
+        yield bad("left in a drive", f"{drive}: {', '.join(one.text for one in settings)} ({path.name})",
+                  "A run is under way, or one died: the next run on that drive gives them back; or set them by hand, "
+                  "and remove the file")
 
 
 def _profile(options: Resolved, connection: Connection) -> Iterator[Finding]:

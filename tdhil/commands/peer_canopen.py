@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import Clock
 from drivers.drive import FrameTap
+from drivers.left_behind import LeftBehind
 from profiles.schema import CanopenProfile
 from tdhil.commands.connection import Connection
 from tdhil.commands.profile_said import rated_torque_is_told_by_hand
@@ -41,6 +42,7 @@ def open_canopen(plan: PeerPlan, options: Resolved, connection: Connection, data
             rate_hz=options["rate_hz"],
             rated_torque_nm=rated_torque_nm(plan, profile, data),
             tap=tap,
+            left=None if plan.embedded else LeftBehind(Path(options["log"]).parent, f"node{node}"),
         )
 
 

@@ -197,6 +197,8 @@ class Run:
         return sample.standstill or off
 
     def stop(self):
+        if not getattr(self.bench, "brakes_in_torque_mode", True):      # as a run does it
+            self.until(lambda sample: sample.mode is Mode.SPEED, 1.0)
         self.drive.quick_stop()
         self.until(self.rests, 30.0)
         self.drive.disable()

@@ -16,6 +16,7 @@ class Epos4Bench(CanopenBench):
     PROFILE, WORN = "maxon/epos4", True
     SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
     speed_lsb, torque_lsb = RPM, 1.0
+    brakes_in_torque_mode = False  # its quick stop lets go there: `Preflight.quick_stop_in_torque_mode`
     ramp_rad_s2 = 10.0 * RPM       # 1 rad/s² is 9.55 rpm/s, the next one up
 
     def decode(self, frames):

@@ -51,6 +51,11 @@ SECOND_MASTER: dict[int, Row] = {
              "tests/drivers/test_preflight.py::test_it_is_widened_by_name_and_no_other_with_it",
              "tests/protocol/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
             "kept, and the run keeps within them"),
+    65: Row("a killed host leaves its limits in the drive", "named by doctor, given back by the next run", "-",
+            ("tests/drivers/test_left_behind.py::test_the_next_run_gives_back_what_a_killed_one_left",
+             "tests/drivers/test_left_behind.py::test_each_is_written_down_before_it_is_changed",
+             "tests/path/test_doctor.py::test_what_a_killed_run_left_in_a_drive_is_named"),
+            "named, and given back before the next run looks at the drive's limits"),
 }
 
 MODBUS: dict[int, Row] = {

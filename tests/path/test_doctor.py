@@ -56,6 +56,20 @@ def test_json_says_the_same():
     assert all(one["do"] for one in document["checks"] if one["grade"] == "bad")
 
 
+def test_what_a_killed_run_left_in_a_drive_is_named(tmp_path):
+    from drivers.drive import Identity
+    from drivers.left_behind import LeftBehind
+
+    book = LeftBehind(tmp_path, "node1")
+    book.opened(Identity(0xFB, 0x1, 0, 0x77, "top drive", False))
+    book.changing("6072h", b"\x64\x00", b"\x90\x01")
+    done = tdhil("doctor", "--log", tmp_path / "run.mcap")
+    assert done.code == 4
+    assert "top drive, node1: 6072h was left at 400, and was 100 before" in done.out
+    book.given_back("6072h")
+    assert tdhil("doctor", "--log", tmp_path / "run.mcap").code == 0
+
+
 def test_a_rig_is_looked_at(tmp_path):
     rig = tmp_path / "rig.yaml"
     rig.write_text("limits: {speed_min_rad_s: 1, speed_max_rad_s: 9, torque_nm: 50, time_s: 60, quick_stop_rad_s2: 1, "
