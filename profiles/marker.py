@@ -28,9 +28,15 @@ STAGE_NUMBERS = {"setup": 1, "speed": 2, "torque": 3, "hold": 4, "acquire": 5}
 """The five stages as a peer is told of them."""
 
 CYCLE_ID = 0x6FE
-"""Frames of one byte from a simulated drive with scripted faults, in stepped time only, where waiting for a frame that
-was lost would cost wall time, and a late one might come in this cycle or in the next: `CYCLES_END` says that from the
-next SYNC on each cycle is ended by `CYCLE_OVER`, or `LAST_CYCLE_OVER` when that ends. CiA 301 keeps 6E1h to 6FFh free
-of other uses."""
+"""Frames about the cycles of stepped time, between a host and a simulated drive only: in stepped time nothing is late,
+so nobody waits for so long and then goes on, which would make a run depend on how busy the computer is.
+
+`CYCLES_END` (one byte, from a drive with scripted faults) says that from this SYNC on each cycle is ended by
+`CYCLE_OVER`, or `LAST_CYCLE_OVER` when that ends. `CYCLE_ASKED` and a number (from a host to which nothing comes) is
+answered by `CYCLE_ANSWER` and the same number: whatever the drive had to say to earlier frames has been said by then,
+and what hasn't come was lost. Both pass by scripted faults, also where these let nothing else through: they are no
+frames of the bus that is simulated. CiA 301 keeps 6E1h to 6FFh free of other uses."""
 
 LAST_CYCLE_OVER, CYCLE_OVER, CYCLES_END = b"\x00", b"\x01", b"\x02"
+CYCLE_ASKED, CYCLE_ANSWER = b"\x03", b"\x04"
+"""Each before a byte that numbers the question."""

@@ -1,8 +1,8 @@
 """Scripted misbehaviour of one simulated drive: what is due begins and ends, and frames pass through what is going on.
 
 All of it in plant time: in stepped time a script repeats to the last frame. In stepped time a SYNC that is lost on its
-way to the drive lets time go on all the same, and while a fault is on the host is told where each cycle ends
-(`profiles.marker.CYCLE_ID`), unless the bus is dead.
+way to the drive lets time go on all the same, and the host is told where each cycle ends (`profiles.marker.CYCLE_ID`),
+from the first one on: also what a fault makes the drive say behind its feedback is then in its cycle.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,6 @@ import numpy as np
 from profiles.marker import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.cia402_node import SYNC, Cia402Node
 from sim_bus.fault_catalogue import make
-from sim_bus.fault_frames import Dead
 from sim_bus.fault_hooks import Frame, Misbehaviour, Scene
 from sim_bus.fault_script import Cast, Scripted
 from sim_bus.link import Sender
@@ -47,13 +46,13 @@ class Faults:
     def moved(self, now_us: int) -> None:
         """Plant time has come so far."""
         self._cast.moved(now_us, self._node.note)
-        if self._cast.active and self._node.stepped and not self._dead and not self._ends_cycles:
-            self._ends_cycles = True
-            self._put(CYCLE_ID, CYCLES_END)
 
     def came(self, can_id: int, data: bytes | bytearray) -> None:
         """A frame from the bus, on its way to the node."""
-        node, told = self._node, self._ends_cycles
+        node = self._node
+        if can_id == SYNC and node.stepped and not self._ends_cycles and self._more:
+            self._ends_cycles = True
+            self._put(CYCLE_ID, CYCLES_END)
         frames: list[Frame] = [(can_id, data)]
         for fault in tuple(self._cast.active):
             frames = [after for before in frames for after in fault.incoming(*before)]
@@ -63,13 +62,14 @@ class Faults:
             return
         if not any(one == SYNC for one, _ in frames):
             node.pass_cycle()
-        if told and not self._dead:
-            self._ends_cycles = bool(self._cast.active)
-            self._put(CYCLE_ID, CYCLE_OVER if self._cast.active else LAST_CYCLE_OVER)
+        if self._ends_cycles:
+            self._ends_cycles = self._more
+            self._put(CYCLE_ID, CYCLE_OVER if self._more else LAST_CYCLE_OVER)
 
     @property
-    def _dead(self) -> bool:
-        return any(isinstance(fault, Dead) for fault in self._cast.active)
+    def _more(self) -> bool:
+        """Something goes on, or is still to come."""
+        return bool(self._cast.active or self._cast.waiting)
 
     def _on_stage(self, number: int) -> None:
         self._cast.stage(number, self._node.time_us)

@@ -1,9 +1,9 @@
 """The loop that owns the bus: frames in, plant time on. And the same in a thread, for one process.
 
-Stepped time moves with the SYNC alone, but for a host that has fallen silent: after ``silence_s`` of wall time
-without a frame, or at once when the bus reports its end, the simulator runs on in its own time, so that the
-drive's watchdog acts and the shaft comes to rest. Frames that come again make it go on stepped. Before the first
-SYNC there is nothing to run on from, and time stands still.
+Stepped time moves with the SYNC alone, but for a host that has fallen silent: after ``silence_s`` of wall time in which
+the simulator itself was awake and no frame came, or at once when the bus reports its end, the simulator runs on in its
+own time, so that the drive's watchdog acts and the shaft comes to rest. Frames that come again make it go on stepped.
+Before the first SYNC there is nothing to run on from, and time stands still.
 """
 
 import math
@@ -16,6 +16,7 @@ from typing import Self
 
 import can
 
+from profiles.marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 from profiles.schema import CanopenProfile
 from sim_bus.cia402_node import Cia402Node
 from sim_bus.fault_script import Scripted
@@ -112,6 +113,9 @@ class Simulator:
         was_stepped = node.stepped
         if message.is_remote_frame:
             node.on_remote(message.arbitration_id)
+        elif message.arbitration_id == CYCLE_ID:
+            if node.stepped and message.data[:1] == CYCLE_ASKED:
+                self._sender.put(CYCLE_ID, CYCLE_ANSWER + message.data[1:2])
         elif self._faults is not None:
             self._faults.came(message.arbitration_id, message.data)
         else:
@@ -131,7 +135,8 @@ class Simulator:
         if waited_s < 0.5 * timeout_s:
             stop.wait(timeout_s)
             waited_s += timeout_s
-        self._silent_s += waited_s
+        # Whoever doesn't get the processor himself doesn't know that others are silent: no wait counts for more.
+        self._silent_s += min(waited_s, timeout_s)
         if self._silent_s >= self._silence_s:
             self._run_on("host silent: running on in own time")
 

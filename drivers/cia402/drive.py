@@ -13,7 +13,6 @@ by node guarding instead (remote frame 700h+node); what else the frames of a dri
 from __future__ import annotations
 
 import math
-import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from drivers.cia402 import preflight as checks
 from drivers.cia402.feedback import Feedback
 from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_doubt
 from drivers.cia402.limits import set_limits
-from drivers.cia402.link import CanLink
+from drivers.cia402.link import PEER_DEAD_S, CanLink
 from drivers.cia402.look import keep_stepping, look, push
 from drivers.cia402.mapping import slow_syncs
 from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
@@ -60,8 +59,6 @@ FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
 QUICK_STOP_OPTION = 0x605A
 DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
-STEPPED_WAIT_S, STEPPED_WAIT_SILENT_S = 0.5, 0.05
-"""Wall time that feedback may take in stepped time, and after a cycle that brought none."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
 """A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
 _NO_WORD = b""
@@ -140,7 +137,6 @@ class Cia402Drive:
         self._since_mode_sent = 0
         self._mode_overwritten = False
         self._contradictions = 0
-        self._heard = True
         self._ticks = Ticks(clock, self.period_s)
         self._watch.host_stood_still = self._stood_still
         self._cycles = self._missed = self._late = 0
@@ -185,6 +181,7 @@ class Cia402Drive:
         self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
         self._identity = read_identity(self._objects)
         refuse_in_doubt(self._objects, self._identity, self._node, self.clock.stepped)
+        self._link.asks = self.clock.stepped
         self.announce(self._stage)
         return self._identity
 
@@ -425,7 +422,6 @@ class Cia402Drive:
         age_s = self._await_feedback(now_s)
         self._cycles += 1
         fresh = bool(feedback.data)
-        self._heard = fresh or feedback.over
         if not fresh:
             self._missed += 1
         if feedback.doubted() and self._wish is not Wish.ENABLED:
@@ -512,10 +508,8 @@ class Cia402Drive:
         clock = self.clock
         link = self._link
         if clock.stepped:
-            # In stepped time nothing is late, it is lost; a peer that has fallen silent must not hold the host up.
-            deadline_s = time.monotonic() + (STEPPED_WAIT_S if self._heard else STEPPED_WAIT_SILENT_S)
-            while not self._feedback.done and (left_s := deadline_s - time.monotonic()) > 0.0:
-                link.receive(left_s)
+            # In stepped time nothing is late, it is lost.
+            link.await_answer(lambda: self._feedback.done, PEER_DEAD_S)
             return 0.0
         feedback = self._feedback
         first = not feedback.arrived and self._cycles < FIRST_ANSWERS

@@ -17,6 +17,7 @@ from drivers.cia402.trouble import Condition, condition, queue_is_full
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
+from profiles.marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 
 if TYPE_CHECKING:
     import can
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
 Handler = Callable[[bytes], None]
 LONGEST_DRAIN_S = 0.25
 """Of wall time. A cycle must not be held up for ever by a bus on which something babbles."""
+PEER_DEAD_S = 4.0
+"""In stepped time a peer that has answered no question for so long, of wall time, is dead; nothing else ends a wait."""
+PEER_STILL_DEAD_S = 0.05
+"""A dead one is given so long from then on, until it is heard again."""
+ASK_S, ASK_SOON_S, ASK_AGAIN_S = 0.05, 0.002, 0.25
+"""It is asked after so long in which what is waited for didn't come; sooner if that was so the last time."""
 BABBLE_FRAMES = 2000
 """More than a bus of 1 Mbit/s carries in that time: with fewer it was this computer that stood still."""
 
@@ -45,6 +52,9 @@ class CanLink:
         self.passive = 0               # how often the adapter said that it is error-passive
         self.stamps = FrameStamps()
         self.name = str(bus.channel_info)
+        self.asks = False              # the peer is a simulated one in stepped time, and may be asked where a cycle is
+        self._question = 0
+        self._answered = self._in_vain = self._dead = False
 
     def send(self, identifier: int, data: bytes, last_look: Callable[[], None] | None = None) -> None:
         """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it.
@@ -102,6 +112,9 @@ class CanLink:
         if not self._clock.stepped:
             self.stamps.take(message.timestamp, self._clock.now_s())
         identifier, data = message.arbitration_id, bytes(message.data)
+        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: it may come or not
+            self._answered |= data[1:] == bytes((self._question,))
+            return identifier, data
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
         # A remote frame (another master's node guarding) carries no state; 29-bit identifiers are no CANopen of ours.
@@ -141,6 +154,33 @@ class CanLink:
                     where=self.name,
                     next_step="Something babbles on the bus: look with candump, check bit rate and termination",
                 )
+
+    def await_answer(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Handle frames until ``done()``, or until it is clear that what is waited for was lost; whether it was done.
+
+        In real time that is so after ``timeout_s``; with a peer that may be asked (`asks`), as soon as it says that it
+        has nothing more to say: no clock decides then, but whether it is dead.
+        """
+        if not self.asks:
+            return self.pump_until(done, timeout_s)
+        begun_s = time.monotonic()
+        end_s = begun_s + (PEER_STILL_DEAD_S if self._dead else PEER_DEAD_S)
+        ask_s = begun_s + (ASK_SOON_S if self._in_vain else ASK_S)
+        self._question, self._answered = (self._question + 1) % 256, False
+        while not done():
+            now_s = time.monotonic()
+            if self._answered or now_s >= end_s:
+                self._in_vain, self._dead = True, not self._answered
+                return False
+            if now_s >= ask_s:
+                self._put(self._message(
+                    arbitration_id=CYCLE_ID, data=CYCLE_ASKED + bytes((self._question,)), is_extended_id=False,
+                    check=False,
+                ))
+                ask_s = now_s + ASK_AGAIN_S
+            self.receive(min(ask_s, end_s) - now_s)
+        self._in_vain = self._dead = False
+        return True
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Handle frames until ``done()`` or until ``timeout_s`` of wall time has passed; whether it was done."""

@@ -78,7 +78,7 @@ class _PumpingClient(SdoClient):  # type: ignore[misc]
             self.responses.put(data)
 
     def read_response(self) -> Any:
-        self._link.pump_until(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
+        self._link.await_answer(lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT)
         if self.responses.empty():
             raise SdoCommunicationError("No SDO response received")
         return super().read_response()

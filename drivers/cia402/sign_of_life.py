@@ -74,7 +74,7 @@ class SignOfLife:
     def answered(self) -> bool:
         """Waits for the first answer of a guarded drive."""
         guarding = self._guarding
-        return guarding is None or self._link.pump_until(lambda: guarding.answers > 0, ANSWER_S)
+        return guarding is None or self._link.await_answer(lambda: guarding.answers > 0, ANSWER_S)
 
 
 def _guarded(profile: CanopenProfile) -> bool:

@@ -111,10 +111,15 @@ class CanopenBench:
         self._second.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def heard(self):
-        """All that the second station has heard since it was last asked."""
+        """All that the second station has heard since it was last asked.
+
+        But for the questions (6FEh, 03h or 04h and a number) that a host puts on a busy computer: they are no part of
+        the run.
+        """
         frames = []
         while (message := self._second.recv(0.0)) is not None:
-            frames.append((message.arbitration_id, bytes(message.data)))
+            if message.arbitration_id != 0x6FE:
+                frames.append((message.arbitration_id, bytes(message.data)))
         return frames
 
     def read(self, index, sub=0):

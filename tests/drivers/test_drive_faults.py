@@ -145,6 +145,15 @@ def numbered(request, wire, peer, profile, fake_time):
 
 
 @pytest.fixture
+def stepped_drive(wire, peer, profile, fake_time):
+    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive.connect()
+    assert drive.preflight(LIMITS).refused == ()
+    drive.enable(Mode.SPEED)
+    return drive
+
+
+@pytest.fixture
 def in_real_time(wire, peer, profile, fake_time):
     drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
@@ -169,18 +178,81 @@ def test_each_sample_is_of_its_own_sync(numbered):
     assert numbered.counters.late == numbered.counters.missed == numbered.counters.overruns == 0
 
 
-def test_a_late_tpdo_is_counted_and_not_taken_for_the_next(numbered, peer):
+def test_a_late_tpdo_is_counted_and_not_taken_for_the_next(in_real_time, peer):
     """It comes after its cycle has given up, and before the next SYNC."""
-    late_s = 0.6 if numbered.clock.stepped else 0.9 * PERIOD_S
-    peer.answer_sync = lambda cycle: [(late_s if cycle == 5 else 0.0002, peer.tpdo(cycle))]
-    if numbered.clock.stepped:
-        samples = exchange(numbered, 5)
-        peer.bus.time.sleep(0.2)
-        samples += exchange(numbered, 5)
-    else:
-        samples = exchange(numbered, 10)
-    assert numbers(samples) == [1, 2, 3, 4, None, 6, 7, 8, 9, 10]
-    assert (numbered.counters.late, numbered.counters.missed) == (1, 1)
+    late_s = 0.9 * PERIOD_S
+    peer.answer_sync = lambda cycle: [(late_s if cycle == 15 else 0.0002, peer.tpdo(cycle))]
+    assert numbers(exchange(in_real_time, 10)) == [11, 12, 13, 14, None, 16, 17, 18, 19, 20]
+    assert (in_real_time.counters.late, in_real_time.counters.missed) == (1, 1)
+
+
+@pytest.mark.parametrize("late_s", [0.06, 0.6, 3.0])
+def test_in_stepped_time_nothing_is_late(stepped_drive, peer, late_s):
+    """However long a busy computer takes: the run is the same."""
+    peer.answer_sync = lambda cycle: [(late_s if cycle % 5 == 0 else 0.0002, peer.tpdo(cycle))]
+    assert numbers(exchange(stepped_drive, 20)) == list(range(1, 21))
+    assert (stepped_drive.counters.late, stepped_drive.counters.missed) == (0, 0)
+
+
+def answered_questions(wire, send, after_s):
+    """What was lost is known when the peer answers a question that was put behind it (6FEh, 03h and a number)."""
+    def on_send(identifier, data):
+        if identifier == 0x6FE:
+            assert data[:1] == b"\x03"
+            wire.put(0x6FE, b"\x04" + data[1:], after_s)
+        send(identifier, data)
+
+    return on_send
+
+
+@pytest.mark.parametrize("slow_s", [0.0, 0.04, 0.4, 3.0])
+def test_in_stepped_time_what_is_lost_is_lost_on_any_computer(stepped_drive, peer, wire, slow_s):
+    """Answers take so long; one in five never comes. Nothing but what the peer says decides."""
+    wire.on_send = answered_questions(wire, wire.on_send, slow_s)
+    peer.answer_sync = lambda cycle: [] if cycle % 5 == 0 else [(slow_s, peer.tpdo(cycle))]
+    assert numbers(exchange(stepped_drive, 20)) == [None if k % 5 == 0 else k for k in range(1, 21)]
+    assert stepped_drive.counters.missed == 4
+
+
+def test_an_answer_to_an_older_question_ends_no_cycle(stepped_drive, peer, wire):
+    """The TPDO came after all, and the answer behind it: it belongs to a cycle that is over."""
+    wire.on_send = answered_questions(wire, wire.on_send, 0.3)
+    peer.answer_sync = lambda cycle: [(0.2 if cycle == 5 else 0.0002 if cycle < 6 else 0.15, peer.tpdo(cycle))]
+    assert numbers(exchange(stepped_drive, 10)) == list(range(1, 11))
+
+
+def test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on(stepped_drive, peer, wire, fake_time):
+    exchange(stepped_drive, 5)
+    peer.silent = True
+    begun_s = fake_time.now_s
+    assert numbers(exchange(stepped_drive, 1)) == [None]
+    assert fake_time.now_s - begun_s == pytest.approx(4.0, abs=0.1)
+    begun_s = fake_time.now_s
+    for _ in range(100):
+        with contextlib.suppress(CommunicationLost):      # its heartbeat is missing
+            exchange(stepped_drive, 1)
+    assert fake_time.now_s - begun_s < 6.0
+    peer.silent = False
+    assert numbers(exchange(stepped_drive, 3)) == [6, 7, 8]
+
+
+def test_questions_are_no_part_of_the_log(wire, peer, profile, fake_time):
+    frames = []
+    drive = Cia402Drive(wire, profile, SteppedClock(), node=1, tap=frames.append)
+    drive.connect()
+    drive.preflight(LIMITS)
+    wire.on_send = answered_questions(wire, wire.on_send, 0.01)
+    peer.answer_sync = lambda cycle: []
+    exchange(drive, 5)
+    assert wire.of(0x6FE)
+    assert not [frame for frame in frames if frame.identifier == 0x6FE]
+
+
+def test_a_real_drive_is_asked_nothing(in_real_time, peer, wire):
+    peer.answer_sync = lambda cycle: []
+    with contextlib.suppress(CommunicationLost):
+        exchange(in_real_time, 300)
+    assert wire.of(0x6FE) == []
 
 
 def test_a_duplicate_is_counted_and_not_taken_for_the_next(numbered, peer):

@@ -9,7 +9,7 @@ from modbus_bank import CONTROL
 from power_machine import ENABLED, STOPPING
 from test_modbus_drive import Run as BankRun
 
-from drivers.cia402 import drive as drive_module
+from drivers.cia402 import link
 from drivers.drive import Looking, PowerState
 from drivers.errors import CommunicationLost, DriveFault
 
@@ -25,9 +25,8 @@ def bench():
 
 @pytest.fixture
 def turning(bench, monkeypatch):
-    # The embedded simulator answers within a millisecond or not at all.
-    monkeypatch.setattr(drive_module, "STEPPED_WAIT_SILENT_S", 0.001)
-    monkeypatch.setattr(drive_module, "STEPPED_WAIT_S", 0.05)
+    monkeypatch.setattr(link, "PEER_DEAD_S", 0.5)
+    monkeypatch.setattr(link, "PEER_STILL_DEAD_S", 0.001)
     run = Run(bench)
     run.ready()
     run.enable()

@@ -29,12 +29,8 @@ def no_bus_of_the_user(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def rehearse(no_bus_of_the_user, monkeypatch, tmp_path):
+def rehearse(no_bus_of_the_user, tmp_path):
     """`tdhil identify --simulate` in this process: ``rehearse(*arguments)``, see `rehearsal`."""
     from rehearsal import run
 
-    from drivers.cia402 import drive
-
-    # The embedded simulator answers within a millisecond or not at all.
-    monkeypatch.setattr(drive, "STEPPED_WAIT_SILENT_S", 0.005)
     return lambda *arguments: run(tmp_path, *arguments)

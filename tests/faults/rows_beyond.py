@@ -18,6 +18,16 @@ LATE: dict[int, Row] = {
             ("tests/protocol/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
              "tests/protocol/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
             "the plan is dropped, not waited for; it was before, and nothing was sent meanwhile"),
+    54: Row("a busy computer, in stepped time (answers take seconds, or are lost)", "the run is the same", "as without",
+            ("tests/drivers/test_drive_faults.py::test_in_stepped_time_nothing_is_late",
+             "tests/drivers/test_drive_faults.py::test_in_stepped_time_what_is_lost_is_lost_on_any_computer",
+             "tests/drivers/test_drive_faults.py::test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on"),
+            "the peer is asked whether anything is still to come; nothing but a dead one (4 s) ends a wait"),
+    55: Row("this computer doesn't hold the profile's rate", "a lower one, chosen and said before motion", "0",
+            ("tests/protocol/test_choose_rate.py::"
+             "test_the_highest_rate_whose_half_period_is_longer_than_the_delay",
+             "tests/protocol/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
+            "the highest of which 999 cycles of 1000 are in time by half a period"),
 }
 
 SECOND = f"{HERE}test_second_master_rows.py::"

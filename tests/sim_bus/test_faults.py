@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles.marker import CYCLE_ID, CYCLE_OVER, CYCLES_END, STAGE_NUMBERS
+from profiles.marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID, CYCLE_OVER, CYCLES_END, STAGE_NUMBERS
 from sim_bus.command import main
 from sim_bus.fault_catalogue import KINDS, make, parse_all
 from sim_bus.fault_script import FaultRefused, Moment, Schedule, Scripted, parse
@@ -179,13 +179,33 @@ def test_without_a_script_nothing_is_said_of_cycles(host):
     assert CYCLE_ID not in {identifier for identifier, _ in drive.syncs(50)}
 
 
-def test_while_a_fault_is_on_each_cycle_has_its_end(host):
+def test_until_the_last_fault_is_over_each_cycle_has_its_end(host):
+    """From the first on: what a fault makes the drive say as it begins is then in its cycle, on any computer."""
     drive = host("heartbeat-lost@100ms/200ms")
     ends = [data for identifier, data in drive.syncs(60) if identifier == CYCLE_ID]
     assert ends[0] == CYCLES_END
     assert set(ends[1:-1]) == {CYCLE_OVER}
     assert ends[-1] == b"\0"
-    assert len(ends) == pytest.approx(21, abs=1)
+    assert len(ends) == pytest.approx(31, abs=1)
+
+
+def test_a_question_is_answered_behind_all_that_came_before_it(host):
+    """Also where nothing else gets through, and without a script; of real time nothing is said."""
+    for fault in ((), ("bus-dead@100ms",), ("frame-loss@100ms=100%",)):
+        drive = host(*fault)
+        drive.syncs(20)
+        for _ in range(20):
+            drive.send(0x080, b"")
+        drive.send(CYCLE_ID, CYCLE_ASKED + b"\x2a")
+        seen = []
+        while not seen or seen[-1] != (CYCLE_ID, CYCLE_ANSWER + b"\x2a"):
+            message = drive.bus.recv(20.0)
+            assert message is not None
+            seen.append((message.arbitration_id, bytes(message.data)))
+        if fault:
+            assert drive.simulated.simulator.time_s == pytest.approx(0.4)
+        if "bus-dead@100ms" in fault:
+            assert {identifier for identifier, _ in seen} == {CYCLE_ID}
 
 
 def test_heartbeats_end_and_come_again(host):

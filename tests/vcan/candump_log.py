@@ -53,8 +53,8 @@ class Candump:
 
     @property
     def frames(self) -> list[Seen]:
-        """What it has seen so far."""
-        return parse(self.log.read_text(), self.interface)
+        """What it has seen so far; without the questions of stepped time (6FEh), which come as the machine is busy."""
+        return [frame for frame in parse(self.log.read_text(), self.interface) if frame.identifier != QUESTION]
 
 
 def listeners(interface: str) -> int:
@@ -86,6 +86,7 @@ def watching(program: str, log: Path, interface: str) -> Iterator[Candump]:
 
 NMT, SYNC, RPDO1, RPDO2, SDO_ASK, HOST_BEAT = 0x000, 0x080, 0x201, 0x301, 0x601, 0x77F
 EMCY, TPDO1, TPDO2, SDO_ANSWER, DRIVE_BEAT = 0x081, 0x181, 0x281, 0x581, 0x701
+QUESTION = 0x6FE
 HOSTS = {NMT, SYNC, RPDO1, RPDO2, SDO_ASK, HOST_BEAT}
 DRIVES = {EMCY, TPDO1, TPDO2, SDO_ANSWER, DRIVE_BEAT}
 ENABLE_OPERATION = 0x0F
