@@ -416,7 +416,7 @@ class Cia402Drive:
     def _finish(self, now_s: float, sync: bool = True) -> Sample:
         """The SYNC, and what comes back for it."""
         feedback = self._feedback
-        feedback.begin(now_s)
+        feedback.begin(now_s, sync=sync)
         if sync:
             self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
         age_s = self._await_feedback(now_s)

@@ -58,8 +58,8 @@ class Feedback:
         self.contradictions = 0        # of them, those that can't be the drive's if the first was
         self._late_s: deque[tuple[float, float]] = deque(maxlen=_RECENT)   # when one came, how long after its cycle
 
-    def begin(self, now_s: float = 0.0) -> None:
-        """A SYNC is about to go out."""
+    def begin(self, now_s: float = 0.0, *, sync: bool = True) -> None:
+        """A SYNC is about to go out; without ``sync`` none is, in this cycle."""
         if not self._waits:
             self._given_up += self._due
             self._due.clear()
@@ -68,7 +68,8 @@ class Feedback:
                 waiting.popleft()
         if not self._due:
             self._half = None          # a half of another cycle must not complete this one
-        self._due.append(now_s)
+        if sync:
+            self._due.append(now_s)
         self._begun_s = now_s
         self._here = 0
         self._spoiled = False

@@ -253,6 +253,17 @@ def test_somebody_who_sends_too_is_found_however_late_the_host_was():
     assert wire.feedback.contradictions >= 3
 
 
+def test_where_no_sync_went_out_no_answer_is_owed():
+    wire = Wire()
+    for _ in range(3):
+        wire.cycle()
+    for _ in range(50):
+        wire.feedback.begin(wire.now_s, sync=False)
+        wire.now_s += PERIOD_S
+    wire.feedback.on_tpdo1(OLD)
+    assert wire.feedback.contradictions == 1
+
+
 def test_halves_of_a_burst_keep_together():
     now = [0.0]
     feedback = Feedback(WIDE, lambda: now[0], PERIOD_S)
