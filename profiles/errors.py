@@ -6,6 +6,8 @@ draws the whole tree.
 
 from dataclasses import dataclass
 
+from profiles.visible import visible
+
 
 class TdhilError(Exception):
     """Root of every error a user can cause or meet.
@@ -21,7 +23,7 @@ class TdhilError(Exception):
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
-        return f"{text}. {self.next_step}" if self.next_step else text
+        return visible(f"{text}. {self.next_step}" if self.next_step else text, keep="\n")
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Problem:
 
     def __str__(self) -> str:
         text = f"{self.file}:{self.line}: {self.message}" if self.line else f"{self.file}: {self.message}"
-        return text if text.isprintable() else "".join(sign if sign.isprintable() else "·" for sign in text)
+        return visible(text)
 
 
 class DataFileError(TdhilError):

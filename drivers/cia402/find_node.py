@@ -5,6 +5,7 @@ from drivers.cia402.sdo import Objects, name
 from drivers.drive import Identity
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.visible import visible
 
 DOUBLED_ANSWERS = 3
 """So many answers that came twice are no accident; `Cia402Drive.connect` asks some ten questions."""
@@ -23,7 +24,7 @@ def read_identity(objects: Objects) -> Identity:
     """Vendor, product, revision and serial number (0 where there is none), name, and whether it is simulated."""
     vendor, product, revision, serial = (objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
     try:
-        title = objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 ")
+        title = visible(objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 "))
     except ObjectRefused:
         title = "CiA 402 drive"
     return Identity(vendor, product, revision, serial, title, _is_simulated(objects))

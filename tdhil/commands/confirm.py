@@ -14,6 +14,7 @@ from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
 from drivers.no_watchdog import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
 from profiles.quantities import RPM
+from profiles.visible import visible
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
@@ -120,7 +121,7 @@ def summary(
     if preflight.watched and preflight.fed_by_any_client:
         watchdog, seen_to = f"{silent}; but {ANY_CLIENT}", _SHARED
     return (
-        f"\nThis run will move {preflight.identity.name}:\n"
+        f"\nThis run will move {visible(preflight.identity.name)}:\n"
         f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
         f"  speed window    {limits.speed_min_rad_s:.4g} to {limits.speed_max_rad_s:.4g} rad/s "
         f"({RPM.of_si(limits.speed_min_rad_s):.4g} to {RPM.of_si(limits.speed_max_rad_s):.4g} rpm)\n"
@@ -140,7 +141,8 @@ def summary(
 def _taken(unverified: Sequence[str]) -> str:
     if not unverified:
         return ""
-    return "Taken as the profile has it, although nobody verified it:\n" + "".join(f"  {one}\n" for one in unverified)
+    lines = "".join(f"  {visible(one)}\n" for one in unverified)
+    return f"Taken as the profile has it, although nobody verified it:\n{lines}"
 
 
 def _ask(idle: Idle) -> str:

@@ -190,8 +190,9 @@ def _show_registers(registers: list[RegisterSeen]) -> None:
     """Beside each register what it is taken for: people compare it with the drive's panel."""
     if not registers:
         return
-    from rich.console import Console
     from rich.table import Table
+
+    from tdhil.report.console import PlainConsole
 
     table = Table(title="registers, as read; compare them with the drive's panel", title_justify="left")
     for heading in ("address", "counts", "is", "meaning"):
@@ -199,7 +200,7 @@ def _show_registers(registers: list[RegisterSeen]) -> None:
     for one in registers:
         counts = "-" if one.counts is None else str(one.counts)
         table.add_row(one.use.address, counts, one.shown, one.use.meaning)
-    Console(highlight=False).print(table)
+    PlainConsole().print(table)
 
 
 def _dump(found: list[Finding], registers: list[RegisterSeen], code: int) -> None:

@@ -58,9 +58,9 @@ def dry_run(options: Resolved, rig: Rig | None, simulated: bool, can_torque: boo
         json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
         sys.stdout.write("\n")
         return 0
-    from rich.console import Console
+    from tdhil.report.console import PlainConsole
 
-    console = Console(highlight=False)
+    console = PlainConsole()
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
@@ -260,12 +260,14 @@ def _lines_table(plan: Plan) -> Table:
 
 
 def _figures_table(figures: tuple[Figure, ...]) -> Table:
+    from rich.text import Text
+
     table = _table("it rests on")
     for heading in ("", "value", "from"):
         table.add_column(heading, overflow="fold")
     for figure in figures:
         assumed = figure.source == "assumed"
-        table.add_row(figure.name, figure.text, "[yellow]assumed[/]" if assumed else figure.source)
+        table.add_row(figure.name, figure.text, Text("assumed", "yellow") if assumed else figure.source)
     return table
 
 

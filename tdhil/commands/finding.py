@@ -8,6 +8,7 @@ from typing import Literal
 
 from drivers.drive import Check, Outcome
 from drivers.errors import TdhilError
+from profiles.visible import visible
 
 Grade = Literal["ok", "note", "bad"]
 
@@ -25,7 +26,7 @@ class Finding:
     def text(self) -> str:
         """One line; a second one says what to do."""
         line = f"{self.grade:<5} {self.name:<16} {self.said}"
-        return f"{line}\n{'':<22} → {self.do}" if self.do else line
+        return visible(f"{line}\n{'':<22} → {self.do}" if self.do else line, keep="\n")
 
 
 def ok(name: str, said: str) -> Finding:

@@ -173,9 +173,9 @@ def _load(file: str) -> Profile:
 
 
 def _console() -> Any:
-    from rich.console import Console
+    from tdhil.report.console import PlainConsole
 
-    return Console(highlight=False)
+    return PlainConsole()
 
 
 def _dump(document: dict[str, Any]) -> None:

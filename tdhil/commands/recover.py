@@ -84,9 +84,9 @@ def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    from rich.console import Console
+    from tdhil.report.console import PlainConsole
 
-    console = Console(highlight=False)
+    console = PlainConsole()
 
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, markup=False, soft_wrap=True)

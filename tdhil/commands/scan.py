@@ -13,6 +13,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles.visible import visible
+
 if TYPE_CHECKING:
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
@@ -122,7 +124,7 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
         sys.stdout.write("\n")
         return
     for one in found:
-        print(f"{one.name}: {one.title or 'without a name'}{' · SIMULATED' if one.simulated else ''}")  # noqa: T201
+        print(visible(f"{one.name}: {one.title or 'without a name'}{' · SIMULATED' if one.simulated else ''}"))  # noqa: T201
         for name, text in (
             ("identity", one.identity),
             ("profile", f"{one.profile or 'none'} ({one.why})"),
@@ -130,9 +132,9 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
             ("seen", one.seen),
         ):
             if text:
-                print(f"  {name:<9} {text}")  # noqa: T201
+                print(visible(f"  {name:<9} {text}"))  # noqa: T201
     for remark in remarks:
-        print(remark)  # noqa: T201
+        print(visible(remark, keep="\n"))  # noqa: T201
 
 
 def _check_free(path: Path) -> None:

@@ -19,6 +19,7 @@ from drivers.errors import CommunicationLost, ObjectRefused
 from profiles.library import load_profile, profile_names
 from profiles.marker import MARKER_INDEX, MARKER_TEXT
 from profiles.schema import CanopenProfile
+from profiles.visible import visible
 from tdhil.commands.scan_found import FoundDrive
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def _identify(link: CanLink, node: int, heard: Heard, profiles: list[CanopenProf
 
 def _text(objects: Objects, index: int, sub: int = 0) -> str:
     try:
-        return objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 ")
+        return visible(objects.read_bytes(index, sub).decode("ascii", "replace").rstrip("\0 "))
     except ObjectRefused:
         return ""
 

@@ -22,6 +22,7 @@ from drivers.modbus.scales import settle
 from drivers.table import Table
 from profiles.library import load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile, Register
+from profiles.visible import visible
 from tdhil.commands.profile_registers import register_uses
 from tdhil.commands.scan_found import FoundDrive
 
@@ -118,7 +119,7 @@ def parse_identification(pdu: bytes) -> tuple[str, str, str]:
         if at + 2 > len(pdu):
             break
         number, length = pdu[at], pdu[at + 1]
-        found[number] = pdu[at + 2 : at + 2 + length].decode("ascii", "replace").strip()
+        found[number] = visible(pdu[at + 2 : at + 2 + length].decode("ascii", "replace").strip())
         at += 2 + length
     return found[0], found[1], found[2]
 

@@ -99,16 +99,15 @@ def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
 
 
 def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, report: bool) -> int:
-    from rich.console import Console
-
     from tdhil.errors import ExitCode, Interrupted, TdhilError, exit_code
+    from tdhil.report.console import PlainConsole
     from tdhil.report.live import stderr_console
     from tdhil.study.write import INSTALL, document, write_study
     from tdhil.study.write_progress import StudyBar
     from tdhil.study.write_report import Chapter, tally, write_report
     from tdhil.study.write_terminal import print_outcome
 
-    told, out = stderr_console(), Console(highlight=False)
+    told, out = stderr_console(), PlainConsole()
     folder = _made(namespace.out)
     chapters: list[Chapter] = []
     documents: list[dict[str, Any]] = []
@@ -180,11 +179,10 @@ def _list(studies: Mapping[str, Study], as_json: bool) -> int:
                   ensure_ascii=False, indent=2)
         sys.stdout.write("\n")
         return 0
-    from rich.console import Console
-
+    from tdhil.report.console import PlainConsole
     from tdhil.study.write_terminal import print_list
 
-    print_list(studies.values(), Console(highlight=False))
+    print_list(studies.values(), PlainConsole())
     return 0
 
 

@@ -15,7 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.drive import Command, Outcome, Preflight, Sample
+from profiles.visible import visible
 from tdhil.record.recording import Stage
+from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED
 from tdhil.report.numbers import minutes
 from tdhil.report.painter import Painter
@@ -47,7 +49,7 @@ class PlannedMotion(Protocol):
 
 
 _EXPECTED_S = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
-_MARKS = {"ok": "[green]✓[/]", "degraded": "[yellow]~[/]", "aborted": "[red]✗[/]", "skipped": "[dim]-[/]"}
+_MARKS = {"ok": ("✓", "green"), "degraded": ("~", "yellow"), "aborted": ("✗", "red"), "skipped": ("-", "dim")}
 _REFRESH_S = 0.2
 _LONGEST_FLUSH_S = 2.0
 _SWITCH_S = 0.0005
@@ -207,15 +209,15 @@ def picture(view: View) -> RenderableType:
         if stage is not None:
             took = minutes(stage.end_s - stage.start_s)
             note = stage.outcome if stage.outcome != "ok" else ""
-            table.add_row(_MARKS.get(stage.outcome, " "), name, note, f"[dim]{took}[/]")
+            table.add_row(Text(*_MARKS.get(stage.outcome, (" ", ""))), name, note, Text(took, "dim"))
         elif name == view.current:
             done_s = view.elapsed_s
             left_s += max(0.0, expected_s - done_s)
             bar = ProgressBar(total=max(expected_s, 0.1), completed=min(done_s, expected_s), width=32)
-            table.add_row("[cyan]▸[/]", f"[bold]{name}[/]", bar, minutes(done_s))
+            table.add_row(Text("▸", "cyan"), Text(name, "bold"), bar, minutes(done_s))
         else:
             left_s += expected_s
-            table.add_row(" ", f"[dim]{name}[/]", "", "")
+            table.add_row(" ", Text(name, "dim"), "", "")
     parts: list[RenderableType] = [table]
     if view.last is not None:
         command, sample = view.last
@@ -232,19 +234,20 @@ def picture(view: View) -> RenderableType:
 def preflight_table(preflight: Preflight) -> Table:
     """Every check with what was wanted and what was found."""
     who = preflight.identity
-    title = f"preflight: {who.name}" + (f" · {SIMULATED}" if who.simulated else "")
+    title = Text(f"preflight: {visible(who.name)}" + (f" · {SIMULATED}" if who.simulated else ""), "table.title")
     table = Table(title=title, title_justify="left", expand=False)
     for heading in ("", "check", "wanted", "found", "where"):
         table.add_column(heading, overflow="fold")
-    marks = {Outcome.OK: "[green]✓[/]", Outcome.NOTE: "[dim]i[/]", Outcome.REFUSED: "[red]✗[/]"}
+    marks = {Outcome.OK: ("✓", "green"), Outcome.NOTE: ("i", "dim"), Outcome.REFUSED: ("✗", "red")}
     for check in preflight.checks:
-        table.add_row(marks[check.outcome], check.name, check.wanted, check.found, check.where)
+        row = (Text(visible(text)) for text in (check.name, check.wanted, check.found, check.where))
+        table.add_row(Text(*marks[check.outcome]), *row)
         if check.next_step:
-            table.add_row("", "", "", f"[yellow]{check.next_step}[/]", "")
+            table.add_row("", "", "", Text(visible(check.next_step), "yellow"), "")
     table.add_row("", "if the host falls silent", "", preflight.safe_action.replace("_", " "), "")
     return table
 
 
 def stderr_console() -> Console:
     """Progress and messages go here; stdout is for results."""
-    return Console(file=sys.stderr, highlight=False)
+    return PlainConsole(sys.stderr)

@@ -183,6 +183,12 @@ COMMAND_LINE: dict[int, Row] = {
               f"{STREAMS}test_an_encoding_that_lacks_our_signs",
               f"{STREAMS}test_nothing_is_loaded_once_the_shaft_may_move"),
              "no module is loaded once the shaft may move"),
+    102: Row("a drive's name (1008h), a profile's title, a file's name with terminal escapes, markup or line breaks",
+             "shown, never obeyed", "-",
+             ("tests/report/test_foreign_text.py::test_the_preflight_table_and_the_prompt",
+              "tests/report/test_foreign_text.py::test_a_profile_s_title",
+              "tests/report/test_foreign_text.py::test_a_console_obeys_nothing"),
+             "a sign that is seen and does nothing; no line of its own in what the operator confirms"),
 }
 
 LOG: dict[int, Row] = {

@@ -1,0 +1,25 @@
+"""The console that everything for people goes through: foreign text stays text, whatever stands in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TextIO
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+from profiles.visible import visible
+
+
+class PlainConsole(Console):
+    """No markup in plain strings (a drive may be called ``[/]``), and no control character but rich's own."""
+
+    def __init__(self, file: TextIO | None = None) -> None:
+        super().__init__(file=file, highlight=False, markup=False)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control is None and not segment.text.isprintable():
+                yield Segment(visible(segment.text, keep="\n"), segment.style)
+            else:
+                yield segment
