@@ -1,12 +1,17 @@
 """The base of every model that is read from a data file, and how a check across several keys names its line."""
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic_core import PydanticCustomError
 
 CROSS_FIELD = "cross_field"
+
+Finding = tuple[str, str]
+"""(dotted path of the key below the model that checks, message)."""
 
 
 class DataModel(BaseModel):
@@ -19,9 +24,19 @@ class DataModel(BaseModel):
     never_here: ClassVar[Mapping[str, str]] = {}
     """Keys that no file of this kind takes, and what is said of each instead of 'unknown key'."""
 
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """What is wrong across several keys.
 
-Finding = tuple[str, str]
-"""(dotted path of the key below the model that checks, message)."""
+        ``values``: by the fields' names, those that are right by themselves, defaults included; sections are mappings
+        likewise. What is missing or wrong is not in it, so that a check runs as far as there is something to check.
+        """
+        return []
+
+    @model_validator(mode="after")
+    def _without_contradictions(self) -> Self:
+        refuse_if(self.contradictions(values_of(self)))
+        return self
 
 
 def refuse_if(findings: Sequence[Finding]) -> None:
@@ -30,3 +45,9 @@ def refuse_if(findings: Sequence[Finding]) -> None:
         text = "; ".join(f"{at}: {message}" if at else message for at, message in findings)
         # Braces would be taken for place-holders of the template.
         raise PydanticCustomError(CROSS_FIELD, "{text}", {"text": text, "findings": list(findings)})
+
+
+def values_of(model: DataModel) -> dict[str, Any]:
+    """Every value by its field's name; sections as mappings likewise."""
+    found = {name: getattr(model, name) for name in type(model).model_fields}
+    return {name: values_of(value) if isinstance(value, DataModel) else value for name, value in found.items()}

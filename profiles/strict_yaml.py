@@ -6,7 +6,7 @@
                                                                     ↑ `yaml_units` (100 rpm → 10.47 rad/s) ↵
 
 A value with a unit of its own is converted where the reader shows both (``convert``), else refused with what it is.
-Checks across several keys run once the keys themselves are right, so they may show up in a second round.
+Checks across several keys (`DataModel.contradictions`) run as far as the keys that they need are right.
 """
 
 import json

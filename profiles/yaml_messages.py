@@ -2,13 +2,13 @@
 
 import difflib
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from profiles import quantities
-from profiles.data_model import CROSS_FIELD
+from profiles.data_model import CROSS_FIELD, DataModel, values_of
 from profiles.errors import Problem
 from profiles.yaml_scalars import hint
 from profiles.yaml_tree import Path, Tree
@@ -30,6 +30,8 @@ _WANTED = {
     "frozen_set_type": "a list, such as [1, 2]",
     "none_required": "nothing",
 }
+_NOT_THE_VALUE = {CROSS_FIELD, "missing", "extra_forbidden"}
+"""What is said of a section, not of a value in it."""
 _BOUNDS = {
     "greater_than": ("gt", "greater than"),
     "greater_than_equal": ("ge", "at least"),
@@ -60,7 +62,46 @@ def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> li
         if item["type"] in _WANTED:      # a union gives one of these for each of its members
             unions.setdefault(path_in_file(item, tree), []).append(item["type"])
     found += [(path, tree.value_lines.get(path, 0), _wanted(kinds, tree, path)) for path, kinds in unions.items()]
-    return found
+    wrong = {path_in_file(item, tree) for item in items if item["type"] not in _NOT_THE_VALUE} | set(tree.refused)
+    told = {(path, message) for path, _, message in found}
+    across = [finding for finding in _contradictions(model, tree.data, (), wrong) if finding not in told]
+    return found + [(path, tree.line(path), message) for path, message in across]
+
+
+def _contradictions(model: type[BaseModel], data: Any, at: Path, wrong: Collection[Path]) -> list[tuple[Path, str]]:
+    """What pydantic checks once every key is right: here as far as keys are right, of a model and its sections."""
+    if not (isinstance(model, type) and issubclass(model, DataModel) and isinstance(data, dict)):
+        return []
+    found: list[tuple[Path, str]] = []
+    for name, info in model.model_fields.items():
+        key, section = info.alias or name, _section_of(info.annotation)
+        if section is not None and key in data:
+            found += _contradictions(section, data[key], (*at, key), wrong)
+    own = model.contradictions(_right_values(model, data, at, wrong))
+    return found + [((*at, *(path.split(".") if path else ())), message) for path, message in own]
+
+
+def _right_values(model: type[DataModel], data: dict[Any, Any], at: Path, wrong: Collection[Path]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, info in model.model_fields.items():
+        key, section = info.alias or name, _section_of(info.annotation)
+        path = (*at, key)
+        if key not in data:
+            if not info.is_required():
+                default = info.get_default(call_default_factory=True)
+                values[name] = values_of(default) if isinstance(default, DataModel) else default
+        elif section is not None and isinstance(data[key], dict):
+            values[name] = _right_values(section, data[key], path, wrong)
+        elif not any(path == one[: len(path)] for one in wrong):
+            values[name] = data[key]
+    return values
+
+
+def _section_of(annotation: Any) -> type[DataModel] | None:
+    """The one model that a key's value is a section of; None for anything else."""
+    members = get_args(annotation) if get_origin(annotation) in (Union, types.UnionType) else (annotation,)
+    models = [one for one in members if isinstance(one, type) and issubclass(one, DataModel)]
+    return models[0] if len(models) == 1 else None
 
 
 def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterator[tuple[Path, int, str]]:

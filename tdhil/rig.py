@@ -14,12 +14,12 @@ motor shaft. It is frozen, and knows from which line of which file each of its k
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError, model_validator
+from pydantic import Field, PrivateAttr, ValidationError
 
 from drivers.errors import DataFileError, PreflightRefused, Problem
-from profiles.data_model import DataModel, refuse_if
+from profiles.data_model import DataModel, Finding
 from profiles.strict_yaml import Conversion, load_with_lines
 from profiles.yaml_messages import messages_of
 
@@ -64,11 +64,12 @@ class Bus(DataModel):
     bitrate: int | None = Field(default=None, gt=0, description="bit/s; socketcan: as the link has it")
     options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
 
-    @model_validator(mode="after")
-    def _known_to_can(self) -> Self:
-        if self.bitrate is not None and (wrong := bit_rate_problem(self.bitrate)):
-            refuse_if([("bitrate", wrong)])
-        return self
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A bit rate that CAN doesn't know."""
+        bitrate = values.get("bitrate")
+        wrong = "" if bitrate is None else bit_rate_problem(bitrate)
+        return [("bitrate", wrong)] if wrong else []
 
 
 class Modbus(DataModel):
@@ -82,15 +83,16 @@ class Modbus(DataModel):
     stop_bits: Literal[1, 2] | None = Field(default=None, description="of the serial line")
     unit: int | None = Field(default=None, ge=0, le=255, description="unit (slave) number of the drive")
 
-    @model_validator(mode="after")
-    def _one_line(self) -> Self:
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """One line only, and a unit that it knows."""
         findings = []
-        if self.host is not None and self.serial is not None:
+        host, serial, unit = (values.get(name) for name in ("host", "serial", "unit"))
+        if host is not None and serial is not None:
             findings.append(("serial", "and host exclude each other; keep one"))
-        if self.serial is not None and self.unit is not None and not 1 <= self.unit <= 247:
-            findings.append(("unit", f"must be 1 to 247 on a serial line, not {self.unit}"))
-        refuse_if(findings)
-        return self
+        if serial is not None and unit is not None and not 1 <= unit <= 247:
+            findings.append(("unit", f"must be 1 to 247 on a serial line, not {unit}"))
+        return findings
 
 
 class Limits(DataModel):
@@ -105,15 +107,17 @@ class Limits(DataModel):
     probe_torque_nm: Torque = Field(description="N·m; highest torque to find out the direction and the breakaway")
     probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A window that is empty, and a probe beyond the limit."""
         findings = []
-        if self.speed_min_rad_s >= self.speed_max_rad_s:
-            findings.append(("speed_min_rad_s", f"must be below speed_max_rad_s, which is {self.speed_max_rad_s:g}"))
-        if self.probe_torque_nm > self.torque_nm:
-            findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {self.torque_nm:g}"))
-        refuse_if(findings)
-        return self
+        lowest, highest = values.get("speed_min_rad_s"), values.get("speed_max_rad_s")
+        if lowest is not None and highest is not None and lowest >= highest:
+            findings.append(("speed_min_rad_s", f"must be below speed_max_rad_s, which is {highest:g}"))
+        probe, most = values.get("probe_torque_nm"), values.get("torque_nm")
+        if probe is not None and most is not None and probe > most:
+            findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {most:g}"))
+        return findings
 
 
 class Gear(DataModel):
@@ -137,16 +141,14 @@ class DriveData(DataModel):
         default={}, description="drive parameters that can't be read over the bus, by the profile's names, in its units"
     )
 
-    @model_validator(mode="after")
-    def _deviations(self) -> Self:
-        refuse_if(
-            [
-                (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
-                for name in ("speed_lag", "torque_lag")
-                if getattr(self, f"{name}_sd_s") is not None and getattr(self, f"{name}_s") is None
-            ]
-        )
-        return self
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A deviation of nothing."""
+        return [
+            (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
+            for name in ("speed_lag", "torque_lag")
+            if values.get(f"{name}_sd_s") is not None and values.get(f"{name}_s", ...) is None
+        ]
 
 
 class Expected(DataModel):
@@ -199,11 +201,11 @@ class Run(DataModel):
     plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
     trace: str | None = Field(default=None, min_length=1, description="CSV of the simulated rig's true shaft")
 
-    @model_validator(mode="after")
-    def _clock(self) -> Self:
-        if self.real_time and self.stepped:
-            refuse_if([("stepped", "and real_time exclude each other; keep one")])
-        return self
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """Two clocks."""
+        both = values.get("real_time") and values.get("stepped")
+        return [("stepped", "and real_time exclude each other; keep one")] if both else []
 
 
 class Rig(DataModel):
@@ -236,24 +238,25 @@ class Rig(DataModel):
     _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})
     _conversions: tuple[Conversion, ...] = PrivateAttr(default=())
 
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """What a string needs, and limits that don't fit the rest."""
+        is_string = values.get("load") == "string"
         findings = [
             ("load", f"string needs '{name}' ({_describe(name)})")
             for name in ("make_up_torque_nm", "torque_ramp_nm_s")
-            if self.load == "string" and getattr(self, name) is None
+            if is_string and values.get(name, ...) is None
         ]
-        limits = self.limits
-        if limits and self.load == "string" and self.make_up_torque_nm and limits.torque_nm >= self.make_up_torque_nm:
-            findings.append(
-                ("limits.torque_nm", f"must be below make_up_torque_nm, which is {self.make_up_torque_nm:g}")
-            )
-        if limits and limits.speed_min_rad_s < 0 and not self.allow_reverse:
+        limits: Mapping[str, Any] = values.get("limits") or {}
+        torque, lowest, watchdog = (limits.get(name) for name in ("torque_nm", "speed_min_rad_s", "watchdog_s"))
+        make_up, rate_hz = values.get("make_up_torque_nm"), values.get("rate_hz")
+        if is_string and make_up and torque is not None and torque >= make_up:
+            findings.append(("limits.torque_nm", f"must be below make_up_torque_nm, which is {make_up:g}"))
+        if lowest is not None and lowest < 0 and values.get("allow_reverse") is False:
             findings.append(("limits.speed_min_rad_s", "below 0 the shaft runs backwards: needs allow_reverse: true"))
-        if limits and self.rate_hz and limits.watchdog_s * self.rate_hz < 5:
-            findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / self.rate_hz:g} s at rate_hz)"))
-        refuse_if(findings)
-        return self
+        if rate_hz and watchdog is not None and watchdog * rate_hz < 5:
+            findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / rate_hz:g} s at rate_hz)"))
+        return findings
 
     def line(self, dotted: str) -> int:
         """The line in rig.yaml of a key such as ``limits.torque_nm``; 0 where it does not stand there."""

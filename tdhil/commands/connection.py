@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from drivers.errors import DataFileError, Problem
 from profiles.library import load_canopen_profile, load_modbus_profile, load_profile
 from profiles.modbus_schema import ModbusProfile
 from tdhil.bus_options import BusConfig, bus_config
@@ -59,11 +60,32 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: Resolved) ->
     if options["drive"] == "modbus":
         profile = load_modbus_profile(options["profile"])
         _refuse_canopen_flags(cli)
-        return options, Connection(profile, NO_BUS, modbus_config(cli, rig, profile))
+        found = Connection(profile, NO_BUS, modbus_config(cli, rig, profile))
+        _refuse_the_other_bus(found, rig, options)
+        return options, found
     flag = asked_for(cli)
     if flag is not None:
         raise UsageError("belongs to Modbus", where=flag, next_step="Add --drive modbus, or leave it out")
-    return options, Connection(load_canopen_profile(options["profile"]), bus_config(cli, rig), NO_MODBUS)
+    found = Connection(load_canopen_profile(options["profile"]), bus_config(cli, rig), NO_MODBUS)
+    _refuse_the_other_bus(found, rig, options)
+    return options, found
+
+
+def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: Resolved) -> None:
+    """A rig.yaml that says where a drive is, but on the other bus: nobody meant the simulator. Raises DataFileError."""
+    if rig is None or found.configured or options["simulate"]:
+        return
+    if found.drive == "canopen" and (rig.modbus.host or rig.modbus.serial):
+        section, missing = "modbus", "bus: (interface, channel)"
+    elif found.drive == "modbus" and rig.bus.interface:
+        section, missing = "bus", "modbus: (host or serial)"
+    else:
+        return
+    raise DataFileError((Problem(
+        rig.file or "rig.yaml", rig.line(section),
+        f"{section}: says where a drive is, but the drive is on {found.drive} ({options.source('drive')}), and nothing"
+        f" says where; give {missing}, name the other drive, or take the simulated one with --simulate",
+    ),))
 
 
 def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: Resolved) -> Resolved:
