@@ -370,3 +370,22 @@ def test_the_embedded_line_drops_what_comes_too_late():
     with pytest.raises(NoReply):
         link.transact(1, ASK, 0.01)
     assert link.late == 1
+
+
+def test_what_is_queued_is_thrown_away_when_the_connection_is_closed():
+    """A setpoint that the drive's system hasn't taken yet must not reach it after the host has gone."""
+    setpoint = bytes.fromhex("0001 0000 0006 01 06 0001 0fa0")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        link = TcpLink(*server.getsockname(), MonotonicClock())
+        drive, _ = server.accept()
+        with drive:
+            link._socket.setblocking(False)
+            with pytest.raises(BlockingIOError):        # until both systems hold as much as they can
+                while True:
+                    link._socket.send(1000 * setpoint)
+            link.close()
+            drive.settimeout(5.0)
+            with pytest.raises(ConnectionResetError):   # an orderly end would be all of it, and then nothing
+                while drive.recv(100_000):
+                    pass

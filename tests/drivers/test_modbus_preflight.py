@@ -8,7 +8,7 @@ from modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, Outcome
-from drivers.errors import PreflightRefused
+from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
@@ -488,3 +488,53 @@ def test_a_simulated_drive_has_nobodys_settings():
     drive.connect()
     assert not drive.preflight(LIMITS).refused
     assert bank.words[38] == 375
+
+
+# -- what must hold, line by line ------------------------------------------------------------------------------
+
+
+def test_a_watchdog_that_falls_back_to_zero_is_not_armed(bank, generic):
+    """It reads back as it was written, and as 0, which is off, from then on: equal to itself, but not armed."""
+    answer, reads = bank.answer, []
+
+    def forgets(pdu):
+        if pdu[:3] == bytes((3, 0, TIME_OUT)) and bank.words[TIME_OUT] == 500:
+            reads.append(pdu)
+            if len(reads) > 1:
+                bank.words[TIME_OUT] = 0
+        return answer(pdu)
+
+    bank.answer = forgets
+    rows = refused(bank, generic)
+    assert rows["watchdog"].found == "0 counts"
+
+
+def test_the_setpoints_are_zero_again_before_anything_else_is_tried(bank, generic):
+    """The mode is written next: nothing of the test values may stand there."""
+    stood = []
+
+    def on_write(address, words):
+        if address == 4:
+            stood.append([bank.words[at] for at in (1, 2, 3)])
+
+    bank.on_write = on_write
+    drive = drive_on(bank, generic)
+    drive.connect()
+    drive.preflight(LIMITS)
+    assert stood and all(words == [0, 0, 0] for words in stood)
+
+
+@pytest.mark.parametrize("echo", [48, 50])
+def test_an_echo_that_falls_silent_leaves_no_setpoint_behind(bank, generic, echo):
+    answer = bank.answer
+
+    def mute(pdu):
+        asked = int.from_bytes(pdu[1:3], "big")
+        return b"" if pdu[0] == 3 and asked == echo else answer(pdu)
+
+    bank.answer = mute
+    drive = drive_on(bank, generic)
+    drive.connect()
+    with pytest.raises(CommunicationLost):
+        drive.preflight(LIMITS)
+    assert [bank.words[at] for at in (1, 2, 3)] == [0, 0, 0]
