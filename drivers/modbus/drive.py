@@ -295,7 +295,8 @@ class ModbusDrive:
         self._cycles += 1
         try:
             got = go_round(
-                self._access, self._transactions(command.mode), image, self._timeout_s, self._moving
+                self._access, self._transactions(command.mode), image, self._timeout_s, self._moving,
+                begun_s + self.period_s,
             )
         except (CommunicationLost, RegisterRefused) as error:
             self._missed += 1
@@ -402,7 +403,8 @@ class ModbusDrive:
         if not self._reads or self._must_be_silent():
             return None
         try:
-            got = go_round(self._access, self._reads, {}, self._timeout_s, self._moving)
+            until_s = self.clock.now_s() + self.period_s
+            got = go_round(self._access, self._reads, {}, self._timeout_s, self._moving, until_s)
         except (CommunicationLost, RegisterRefused):
             return None
         self._take(self._codec.feedback(got.words), self._sent_mode)

@@ -5,6 +5,7 @@
     CommunicationLost
     ├── NoReply            nothing came in time
     ├── BadReply           CRC, length, unit, function or transaction id are not those of the request
+    │   └── NoisyReply     a reply that the line has damaged: the same may be asked again at once
     └── LinkLost           connection reset or closed, port gone; stays so until a new link is opened
     ObjectRefused
     └── RegisterRefused    exception reply to a request before motion
@@ -47,6 +48,10 @@ class NoReply(CommunicationLost):
 
 class BadReply(CommunicationLost):
     """Something came, but no reply to this request that could be trusted."""
+
+
+class NoisyReply(BadReply):
+    """A reply to this request, damaged on its way; the drive has most probably acted."""
 
 
 class LinkLost(CommunicationLost):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from drivers.modbus.access import Access, Answer
-from drivers.modbus.errors import BUSY, RegisterRefused
+from drivers.modbus.errors import BUSY, NoisyReply, RegisterRefused
 from drivers.modbus.plan import Transaction
 from profiles.modbus_schema import Register
 
@@ -29,8 +30,11 @@ def go_round(
     image: Mapping[int, int],
     timeout_s: float,
     moving: Sequence[Register],
+    again_until_s: float = -math.inf,
 ) -> Round:
     """Run them one after the other; the first that fails ends the round.
+
+    A reply that noise has damaged is asked for once more, up to ``again_until_s`` (control time): the same words.
 
     Raises CommunicationLost (NoReply, BadReply, LinkLost) and RegisterRefused.
     """
@@ -38,7 +42,7 @@ def go_round(
     sent_s: float | None = None
     received_s = longest_s = 0.0
     for transaction in transactions:
-        answer = _patiently(access, transaction.request(image), timeout_s, str(transaction))
+        answer = _patiently(access, transaction.request(image), timeout_s, str(transaction), again_until_s)
         longest_s = max(longest_s, answer.received_s - answer.sent_s)
         span = transaction.read
         if span is None:
@@ -50,11 +54,16 @@ def go_round(
     return Round(words, sent_s or 0.0, received_s, longest_s)
 
 
-def _patiently(access: Access, pdu: bytes, timeout_s: float, what: str) -> Answer:
-    tries = 1
+def _patiently(access: Access, pdu: bytes, timeout_s: float, what: str, again_until_s: float) -> Answer:
+    tries, noisy = 1, False
     while True:
         try:
             return access.once(pdu, timeout_s, f"function {what}")
+        except NoisyReply:
+            if noisy or access.clock.now_s() >= again_until_s:
+                raise
+            noisy = True
+            continue
         except RegisterRefused as error:
             if error.code != BUSY or tries >= BUSY_TRIES:
                 raise

@@ -20,7 +20,7 @@ from pymodbus.pdu import DecodePDU
 
 from drivers.clock import Clock
 from drivers.errors import PreflightRefused
-from drivers.modbus.errors import BadReply, LinkLost, NoReply
+from drivers.modbus.errors import BadReply, LinkLost, NoisyReply, NoReply
 from drivers.modbus.link import Reply
 from drivers.modbus.requests import answers, reply_length
 from drivers.modbus.serial_port import refusal
@@ -87,7 +87,9 @@ class RtuLink:
                 reply, received_s = self._doubt(reply, received_s, unit, pdu)
         except (NoReply, BadReply) as error:
             self._owed = isinstance(error, NoReply)
-            self._listen_s = min(max(LISTEN_SHARE * timeout_s, QUIET_S), LONGEST_LISTEN_S)
+            # A damaged reply that came as a whole leaves nothing outstanding: the line is in step once it is quiet.
+            whole = isinstance(error, NoisyReply)
+            self._listen_s = QUIET_S if whole else min(max(LISTEN_SHARE * timeout_s, QUIET_S), LONGEST_LISTEN_S)
             raise
         finally:
             self._quiet_from_s = self.clock.now_s() + self._silence_s
@@ -111,7 +113,8 @@ class RtuLink:
             wanted = self._length(frame)
             if wanted is not None and len(frame) >= wanted:
                 if not self._sound(frame[:wanted]):
-                    raise self._bad(f"a reply with a wrong CRC: {_shown(frame)}")
+                    bad = self._bad(f"a reply with a wrong CRC: {_shown(frame)}")
+                    raise NoisyReply(bad.what, where=bad.where, next_step=bad.next_step)
                 reply = frame[1 : wanted - 2]
                 if frame[0] == unit and answers(pdu, reply) and len(frame) == wanted:
                     return reply

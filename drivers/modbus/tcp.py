@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import select
 import socket
 import struct
 import sys
@@ -33,8 +35,10 @@ DEAD_AFTER_MS = 1000
 HEADER = struct.Struct(">HHHB")
 """Transaction id, protocol id, length of what follows, unit (Modbus Messaging on TCP/IP, section 3.1.3)."""
 _AT_ONCE = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)
+MOST_RENEWED, RENEWED_WITHIN_S = 3, 10.0
+"""So often in that time a foreign reply costs the connection; then it is merely dropped."""
 REMEMBERED = 64
-"""Ids of requests whose time is over: their replies are late, not foreign."""
+"""Ids of requests whose time is over, or that were answered: their replies are late or said twice, not foreign."""
 
 
 class TcpLink:
@@ -48,9 +52,13 @@ class TcpLink:
         self._connect_s = connect_s
         self._framer = FramerSocket(DecodePDU(False))
         self._given_up: deque[int] = deque(maxlen=REMEMBERED)
+        self._answered: deque[int] = deque(maxlen=REMEMBERED)
         self._buffer = b""
         self._transaction = 0
         self._renew = False
+        self._opening: socket.socket | None = None      # anew, and not open yet
+        self._renewed_s: deque[float] = deque(maxlen=MOST_RENEWED)
+        self._family, self._peer = socket.AF_INET, ()
         try:
             self._socket: socket.socket | None = self._connect()
         except OSError as error:
@@ -58,11 +66,11 @@ class TcpLink:
 
     def transact(self, unit: int, pdu: bytes, timeout_s: float) -> Reply:
         """One request and its reply. A connection that was reset stays lost; nothing is sent twice."""
+        deadline_s = self.clock.now_s() + timeout_s
         if self._renew:
-            self._reconnect()
+            self._reconnect(timeout_s)
         if self._socket is None:
             self._lost("the connection is gone")
-        deadline_s = self.clock.now_s() + timeout_s
         while self._untaken():
             # The other end hasn't even taken the request before: another one would only queue up behind it.
             if self.clock.now_s() >= deadline_s:
@@ -80,6 +88,7 @@ class TcpLink:
         while True:
             frame = self._frame()
             if frame is not None and self._accepts(frame, unit, pdu):
+                self._answered.append(self._transaction)
                 return Reply(frame[HEADER.size :], sent_s, self.clock.now_s())
             if frame is None:
                 left_s = deadline_s - self.clock.now_s()
@@ -90,11 +99,17 @@ class TcpLink:
 
     def close(self) -> None:
         """Let go at once; what the other end hasn't taken yet is thrown away."""
+        self._drop()
+        if self._opening is not None:
+            self._opening.close()
+        self._opening, self._renew = None, False
+
+    def _drop(self) -> None:
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             self._socket.close()
-        self._socket, self._renew = None, False
+        self._socket = None
 
     # -- replies ---------------------------------------------------------------------------------------------
 
@@ -117,6 +132,9 @@ class TcpLink:
         if transaction in self._given_up:
             self._given_up.remove(transaction)
             self.late += 1
+            return False
+        if transaction != self._transaction and (transaction in self._answered or not self._may_renew()):
+            self.late += 1             # said twice, or foreign once too often: dropped, its id shows that it isn't ours
             return False
         if transaction != self._transaction:
             raise self._untrusted(f"a reply with transaction id {transaction}, not {self._transaction}")
@@ -145,20 +163,49 @@ class TcpLink:
 
     def _connect(self) -> socket.socket:
         connection = socket.create_connection(self._address, timeout=self._connect_s)
+        self._family, self._peer = connection.family, connection.getpeername()
+        return self._prepared(connection)
+
+    @staticmethod
+    def _prepared(connection: socket.socket) -> socket.socket:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, DEAD_AFTER_MS)
         return connection
 
-    def _reconnect(self) -> None:
-        """After a frame that can't be ours: what follows it on this connection can't be trusted either."""
-        self.close()
-        self._buffer = b""
-        self._given_up.clear()
-        try:
-            self._socket = self._connect()
-        except OSError as error:
-            self._lost(f"it could not be opened anew: {error}", error)
+    def _may_renew(self) -> bool:
+        """Has the connection not been renewed too often of late?"""
+        since_s = self.clock.now_s() - RENEWED_WITHIN_S
+        return sum(at_s >= since_s for at_s in self._renewed_s) < MOST_RENEWED
+
+    def _reconnect(self, timeout_s: float) -> None:
+        """After a frame that can't be ours: what follows it on this connection can't be trusted either.
+
+        Takes no longer than the reply may: raises NoReply while the new connection isn't open, and goes on with it the
+        next time.
+        """
+        now_s = self.clock.now_s()
+        if self._opening is None:
+            self._drop()
+            self._buffer = b""
+            self._given_up.clear()
+            self._answered.clear()
+            self._renewed_s.append(now_s)
+            self._opening = socket.socket(self._family, socket.SOCK_STREAM)
+            self._opening.setblocking(False)
+            code = self._opening.connect_ex(self._peer)
+            if code not in (0, errno.EINPROGRESS, errno.EWOULDBLOCK):
+                self._lost(f"it could not be opened anew: {os.strerror(code)}")
+        _, opened, failed = select.select([], [self._opening], [self._opening], timeout_s)
+        code = self._opening.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code or (failed and not opened):
+            self._lost(f"it could not be opened anew: {os.strerror(code)}")
+        if opened:
+            self._socket, self._opening, self._renew = self._prepared(self._opening), None, False
+        elif now_s - self._renewed_s[-1] > self._connect_s:
+            self._lost("it could not be opened anew: no answer")
+        else:
+            raise self._silent(timeout_s, "a foreign reply came, and the connection opened anew isn't there yet")
 
     def _untaken(self) -> bool:
         """Has the other end's system not acknowledged all that was sent? Known on Linux only."""

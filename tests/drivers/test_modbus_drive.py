@@ -239,9 +239,12 @@ def test_standstill_from_the_speed_wants_time():
     run.bank.feedback = lambda: (0, 0)
     seen = [run.cycle().standstill for _ in range(30)]
     assert seen.index(True) == 19       # 20 cycles of 10 ms
-    run.bank.script = [lambda reply: None]
-    assert not run.cycle().standstill
-    assert not run.cycle().standstill
+    for lost, unsaid in ((1, False), (2, False), (3, True)):
+        run.bank.refuse = {23: 6}                                       # busy: no reply to this cycle
+        assert not any(run.cycle().standstill for _ in range(lost))     # nothing is said without a reply
+        run.bank.refuse = {}
+        assert run.cycle().standstill is not unsaid
+        seen = [run.cycle().standstill for _ in range(30)]
 
 
 def test_creeping_is_no_standstill():

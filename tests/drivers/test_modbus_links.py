@@ -1,6 +1,7 @@
 """Both links against peers that misbehave, over the loopback and over a pty: every trouble comes out typed."""
 
 import contextlib
+import select
 import socket
 import struct
 import threading
@@ -16,7 +17,7 @@ from drivers.modbus.embedded import EmbeddedLink
 from drivers.modbus.errors import BadReply, LinkLost, NoReply
 from drivers.modbus.rtu import RtuLink
 from drivers.modbus.serial_port import permission_command, refusal
-from drivers.modbus.tcp import TcpLink
+from drivers.modbus.tcp import MOST_RENEWED, TcpLink
 
 ASK = bytes.fromhex("03 0010 0002")
 GOOD = bytes.fromhex("03 04 0250 04d2")
@@ -156,13 +157,8 @@ def test_a_reply_nobody_asked_for_is_thrown_away(kind):
         assert line.ask().pdu == GOOD
         wait = threading.Event()
         wait.wait(0.06)
-        if kind == "rtu":
-            assert line.ask().pdu == GOOD
-            assert line.link.late == 1
-        else:
-            # An id that is not awaited, nor was given up: foreign. What comes next is on a new connection.
-            with pytest.raises(BadReply, match="transaction id 1, not 2"):
-                line.ask()
+        assert line.ask().pdu == GOOD
+        assert line.link.late == 1
         assert line.ask().pdu == GOOD
 
 
@@ -389,3 +385,59 @@ def test_what_is_queued_is_thrown_away_when_the_connection_is_closed():
             with pytest.raises(ConnectionResetError):   # an orderly end would be all of it, and then nothing
                 while drive.recv(100_000):
                     pass
+
+
+def test_replies_that_come_twice_cost_nothing():
+    """A gateway that says everything twice: the second one bears an id that was answered already."""
+    with TcpPeer(lambda number, request: [good(request), good(request)]) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
+        for _ in range(50):
+            assert link.transact(1, ASK, LONG_S).pdu == GOOD
+        link.close()
+        assert peer.connections == 1
+        assert 40 <= link.late <= 49
+
+
+def test_foreign_replies_cost_the_connection_a_few_times_only():
+    """Then they are dropped, and the right one is waited for."""
+    with TcpPeer(lambda number, request: [tcp(0xF000 + number, 1, OTHER), good(request)]) as peer:
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock())
+        answered = 0
+        for _ in range(20):
+            with contextlib.suppress(BadReply):
+                answered += link.transact(1, ASK, LONG_S).pdu == GOOD
+        link.close()
+        assert peer.connections <= MOST_RENEWED + 1
+        assert answered == 20 - MOST_RENEWED
+
+
+def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
+    """A foreign reply, and then nobody takes the new connection: the cycle goes on, and the stop can."""
+    with (
+        TcpPeer(lambda number, request: [tcp(0xF000, 1, OTHER)]) as peer,
+        socket.create_server(("127.0.0.1", 0), backlog=0) as full, contextlib.ExitStack() as waiting,
+    ):
+        link = TcpLink("127.0.0.1", peer.port, MonotonicClock(), connect_s=0.5)
+        with pytest.raises(BadReply):
+            link.transact(1, ASK, LONG_S)
+        link._peer = full.getsockname()
+        for _ in range(4):             # its queue is full from here on, and further ones are left without an answer
+            one = waiting.enter_context(socket.socket())
+            one.setblocking(False)
+            one.connect_ex(link._peer)
+        waited, plain = [], select.select
+
+        def watched(readers, writers, errors, timeout_s):
+            waited.append(timeout_s)
+            return plain(readers, writers, errors, timeout_s)
+
+        monkeypatch.setattr("drivers.modbus.tcp.select.select", watched)
+        for _ in range(5):
+            with pytest.raises(NoReply):
+                link.transact(1, ASK, 0.02)
+        assert waited == [0.02] * 5
+        with pytest.raises(LinkLost):  # and it is given up in the end
+            for _ in range(100):
+                with contextlib.suppress(NoReply):
+                    link.transact(1, ASK, 0.02)
+        link.close()

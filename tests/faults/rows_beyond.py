@@ -105,6 +105,19 @@ MODBUS: dict[int, Row] = {
          "tests/path/test_stop_command.py::test_a_hub_that_dies_while_it_stops"),
         "the sentence on stdout, in the JSON document too",
     ),
+    76: Row(
+        "RTU: every fifth reply is damaged from some time in motion on",
+        "asked for once more within the cycle; whatever ends the run, standstill is seen and confirmed", "0, 5, 9",
+        (HERE + "test_modbus_noise.py",),
+    ),
+    77: Row(
+        "Modbus TCP: every reply comes twice; foreign replies again and again; a new connection isn't answered",
+        "dropped by their ids; renewed three times in ten seconds at most; never longer than a reply may take", "",
+        ("tests/drivers/test_modbus_links.py::test_replies_that_come_twice_cost_nothing",
+         "tests/drivers/test_modbus_links.py::test_foreign_replies_cost_the_connection_a_few_times_only",
+         "tests/drivers/test_modbus_links.py::test_opening_anew_never_takes_longer_than_a_reply_may"),
+        "one connection for fifty doubled replies; the cycle goes on while a new connection is opened",
+    ),
 }
 
 UNITS: dict[int, Row] = {

@@ -1,0 +1,45 @@
+"""Row 76: a serial line on which every fifth reply is damaged, from some time in motion on, judged on the shaft."""
+
+import random
+
+import pytest
+from rehearsal import at, run
+
+from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.errors import NoisyReply
+
+
+class Noise:
+    """The drive acts, its reply comes, and is damaged: a share of them, seeded."""
+
+    def __init__(self, monkeypatch):
+        self.share, self.damaged, self._random = 0.0, 0, random.Random(7)
+        transact, noise = EmbeddedLink.transact, self
+
+        def noisy(self, unit, pdu, timeout_s):
+            reply = transact(self, unit, pdu, timeout_s)
+            if noise._random.random() < noise.share:
+                noise.damaged += 1
+                raise NoisyReply("a reply with a wrong CRC", where=self.description)
+            return reply
+
+        monkeypatch.setattr(EmbeddedLink, "transact", noisy)
+
+
+@pytest.mark.parametrize("profile", ["generic/modbus", "siemens/g120"])
+def test_row_76_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_user, monkeypatch, tmp_path, seen):
+    """One request a cycle, and three of them at 19,200 baud."""
+    noise = Noise(monkeypatch)
+
+    def begin(_):
+        noise.share = 0.2
+
+    acted = at(monkeypatch, "speed", 8.0, begin)
+    ended = run(tmp_path, "--drive", "modbus", "--profile", profile, "--rate", 15, "--mode", "speed")
+    assert noise.damaged > 20
+    assert ended.done.code in (0, 5, 9), ended.done.err
+    assert "NOT confirmed" not in ended.done.err
+    ended.shaft.assert_at_rest()
+    ended.shaft.assert_never_let_go()
+    seen(76, f"{profile}: the run {'goes on' if ended.done.code != 5 else 'is ended, the shaft seen at rest'}",
+         None if ended.done.code != 5 else ended.standstill_s(acted[0]), ended.assert_log_whole(), ended.done.code)
