@@ -6,7 +6,7 @@ import sys
 
 import can
 import pytest
-from path_runs import QUICK, Shaft, Terminal, clean_environment, identify, tdhil
+from path_runs import QUICK, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
 from sim_bus.params import RigParams
 from sim_bus.simulator import EmbeddedSimulator
@@ -56,19 +56,19 @@ def test_a_seed_repeats_result_and_samples(tmp_path):
 
 
 def test_without_a_seed_one_is_drawn_and_named(tmp_path):
-    runs = [identify(tmp_path, *QUICK, "--amplitude", 9, log=name) for name in ("a.mcap", "b.mcap")]
+    runs = [identify(tmp_path, *QUICK, *TOO_MUCH, log=name) for name in ("a.mcap", "b.mcap")]
     seeds = [read_run(done.log).configuration["seed"] for done in runs]
     assert seeds[0] != seeds[1]
     for done, seed in zip(runs, seeds, strict=True):
         assert f"seed {seed}" in done.err.replace("\n", " ")
         assert "no CAN bus is configured" in done.err.replace("\n", " ")
-    again = identify(tmp_path, *QUICK, "--amplitude", 9, "--seed", seeds[0], log="c.mcap")
+    again = identify(tmp_path, *QUICK, *TOO_MUCH, "--seed", seeds[0], log="c.mcap")
     assert list(read_samples(again.log)) == list(read_samples(runs[0].log))
 
 
 def test_an_older_log_is_kept(tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"an older run")
-    done = identify(tmp_path, "--simulate", *QUICK, "--amplitude", 9)
+    done = identify(tmp_path, "--simulate", *QUICK, *TOO_MUCH)
     (kept,) = [path for path in tmp_path.glob("run-*.mcap") if path.read_bytes() == b"an older run"]
     assert kept.name in done.err.replace("\n", "")
     assert read_run(done.log).complete
@@ -172,8 +172,8 @@ def test_the_environment_names_the_bus(tmp_path, monkeypatch):
     with EmbeddedSimulator(RigParams(), seed=1, stepped=True) as simulated:
         monkeypatch.setenv("CAN_INTERFACE", "virtual")
         monkeypatch.setenv("CAN_CHANNEL", simulated.channel)
-        done = identify(tmp_path, "--stepped", *QUICK, "--amplitude", 9)
-    assert done.code == 4, done.err                                # it got as far as the plan
+        done = identify(tmp_path, "--stepped", *QUICK, *TOO_MUCH)
+    assert done.code == 7, done.err                                # it got as far as the plan
     assert done.outcomes[1] == ("speed", "ok")
     lines = [" ".join(line.split()) for line in done.err.splitlines()]
     assert "bus interface virtual (CAN_INTERFACE)" in lines
@@ -193,17 +193,19 @@ def test_a_bus_without_a_drive_is_refused_with_the_likely_causes(tmp_path, monke
 
 def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
     monkeypatch.setenv("CAN_INTERFACE", "virtual")
-    done = identify(tmp_path, "--simulate", *QUICK, "--amplitude", 9)
-    assert done.code == 4
+    done = identify(tmp_path, "--simulate", *QUICK, *TOO_MUCH)
+    assert done.code == 7
     assert "SIMULATED" in done.err
 
 
-@pytest.mark.parametrize(("node", "said"), [(5, "amplitude of 9 rad/s"), (6, "node 6 does not answer")])
-def test_the_node_is_the_one_asked_for(tmp_path, node, said):
+@pytest.mark.parametrize(
+    ("node", "code", "said"), [(5, 7, "amplitude of 3 rad/s"), (6, 4, "node 6 does not answer")]
+)
+def test_the_node_is_the_one_asked_for(tmp_path, node, code, said):
     with EmbeddedSimulator(RigParams(), node_id=5, stepped=True) as simulated:
         done = identify(tmp_path, "-i", "virtual", "-c", simulated.channel, "--stepped", "--node", node,
-                        *QUICK, "--amplitude", 9)
-    assert done.code == 4, done.err
+                        *QUICK, *TOO_MUCH)
+    assert done.code == code, done.err
     assert said in done.err
 
 
@@ -212,9 +214,10 @@ def test_the_node_is_the_one_asked_for(tmp_path, node, said):
 
 def test_a_plan_that_does_not_fit_ends_with_the_shaft_at_rest(tmp_path):
     trace = tmp_path / "shaft.csv"
-    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, *QUICK, "--amplitude", 9)
-    assert done.code == 4
-    assert "amplitude of 9 rad/s" in done.err
+    done = identify(tmp_path, "--simulate", "--seed", 1, "--trace", trace, *QUICK, *TOO_MUCH)
+    assert done.code == 7
+    assert "amplitude of 3 rad/s" in done.err
+    assert "before anything moved" not in done.err
     assert "the shaft is at rest" in done.document["stop"]
     shaft = Shaft.read(trace)
     shaft.assert_enabled(True)
@@ -231,7 +234,7 @@ def test_a_drive_in_fault_is_reset_on_the_operator_s_word_only(tmp_path):
         assert "--reset-fault" in done.err
         assert "nothing has moved" in done.err
         bus = can.Bus(interface="virtual", channel=simulated.channel)      # keeps the channel for the second run
-        again = identify(tmp_path, *options, "--reset-fault", *QUICK, "--amplitude", 9, log="b.mcap")
+        again = identify(tmp_path, *options, "--reset-fault", *QUICK, *TOO_MUCH, log="b.mcap")
         bus.shutdown()
     assert again.outcomes[:2] == [("setup", "ok"), ("speed", "ok")]
     assert any(event.kind == "reset" for event in read_run(again.log).events)

@@ -8,7 +8,7 @@ import termios
 from types import SimpleNamespace
 
 import pytest
-from path_runs import QUICK, identify, process, tdhil
+from path_runs import QUICK, TOO_MUCH, identify, process, tdhil
 
 from profiles.library import load_modbus_profile, load_profile, profile_path
 from tdhil.record.reader import read_frames, read_run
@@ -65,18 +65,18 @@ def test_the_log_says_how_the_drive_was_spoken_to(run):
 
 
 def test_a_seed_repeats_it(tmp_path):
-    runs = [identify(tmp_path, "--profile", "generic/modbus", *QUICK, "--amplitude", 9, "--seed", 3, log=name)
+    runs = [identify(tmp_path, "--profile", "generic/modbus", *QUICK, *TOO_MUCH, "--seed", 3, log=name)
             for name in ("a.mcap", "b.mcap")]
     for done in runs:
-        assert done.code == 4                                  # it got as far as the plan, which does not fit
-        assert "amplitude of 9 rad/s" in done.err
+        assert done.code == 7                                  # it got as far as the plan, which does not fit
+        assert "amplitude of 3 rad/s" in done.err
         assert "no Modbus host and no serial device is named" in done.err.replace("\n", " ")
     assert list(read_frames(runs[0].log)) == list(read_frames(runs[1].log))
 
 
 def test_the_unit_is_the_one_asked_for(tmp_path):
-    done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, *QUICK, "--amplitude", 9)
-    assert done.code == 4
+    done = identify(tmp_path, "--drive", "modbus", "--simulate", "--unit", 17, *QUICK, *TOO_MUCH)
+    assert done.code == 7
     assert {frame.identifier for frame in read_frames(done.log)} == {17}
 
 
@@ -94,7 +94,7 @@ def test_a_dry_run_knows_the_drive(tmp_path):
 @pytest.mark.parametrize(("name", "bus"), [("maxon/epos4", "canopen"), ("siemens/g130-s120", "modbus")])
 def test_the_simulator_wears_the_profile(tmp_path, name, bus):
     profile = load_profile(name)
-    done = identify(tmp_path, "--profile", name, "--simulate", *QUICK, "--amplitude", 9)
+    done = identify(tmp_path, "--profile", name, "--simulate", *QUICK, *TOO_MUCH)
     assert "SIMULATED" in done.err
     assert f"drive          {bus}  (profile {name})" in done.err
     configuration = read_run(done.log).configuration

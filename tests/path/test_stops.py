@@ -18,6 +18,7 @@ from path_runs import (
     QUICK_STOP_RAD_S2,
     SETTLING_S,
     STAGES,
+    TOO_MUCH,
     TORQUE_NM,
     WATCHDOG_S,
     Shaft,
@@ -256,8 +257,8 @@ def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
 def test_what_follows_the_shaft_is_in_order(tmp_path):
     """Of one interrupted run: enabled, quick stop, disabled, and only then let go of the bus."""
     trace = tmp_path / "shaft.csv"
-    done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--trace", trace, "--amplitude", 9)
-    assert done.code == 4
+    done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--trace", trace, *TOO_MUCH)
+    assert done.code == 7
     shaft = Shaft.read(trace)
     marks = [
         shaft.events("state: operation enabled")[0],
