@@ -15,6 +15,7 @@ from tdhil.commands.streams import sheltered
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
     "replay": "identify again from a log, or from a trace that a drive's own tool exported",
+    "export": "a log's CAN frames or samples in another program's format",
     "profiles": "what is known of which drive, what it needs set, and how sure that is",
     "scan": "find out who is on the bus; writes nothing to any drive",
     "doctor": "check adapter, permissions, bus, computer, profile and drive; writes nothing",
@@ -89,6 +90,8 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.commands.stop import add_arguments
     elif name == "study":
         from tdhil.commands.study import add_arguments
+    elif name == "export":
+        from tdhil.commands.export import add_arguments
     elif name == "recover":
         from tdhil.commands.recover import add_arguments
     elif name == "profiles":

@@ -194,7 +194,8 @@ def _run(
 
     _load_the_end(namespace.report is not None)
     place = LogPlace(Path(options["log"]))
-    writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open)
+    writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
+                       modbus=connection.drive == "modbus")
     writer.path = place.path
     if place.live:
         console.print(f"another run is writing {place.wanted}: this one's log is {place.path}", style="yellow",

@@ -11,6 +11,8 @@
    6  /event          Event          when something happened
    7  /configuration  Text           JSON: {"run": …, "recording": …}; the last one counts
    8  /result         Text           JSON; the last one counts
+   9  /log            foxglove.Log   the same events again, for viewers; never read back
+  10  /modbus         Frames         requests and replies (PDU), in place of /can; older logs have them there
 ====  ==============  =============  =====================================================================
 
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
@@ -20,6 +22,7 @@ from typing import Any, Final
 
 from drivers.drive import Mode, PowerState
 from tdhil.record.event import Event
+from tdhil.record.foxglove import LOG_CLASS
 from tdhil.record.recording import Excitation, Level, Ramp, Segment, Stage
 from tdhil.record.schema import fields_of, message_classes
 
@@ -33,6 +36,8 @@ EXCITATION: Final = 5
 EVENT: Final = 6
 CONFIGURATION: Final = 7
 RESULT: Final = 8
+LOG: Final = 9
+MODBUS: Final = 10
 
 CHANNELS: Final = {
     SAMPLE: ("/sample", "Sample"),
@@ -43,6 +48,8 @@ CHANNELS: Final = {
     EVENT: ("/event", "Event"),
     CONFIGURATION: ("/configuration", "Text"),
     RESULT: ("/result", "Text"),
+    LOG: ("/log", "Log"),
+    MODBUS: ("/modbus", "Frames"),
 }
 
 MODES: Final = {None: 0, Mode.SPEED: 1, Mode.TORQUE: 2}
@@ -88,4 +95,10 @@ MESSAGES: Final = {
     "Event": fields_of(Event),
     "Text": {"json": "string"},
 }
-CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES)
+CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES) | {"Log": LOG_CLASS}
+
+
+def schema_name(message: str) -> str:
+    """A message's full name, such as ``tdhil.Sample``."""
+    name: str = CLASSES[message].DESCRIPTOR.full_name
+    return name

@@ -26,7 +26,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics, SummaryOffset
 
 from tdhil import __version__
-from tdhil.record.channels import CHANNELS, CLASSES, PACKAGE
+from tdhil.record.channels import CHANNELS, CLASSES, PACKAGE, schema_name
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = f"{PACKAGE} {__version__}"
@@ -190,7 +190,7 @@ def _declarations() -> tuple[list[bytes], list[bytes]]:
     schemas, channels = [], []
     for number, (topic, message) in CHANNELS.items():
         data = _descriptor_set(CLASSES[message])
-        schemas.append(_record(Schema(id=number, name=f"{PACKAGE}.{message}", encoding="protobuf", data=data)))
+        schemas.append(_record(Schema(id=number, name=schema_name(message), encoding="protobuf", data=data)))
         channels.append(_record(
             Channel(id=number, topic=topic, message_encoding="protobuf", schema_id=number, metadata={})))
     return schemas, channels
@@ -198,7 +198,8 @@ def _declarations() -> tuple[list[bytes], list[bytes]]:
 
 def _descriptor_set(message: Any) -> bytes:
     files = FileDescriptorSet()
-    message.DESCRIPTOR.file.CopyToProto(files.file.add())
+    for file in (*message.DESCRIPTOR.file.dependencies, message.DESCRIPTOR.file):
+        file.CopyToProto(files.file.add())
     return files.SerializeToString(deterministic=True)
 
 

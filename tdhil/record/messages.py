@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from tdhil.record import chunk
-from tdhil.record.channels import CHANNELS, PACKAGE
+from tdhil.record.channels import CHANNELS, PACKAGE, schema_name
 from tdhil.record.container import MAGIC
 from tdhil.record.errors import LogError
 from tdhil.record.inflate import Contents, Damage
 from tdhil.record.recovery import Library, Whole, walk
 
-_NUMBER: Final = {(topic, f"{PACKAGE}.{message}"): number for number, (topic, message) in CHANNELS.items()}
+_NUMBER: Final = {(topic, schema_name(message)): number for number, (topic, message) in CHANNELS.items()}
 _OTHER: Final = "Give a run.mcap of this tool"
 
 
@@ -47,6 +47,8 @@ def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | W
                 elif isinstance(found, Library):
                     declared.library(found.name)
                 else:
+                    if salvage and isinstance(found, Damage):
+                        declared.assume_undeclared()       # it may have been what declares the channels
                     yield found
     except OSError as error:
         raise LogError(f"the log can't be read: {error.strerror or error}", where=str(path),
@@ -73,6 +75,11 @@ class _Declared:
     def assume(self) -> None:
         """Nothing is known of who wrote it: what can't be one of our files' chunks must show by itself."""
         self._numbers = {number: number for number in CHANNELS}
+
+    def assume_undeclared(self) -> None:
+        """Where nothing was declared so far: our own numbers."""
+        if not self._schemas:
+            self._numbers = {number: number for number in CHANNELS} | self._numbers
 
     def messages(self, contents: Contents) -> Iterator[Ours | Damage]:
         numbers = self._numbers

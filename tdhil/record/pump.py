@@ -6,10 +6,11 @@ from typing import Final
 
 from drivers.drive import RawFrame, Sample
 from tdhil.record.backlog import Backlog
-from tdhil.record.channels import CAN, COMMAND, SAMPLE
+from tdhil.record.channels import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE
 from tdhil.record.cold import Cold, event_message
 from tdhil.record.container import Container
 from tdhil.record.event import Event
+from tdhil.record.foxglove import log_payload
 from tdhil.record.sync import Syncer
 from tdhil.record.wire import pack_command, pack_frames, pack_sample
 
@@ -26,12 +27,15 @@ class Pump:
     ``failure`` is the first exception, whatever came after it.
     """
 
-    def __init__(self, backlog: Backlog, container: Container, syncer: Syncer, epoch_ns: int) -> None:
+    def __init__(
+        self, backlog: Backlog, container: Container, syncer: Syncer, epoch_ns: int, frames: int = CAN
+    ) -> None:
         self.failure: BaseException | None = None
         self._backlog = backlog
         self._container = container
         self._syncer = syncer
         self._epoch_ns = epoch_ns
+        self._channel = frames                 # of raw frames
         self._time_s = 0.0                     # of the latest record, control time
         self._frames: list[RawFrame] = []      # of the cycle that is under way
         self._chunk_ns: int | None = None      # log time of the open chunk's first sample
@@ -106,26 +110,35 @@ class Pump:
 
     def _put_frames(self) -> None:
         frames, self._frames = self._frames, []
-        self._container.add(CAN, self._log_ns(frames[0][0]), pack_frames(frames))
+        self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
         if self._container.size > CHUNK_BYTES:
             self._close_chunk()
 
     def _put_cold(self, cold: Cold) -> None:
         channel, time_s, payload, flush = cold
-        self._container.add(channel, self._log_ns(self._time_s if time_s is None else time_s), payload)
+        log_ns = self._log_ns(self._time_s if time_s is None else time_s)
+        self._container.add(channel, log_ns, payload)
+        if channel == EVENT:
+            self._put_log(log_ns, payload)
         if flush or self._container.size > CHUNK_BYTES:
             self._close_chunk()
+
+    def _put_log(self, log_ns: int, payload: bytes) -> None:
+        """An event again, as viewers know it."""
+        event = CLASSES["Event"].FromString(payload)
+        self._container.add(LOG, log_ns, log_payload(event.kind, event.text, log_ns))
 
     def _close_chunk(self) -> None:
         if self._frames:
             frames, self._frames = self._frames, []
-            self._container.add(CAN, self._log_ns(frames[0][0]), pack_frames(frames))
+            self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
         dropped = self._backlog.dropped
         if dropped > self._told:
             text = f"{dropped - self._told} records found no place in the log's queue; {dropped} so far"
             self._told = dropped
             event = event_message(Event(self._time_s, "dropped", text))
             self._container.add(event.channel, self._log_ns(self._time_s), event.payload)
+            self._put_log(self._log_ns(self._time_s), event.payload)
         self._chunk_ns = self._opened_s = None
         self._container.close_chunk()
         self._backlog.saved_s = self._time_s

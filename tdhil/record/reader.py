@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
-from drivers.drive import PowerState, RawFrame, Sample
+from drivers.drive import Command, PowerState, RawFrame, Sample
 from tdhil.record import channels
 from tdhil.record.builder import FACTS, RecordingBuilder
 from tdhil.record.channels import CHANNELS, CLASSES, MODE_OF, STATE_OF
@@ -54,27 +54,43 @@ def read_run(path: Path, *, salvage: bool = False) -> Run:
 
 def read_samples(path: Path) -> Iterator[Sample]:
     """The samples as they were logged, damaged stretches left out. Raises `LogError` like `read_run`."""
-    for message in _messages(path, channels.SAMPLE):
-        demand_nm = message.torque_demand_nm if message.HasField("torque_demand_nm") else None
-        yield Sample(
-            message.time_s, message.age_s, message.half_width_s, message.fresh, message.speed_rad_s,
-            message.torque_nm, demand_nm, MODE_OF.get(message.mode), STATE_OF.get(message.state, PowerState.NOT_READY),
-            message.standstill, message.limit_active, message.status)
+    for _, message in _messages(path, channels.SAMPLE):
+        yield _sample_of(message)
 
 
 def read_frames(path: Path) -> Iterator[RawFrame]:
-    """The raw frames as they stood on the bus, damaged stretches left out. Raises `LogError` like `read_run`."""
-    for message in _messages(path, channels.CAN):
+    """The raw frames as they stood on the bus, damaged stretches left out. Raises `LogError` like `read_run`.
+
+    Of a Modbus line they are requests and replies, the unit for an identifier.
+    """
+    for _, message in _messages(path, channels.CAN, channels.MODBUS):
         for frame in message.frames:
             yield RawFrame(frame.time_s, frame.outgoing, frame.identifier, frame.data)
 
 
-def _messages(path: Path, wanted: int) -> Iterator[Any]:
-    parse = CLASSES[CHANNELS[wanted][1]].FromString
+def read_cycles(path: Path) -> Iterator[tuple[Command | None, Sample]]:
+    """Every sample with the command that it answers, None before the first. Raises `LogError` like `read_run`."""
+    command: Command | None = None
+    for number, message in _messages(path, channels.COMMAND, channels.SAMPLE):
+        if number == channels.SAMPLE:
+            yield command, _sample_of(message)
+        elif (mode := MODE_OF.get(message.mode)) is not None:
+            command = Command(mode, message.speed_rad_s, message.torque_nm)
+
+
+def _sample_of(message: Any) -> Sample:
+    demand_nm = message.torque_demand_nm if message.HasField("torque_demand_nm") else None
+    return Sample(
+        message.time_s, message.age_s, message.half_width_s, message.fresh, message.speed_rad_s,
+        message.torque_nm, demand_nm, MODE_OF.get(message.mode), STATE_OF.get(message.state, PowerState.NOT_READY),
+        message.standstill, message.limit_active, message.status)
+
+
+def _messages(path: Path, *wanted: int) -> Iterator[tuple[int, Any]]:
     for found in messages(path):
-        if isinstance(found, Ours) and found.number == wanted:
+        if isinstance(found, Ours) and found.number in wanted:
             with suppress(DecodeError):
-                yield parse(found.payload)
+                yield found.number, CLASSES[CHANNELS[found.number][1]].FromString(found.payload)
 
 
 class _Reading:
@@ -132,7 +148,9 @@ class _Reading:
 
     def _message(self, number: int, payload: bytes) -> None:
         try:
-            if number not in (channels.SAMPLE, channels.COMMAND, channels.CAN):
+            if number in (channels.COMMAND, channels.CAN, channels.LOG, channels.MODBUS):
+                return
+            if number != channels.SAMPLE:
                 self._budget -= len(payload)
                 if self._budget < 0:
                     raise ValueError(f"more than {RARE_BYTES} bytes of such messages")

@@ -13,11 +13,12 @@ from typing import Final
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from tdhil.record.channels import CHANNELS, CLASSES, EVENT
+from tdhil.record.channels import CHANNELS, CLASSES, EVENT, LOG
 from tdhil.record.cold import event_message
 from tdhil.record.container import Container
 from tdhil.record.errors import LogBroken, LogError, LogUnopened, NothingRecoverable
 from tdhil.record.event import RECOVERED, Event
+from tdhil.record.foxglove import log_payload
 from tdhil.record.messages import Ours, messages
 from tdhil.record.reader import Run, read_run
 
@@ -117,6 +118,7 @@ def _copy(source: Path, container: Container, found: Salvage) -> int:
         said = f"recovered from a damaged log; lost: {'; '.join(found.lost)}"
         event = event_message(Event(float(time_s[-1]) if len(time_s) else 0.0, RECOVERED, said))
         container.add(event.channel, last_ns, event.payload)
+        container.add(LOG, last_ns, log_payload(RECOVERED, said, last_ns))
     container.close_chunk()
     container.finish()
     return count

@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 from drivers.drive import Command, RawFrame, Sample
 from tdhil.record import cold
 from tdhil.record.backlog import Backlog
+from tdhil.record.channels import CAN, MODBUS
 from tdhil.record.container import Container, LogGone, RawFile
 from tdhil.record.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.record.event import Event
@@ -33,6 +34,8 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 class RunWriter:
     """One run.mcap. ``epoch_ns`` is the wall clock at control time zero.
+
+    ``modbus``: the raw frames are a Modbus line's, on a topic of their own.
 
     ``queue_size`` counts records; None takes the default of stepped or real time.
     ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in
@@ -56,6 +59,7 @@ class RunWriter:
         min_free_bytes: int = 200_000_000,
         overwrite: bool = True,
         opener: Callable[[Path], RawFile] | None = None,
+        modbus: bool = False,
     ) -> None:
         self.path = path
         self._raised = self._closing = False
@@ -73,7 +77,7 @@ class RunWriter:
             kind = LogRefused if error.errno in _FULL else LogUnopened
             raise self._error(kind, "the log can't be opened", error) from error
         self._block = block
-        self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns)
+        self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns, MODBUS if modbus else CAN)
         self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
         self._thread.start()
 

@@ -100,13 +100,13 @@ def test_mcap_reads_it_and_the_times_are_right(tmp_path):
         assert reader.get_header().library.startswith("tdhil ")
         for schema, channel, message, decoded in reader.iter_decoded_messages():
             counts[channel.topic] += 1
-            assert schema.name == f"tdhil.{type(decoded).DESCRIPTOR.name}"
+            assert schema.name == type(decoded).DESCRIPTOR.full_name
             assert message.log_time == message.publish_time
             if channel.topic in ("/sample", "/command", "/can"):
                 assert message.log_time == epoch_ns + round(decoded.time_s * 1e9)
         statistics = reader.get_summary().statistics
     assert counts == {"/sample": 500, "/command": 500, "/can": 500, "/stage": 2, "/excitation": 2, "/event": 1,
-                      "/configuration": 1, "/result": 1}
+                      "/log": 1, "/configuration": 1, "/result": 1}
     assert statistics.message_count == counts.total()
     assert statistics.message_start_time == epoch_ns
     assert statistics.chunk_count >= 500 * PERIOD_S / 0.5
