@@ -62,6 +62,11 @@ class QuickStop(Entry):
 class Speed(Entry):
     """Speed as reported in 606Ch and commanded in 60FFh, and what limits it."""
 
+    vl: bool = Field(
+        default=False,
+        description="velocity mode (vl, mode 2): 6042h and 6044h, 16 bits each, in place of 60FFh and 606Ch, and bits "
+        "4 to 6 of the controlword release the setpoint",
+    )
     rpm_per_lsb: Positive = Field(description="unit of 606Ch and 60FFh in rpm, before `times` and `over`")
     times: tuple[Name, ...] = Field(default=(), description="parameters whose values multiply the unit")
     over: tuple[Name, ...] = Field(default=(), description="parameters whose values divide the unit")

@@ -22,6 +22,10 @@ _MUST = {
     0x6040: ("controlword", "u16"), 0x6041: ("statusword", "u16"), 0x60FF: ("target velocity", "i32"),
     0x606C: ("velocity actual", "i32"),
 }
+_MUST_VL = {key: _MUST[key] for key in (0x6040, 0x6041)} | {
+    0x6042: ("vl target velocity", "i16"), 0x6044: ("vl velocity actual", "i16"),
+}
+"""Of a drive that has velocity mode (vl, 2) instead."""
 _ROTATIONS = {0xB4: 1.0, 0x10: 1.0 / (2.0 * math.pi), 0x41: 1.0 / 360.0}
 _TIMES_S = {0x03: 1.0, 0x47: 60.0}
 """Turns and seconds in the units of 60A9h, by their numbers in CiA 303-2 (B4h: a revolution, of CiA 402)."""
@@ -52,17 +56,31 @@ def _refuse_unless_possible(eds: EdsFile, path: str) -> None:
     told = None if kind is None else kind.stands
     if kind is not None and told is not None and int(told) & 0xFFFF not in (0, 402):
         problems.append(Problem(path, kind.line, f"1000h says device profile {int(told) & 0xFFFF}: no CiA 402 drive"))
-    if eds.get(0x60FF) is None and eds.get(0x6042) is not None:
-        problems.append(Problem(path, 0, "has 6042h (velocity mode, vl) and no 60FFh: a drive whose only speed mode is "
-                                         "vl can't be driven by this program on CANopen; see whether it has Modbus"))
-    elif missing := [f"{index:04X}h ({said})" for index, (said, _) in _MUST.items() if eds.get(index) is None]:
+    must = _MUST_VL if _only_vl(eds) else _MUST
+    if missing := [f"{index:04X}h ({said})" for index, (said, _) in must.items() if eds.get(index) is None]:
         problems.append(Problem(path, 0, f"has no {', '.join(missing)}: no CiA 402 drive with a speed to set"))
-    for index, (said, kind_wanted) in _MUST.items():
+    for index, (said, kind_wanted) in must.items():
         one = eds.get(index)
         if one is not None and one.type != kind_wanted:
             problems.append(Problem(path, one.line, f"{index:04X}h ({said}) is {one.type}: {kind_wanted} is wanted"))
     if problems:
         raise DataFileError(tuple(problems))
+
+
+def _modes_told(eds: EdsFile) -> int | None:
+    """6502h; None where the file gives no value."""
+    one = eds.get(0x6502)
+    return None if one is None or not one.stands else int(one.stands)
+
+
+def _only_vl(eds: EdsFile) -> bool:
+    """Is velocity mode (2) the one speed mode? By 6502h, else by what there is."""
+    if eds.get(0x6042) is None:
+        return False
+    bits = _modes_told(eds)
+    if bits is not None and not any(bits >> code - 1 & 1 for code in SPEED_MODES):
+        return bool(bits >> 1 & 1)
+    return eds.get(0x60FF) is None
 
 
 class _Writer:
@@ -144,8 +162,7 @@ class _Writer:
             yield from self._entry(f"{self._file}, 1018h or DeviceInfo; preflight compares the drive's", "verified")
 
     def _modes(self) -> Iterator[str]:
-        supported, mode = self._eds.get(0x6502), self._eds.get(0x6060)
-        bits = None if supported is None or not supported.stands else int(supported.stands)
+        mode, bits, vl = self._eds.get(0x6060), _modes_told(self._eds), _only_vl(self._eds)
         said = "no value of 6502h" if bits is None else f"6502h = {bits:08X}h"
 
         def has(code: int) -> bool:
@@ -156,7 +173,9 @@ class _Writer:
         mapped = mode is not None and mode.mappable
         target = self._eds.get(0x6071)
         why = ""
-        if target is None or target.type != "i16" or not target.mappable:
+        if vl:
+            speed, why = [2], "velocity mode (vl, 2) has its setpoint where other modes don't, and stands alone"
+        elif target is None or target.type != "i16" or not target.mappable:
             why = "6071h (target torque) is not in the file, is no i16 or can't be mapped"
         elif not mapped:
             why = "6060h can't be mapped into a PDO: the mode can't change in the cycle"
@@ -232,7 +251,12 @@ class _Writer:
             )
         for note in self._factors():
             yield from _comment(f"{note}")
+        vl = _only_vl(self._eds)
+        if vl:
+            yield from _comment("Velocity mode: 6042h and 6044h, in rpm where 604Ch (vl dimension factor) is 1 over 1.")
         yield "speed:"
+        if vl:
+            yield "  vl: true"
         yield f"  rpm_per_lsb: {self._rpm_text()}"
         yield from scale
         if si is not None:
@@ -243,9 +267,9 @@ class _Writer:
         yield from self._entry(said, confidence)
 
     def _si_unit(self) -> float | None:
-        """Rpm for one count by 60A9h; None where it isn't told, or is no speed of a shaft."""
+        """Rpm for one count by 60A9h; None where it isn't told, is no speed of a shaft, or not vl's."""
         one = self._eds.get(0x60A9)
-        if one is None or one.type != "u32" or not one.readable or not one.stands:
+        if _only_vl(self._eds) or one is None or one.type != "u32" or not one.readable or not one.stands:
             return None
         raw = int(one.stands)
         turn, second = _ROTATIONS.get(raw >> 16 & 0xFF), _TIMES_S.get(raw >> 8 & 0xFF)
@@ -267,7 +291,7 @@ class _Writer:
     def _counted(self) -> bool:
         """Has it an encoder resolution that speeds may be counted in?"""
         one = self._eds.get(0x608F, 1)
-        return one is not None and one.type == "u32" and one.readable
+        return not _only_vl(self._eds) and one is not None and one.type == "u32" and one.readable
 
     def _scale(self) -> tuple[list[str], str]:
         """(the lines of times and over, source): a guess that the drive's own objects scale."""
@@ -307,8 +331,9 @@ class _Writer:
         """What the file has of the factor group, for whoever looks the unit up."""
         for index, said in ((0x6090, "velocity encoder resolution"), (0x6091, "gear ratio"), (0x6092, "feed constant"),
                             (0x6094, "velocity encoder factor"), (0x6095, "velocity factor 1"),
-                            (0x6096, "velocity factor"), (0x608B, "velocity notation index"),
-                            (0x608C, "velocity dimension index"), (0x60A8, "SI unit position")):
+                            (0x6096, "velocity factor"), (0x604C, "vl dimension factor"),
+                            (0x608B, "velocity notation index"), (0x608C, "velocity dimension index"),
+                            (0x60A8, "SI unit position")):
             subs = [one for (at, sub), one in sorted(self._eds.objects.items()) if at == index and (sub or index in (
                 0x608B, 0x608C, 0x60A8))]
             told = ", ".join("not told" if one.stands is None else f"{one.stands:.10g}" for one in subs)
@@ -398,7 +423,7 @@ class _Writer:
 
     def _mapping_hints(self) -> None:
         """Can what a run needs be mapped, and can the mapping be written?"""
-        wanted = (0x6040, 0x6041, 0x60FF, 0x606C, 0x6061)
+        wanted = (*(_MUST_VL if _only_vl(self._eds) else _MUST), 0x6061)
         unmapped = [index for index in wanted if (one := self._eds.get(index)) is None or not one.mappable]
         if unmapped:
             listed = ", ".join(f"{index:04X}h" for index in unmapped)

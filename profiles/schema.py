@@ -60,6 +60,16 @@ class CanopenProfile(DataModel):
         return self
 
     @model_validator(mode="after")
+    def _vl_alone(self) -> Self:
+        findings: list[Finding] = []
+        if self.speed.vl != (2 in self.modes.speed):
+            findings.append(("speed.vl", "velocity mode (2 in modes.speed) has objects of its own: both or neither"))
+        elif self.speed.vl and (len(self.modes.speed) > 1 or self.modes.torque):
+            findings.append(("modes", "velocity mode (2) stands alone: its setpoint is not where other modes have it"))
+        refuse_if(findings)
+        return self
+
+    @model_validator(mode="after")
     def _refers(self) -> Self:
         names = [parameter.name for parameter in self.parameters]
         findings: list[Finding] = [

@@ -48,6 +48,7 @@ class ApplicationObjects:
             key_of(0x6060): self._mode_by_pdo,
             key_of(0x6071): self._set_target_torque,
             key_of(0x60FF): self._set_target_velocity,
+            key_of(0x6042): self._set_target_velocity,
         }
         self._ratings()
         self._bind_process_data()
@@ -83,6 +84,8 @@ class ApplicationObjects:
         live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
         live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)
         live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / velocity, 32)
+        live[key_of(0x6042)] = lambda: clamped(application.target_speed_rad_s / velocity, 16)
+        live[key_of(0x6044)] = lambda: clamped(reporting.speed_rad_s / velocity, 16)
         hooks.update(self.setters)
         hooks[key_of(0x6060)] = self._mode_by_sdo
 

@@ -22,6 +22,7 @@ from sim_bus.inverter import Inverter
 class Mode(IntEnum):
     """Modes of operation, 6060h."""
 
+    VELOCITY = 2                         # vl: follows its setpoint only where controlword bits 4 to 6 release it
     PROFILE_VELOCITY = 3
     PROFILE_TORQUE = 4
     CYCLIC_VELOCITY = 9
@@ -64,7 +65,7 @@ class Application:
         self.controlword = 0
         self.target_speed_rad_s = 0.0
         self.target_torque_nm = 0.0
-        self.modes = frozenset(Mode)
+        self.modes = frozenset(Mode) - {Mode.VELOCITY}        # only a drive whose profile says so has it
         self.warning = False
         self.deaf = False              # scripted: no command moves the state machine
         self.keeps_mode = False        # scripted: 6060h is taken and not followed
@@ -133,7 +134,7 @@ class Application:
     def power_off(self) -> None:
         """Reset of the device: no torque, switch on disabled, setpoints forgotten."""
         self.controlword = 0
-        self.mode = Mode.PROFILE_VELOCITY
+        self.mode = self.first_mode
         self.target_speed_rad_s = self.target_torque_nm = 0.0
         self._own_stop = False
         self._weighed = None
@@ -141,6 +142,11 @@ class Application:
         self.inverter.control.off()
 
     # -- what it says ------------------------------------------------------------------------------------
+
+    @property
+    def first_mode(self) -> Mode:
+        """After power on: profile velocity, or what the drive has instead."""
+        return Mode.PROFILE_VELOCITY if Mode.PROFILE_VELOCITY in self.modes else min(self.modes, default=Mode.VELOCITY)
 
     @property
     def standstill(self) -> bool:
@@ -211,6 +217,10 @@ class Application:
             control.off()
         elif self.controlword & sm.HALT:
             control.stop(self._ramp(settings.halt_option))
+        elif self.mode is Mode.VELOCITY:
+            released = self.controlword & sm.RELEASED == sm.RELEASED
+            target = self.target_speed_rad_s if released else 0.0
+            control.speed(target, settings.accel_rad_s2, settings.decel_rad_s2)
         elif self.mode is Mode.CYCLIC_TORQUE:
             control.torque(self.target_torque_nm)
         elif self.mode is Mode.CYCLIC_VELOCITY:

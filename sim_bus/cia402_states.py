@@ -18,6 +18,7 @@ from enum import Enum
 
 FAULT_RESET = 0x0080
 HALT = 0x0100
+RELEASED = 0x0070          # velocity mode: ramp enabled (4), not locked (5), reference used (6)
 
 VOLTAGE_ENABLED = 0x0010
 WARNING = 0x0080

@@ -31,6 +31,7 @@ class WornProfile:
         self.units: ObjectUnits = profile_units(application.inverter.params.drive, profile, self.settings.scales())
         wanted = (*profile.modes.speed, *profile.modes.torque)
         application.modes = frozenset(Mode(code) for code in wanted if code in list(Mode))
+        application.mode = application.first_mode
 
     def dress(self, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]) -> None:
         """Everything at once."""
@@ -140,6 +141,16 @@ class WornProfile:
                 store.live[key] = lambda: clamped(reporting.torque_nm / unit, bits)
 
     def _speed(self, store: ObjectStore) -> None:
+        if self.profile.speed.vl:
+            for index in (0x606B, 0x606C, 0x606D, 0x606F, 0x60FF):
+                store.remove(index)
+            for index, writable, name in ((0x6042, True, "vl target velocity"), (0x6044, False, "vl velocity actual")):
+                key = key_of(index)
+                live, hook = store.live[key], store.hooks.get(key)
+                store.add(index, 0, datatypes.INTEGER16, writable=writable, mappable=True, name=name)
+                store.live[key] = live
+                if hook is not None:
+                    store.hooks[key] = hook
         if self.profile.speed.si_unit is not None:
             store.set_default(0x60A9, 0, self.profile.speed.si_unit)
 

@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING
 from drivers.bare_stop import Seen
 from drivers.cia402.link import CanLink
 from drivers.cia402.mapping import DISABLED
-from drivers.cia402.objects import RPM, mapping_entry
+from drivers.cia402.objects import VELOCITY_ACTUAL, VL_ACTUAL, mapping_entry
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.state import ENABLE_OPERATION, QUICK_STOP, TARGET_REACHED, State, decode, power_state
+from drivers.cia402.units import speed_unit
 from drivers.clock import Clock
 from drivers.drive import PowerState
 from drivers.errors import DriveFault, ObjectRefused
+from drivers.table import Table
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile
 
@@ -51,7 +53,8 @@ class Cia402Target:
         self._profile = profile
         self._clock = clock
         self._stays_in_torque_mode = False
-        self._rad_s_per_lsb = profile.speed.rpm_per_lsb * RPM
+        self._rad_s_per_lsb: float | None = None
+        self._speed_at = (VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0]
         self._word = QUICK_STOP
         self._prepared = False
         self._foreign = 0
@@ -76,8 +79,10 @@ class Cia402Target:
     def look(self) -> Seen:
         """6041h and 606Ch."""
         status = self._objects.read(0x6041)
-        raw = self._objects.read(0x606C, signed=True)
+        raw = self._objects.read(self._speed_at, signed=True)
         state = decode(status)
+        if self._rad_s_per_lsb is None:                # where the drive's own settings scale it, from there
+            self._rad_s_per_lsb = speed_unit(Table(), self._objects, self._profile)
         speed = raw * self._rad_s_per_lsb
         enabled = power_state(state) is PowerState.ENABLED
         return Seen(

@@ -30,7 +30,7 @@ from drivers.cia402.position import Angle, find_angle
 from drivers.cia402.read_back import ReadBack
 from drivers.cia402.reported import Reported
 from drivers.cia402.sdo import Objects
-from drivers.cia402.shape import RPDO1, RPDO1_SPEED, shape_of
+from drivers.cia402.shape import shape_of
 from drivers.cia402.sign_of_life import HEARTBEAT_S, SignOfLife
 from drivers.cia402.standing import Standing
 from drivers.cia402.state import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
@@ -106,7 +106,8 @@ class Cia402Drive:
         )
         self._objects.on_answer(self._read_back.take)
         self._strangers.on_write = self._on_write
-        self._standing = Standing(self._objects, self._link, node, self.period_s)
+        self._shape = shape_of(profile)
+        self._standing = Standing(self._objects, self._link, node, self.period_s, self._shape.target_speed)
         self._fed = True
         self._link.handlers[0x080 + node] = self._watch.on_emcy
         self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
@@ -118,7 +119,6 @@ class Cia402Drive:
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
         self._modes: dict[int, Mode] = {}
-        self._shape = shape_of(profile)
         self._layout = self._shape.feedback
         self._wide = self._shape.wide
         self._feedback = self._new_feedback()
@@ -204,7 +204,7 @@ class Cia402Drive:
         if self._left is not None:
             checks.give_back_left(table, objects, self._left, self._identity)
         checks.check_identity(table, self._identity, self._profile)
-        checks.check_state(table, objects, self._units)
+        checks.check_state(table, objects, self._units, self._profile)
         check_parameters(table, objects, self._profile)
         self._codes = checks.choose_modes(table, objects, self._profile)
         self._modes = {code: mode for mode, code in self._codes.items()}
@@ -294,7 +294,7 @@ class Cia402Drive:
                 back.watch("the quick-stop option", index, sub, data, often=True)
             elif index not in (0x1006, 0x1017, 0x6060, MARKER_INDEX):
                 back.watch("the drive's own limit", index, sub, data)
-        back.watch_setpoint("the target velocity", 0x60FF)
+        back.watch_setpoint("the target velocity", self._shape.target_speed[0])
         if self._has_target:
             back.watch_setpoint("the target torque", 0x6071)
         if self._shape.mode:
@@ -356,7 +356,7 @@ class Cia402Drive:
         """
         if command.mode not in self._codes:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
-        speed_raw = encode_speed(command.speed_rad_s, self._units)
+        speed_raw = encode_speed(command.speed_rad_s, self._units, self._shape.target_speed)
         torque_raw = encode_torque(command.torque_nm, self._units)
         self._ticks.wait(self._listen_until)
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
@@ -373,12 +373,8 @@ class Cia402Drive:
                 self._link.send(self._rpdo2_id, RPDO2.pack(code))
             self._sent_code, self._since_mode_sent, self._mode_overwritten = code, 0, False
         word = controlword_towards(self._reported.state, self._wish)
-        self._link.send(
-            self._rpdo1_id,
-            RPDO1.pack(word, torque_raw, speed_raw) if self._has_target else RPDO1_SPEED.pack(word, speed_raw),
-            self._ticks.check,
-        )
-        self._read_back.sent(0x60FF, speed_raw)
+        self._link.send(self._rpdo1_id, self._shape.setpoints(word, torque_raw, speed_raw), self._ticks.check)
+        self._read_back.sent(self._shape.target_speed[0], speed_raw)
         self._read_back.sent(0x6071, torque_raw)
         self._read_back.sent(0x6060, code)
         sample = self._finish(now_s)

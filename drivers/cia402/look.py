@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drivers.cia402.objects import VELOCITY_ACTUAL
+from drivers.cia402.objects import VELOCITY_ACTUAL, VL_ACTUAL
 from drivers.cia402.sdo import Objects, name
 from drivers.cia402.state import State, Wish, controlword_towards, decode
 from drivers.cia402.values import decode_value
@@ -43,7 +43,7 @@ def look(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked
     with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
         try:
             status = objects.read(0x6041)
-            speed = objects.read(VELOCITY_ACTUAL[0], VELOCITY_ACTUAL[1], signed=True)
+            speed = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], 0, signed=True)
         except (CommunicationLost, ObjectRefused):
             return None
         return Looked(status, speed, _torque(objects, profile))

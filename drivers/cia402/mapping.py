@@ -13,9 +13,7 @@ from drivers.cia402.objects import (
     MODE_DISPLAY,
     STATUSWORD,
     TARGET_TORQUE,
-    TARGET_VELOCITY,
     TORQUE_DEMAND,
-    VELOCITY_ACTUAL,
     mapping_entry,
 )
 from drivers.cia402.sdo import Objects, name
@@ -64,14 +62,14 @@ def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -
 
     ``slow``: see `slow_syncs`.
     """
-    targets = (TARGET_TORQUE, TARGET_VELOCITY) if shape.target_torque else (TARGET_VELOCITY,)
+    targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
     shown = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
     first: tuple[tuple[int, int, int], ...]
     second: tuple[tuple[int, int, int], ...]
     if shape.wide:
-        first, second, syncs = (shape.torque, VELOCITY_ACTUAL), (STATUSWORD, *shown), 1
+        first, second, syncs = (shape.torque, shape.actual_speed), (STATUSWORD, *shown), 1
     else:
-        first, second, syncs = (STATUSWORD, shape.torque, VELOCITY_ACTUAL), shown, slow
+        first, second, syncs = (STATUSWORD, shape.torque, shape.actual_speed), shown, slow
     modes = (Pdo(True, 2, 1, (MODE,)),) if shape.mode else ()
     return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
 

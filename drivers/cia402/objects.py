@@ -35,8 +35,11 @@ TARGET_TORQUE = (0x6071, 0, 16)
 TORQUE_DEMAND = (0x6074, 0, 16)
 TORQUE_ACTUAL = (0x6077, 0, 16)
 TARGET_VELOCITY = (0x60FF, 0, 32)
+VL_TARGET, VL_ACTUAL = (0x6042, 0, 16), (0x6044, 0, 16)
+"""Velocity mode (vl): target velocity, and what CiA 402-2 calls vl velocity actual value (or control effort)."""
 
-MODE_NAMES = {3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity", 10: "cyclic sync torque"}
+MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity",
+              10: "cyclic sync torque"}
 """6060h codes that tdhil may use."""
 
 
@@ -49,9 +52,10 @@ class Units:
     target_nm_per_lsb: float | None = None      # None: as reported
 
 
-def encode_speed(speed_rad_s: float, units: Units) -> int:
-    """Rad/s at the motor shaft → 60FFh. Raises CommandRejected outside i32 or if not finite."""
-    return _encode(speed_rad_s, units.speed_rad_s_per_lsb, 31, "target velocity 60FFh", "rad/s")
+def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
+    """Rad/s at the motor shaft → 60FFh, or 6042h. Raises CommandRejected outside of it or if not finite."""
+    index, _, bits = target
+    return _encode(speed_rad_s, units.speed_rad_s_per_lsb, bits - 1, f"target velocity {index:04X}h", "rad/s")
 
 
 def encode_torque(torque_nm: float, units: Units) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from drivers.cia402.filters import read_filters
-from drivers.cia402.objects import MODE_NAMES, Units
+from drivers.cia402.objects import MODE_NAMES, TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL, VL_TARGET, Units
 from drivers.cia402.sdo import Objects, place
 from drivers.cia402.state import State, decode
 from drivers.drive import Identity, Mode, Preflight
@@ -72,7 +72,7 @@ def give_back_left(table: Table, objects: Objects, left: LeftBehind, identity: I
     objects.left = left
 
 
-def check_state(table: Table, objects: Objects, units: Units) -> None:
+def check_state(table: Table, objects: Objects, units: Units, profile: CanopenProfile) -> None:
     """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop."""
     state = decode(objects.read(0x6041))
     faulty = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -81,7 +81,7 @@ def check_state(table: Table, objects: Objects, units: Units) -> None:
     braking = False
     if state is State.QUICK_STOP_ACTIVE:
         # Disabling would let it coast: it must have come to rest under its own quick stop.
-        speed_lsb = objects.read(0x606C, signed=True)
+        speed_lsb = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], signed=True)
         braking = abs(speed_lsb) > max(STILL_LSB, STILL_RAD_S / units.speed_rad_s_per_lsb)
         found += f", velocity {speed_lsb}"
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
@@ -135,7 +135,8 @@ def check_mode_display(table: Table, objects: Objects, code: int, wait: Callable
 
 def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> None:
     """No setpoint of an earlier run may act when the drive is enabled."""
-    targets = ((0x6071, 16), (0x60FF, 32)) if profile.modes.torque else ((0x60FF, 32),)
+    index, _, bits = VL_TARGET if profile.speed.vl else TARGET_VELOCITY
+    targets = ((0x6071, 16), (index, bits)) if profile.modes.torque else ((index, bits),)
 
     def work() -> tuple[str, bool]:
         for index, bits in targets:

@@ -15,6 +15,7 @@ from contextlib import suppress
 from drivers.cia402.link import CanLink
 from drivers.cia402.look import ANSWER_S, WATCHDOG_SHARE
 from drivers.cia402.mapping import DISABLED
+from drivers.cia402.objects import TARGET_VELOCITY
 from drivers.cia402.sdo import Objects
 from drivers.cia402.state import State, Wish, controlword_towards
 from drivers.errors import CommunicationLost, ObjectRefused
@@ -28,10 +29,14 @@ _LEFT_ALONE = frozenset(State) - {State.OPERATION_ENABLED}
 class Standing:
     """``rpdos``: number of each RPDO that acts or could, and its COB-ID."""
 
-    def __init__(self, objects: Objects, link: CanLink, node: int, period_s: float) -> None:
+    def __init__(
+        self, objects: Objects, link: CanLink, node: int, period_s: float,
+        target: tuple[int, int, int] = TARGET_VELOCITY,
+    ) -> None:
         self._objects = objects
         self._link = link
         self._node = node
+        self._target = target
         self.set_period(period_s)
         self._since_s: float | None = None
         self._turn = 0
@@ -74,7 +79,8 @@ class Standing:
             return
         self._turn += 1
         if self._turn % 4 == 0:
-            self._write(_EXPEDITED_4, 0x60FF, 0)
+            index, _, bits = self._target
+            self._write(_EXPEDITED_4 if bits == 32 else _EXPEDITED_2, index, 0)
         elif self._turn % 4 == 2:
             self._write(_EXPEDITED_2, 0x6071, 0)
         else:

@@ -21,7 +21,7 @@ def find_units(
     where = name(profile.torque.rated.index, profile.torque.rated.sub)
     agreed_nm = agreed_rated_torque(table, _told(objects, profile), rated_torque_nm, where)
     rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused, and the rows after it still want a scale
-    speed = _speed_unit(table, objects, profile)
+    speed = speed_unit(table, objects, profile)
     target = profile.torque.rated_per_lsb * rated_nm
     actual = profile.torque.actual
     if actual is None:
@@ -41,7 +41,7 @@ def _told(objects: Objects, profile: CanopenProfile) -> float | None:
     return raw * per_lsb if raw > 0.0 else None
 
 
-def _speed_unit(table: Table, objects: Objects, profile: CanopenProfile) -> float:
+def speed_unit(table: Table, objects: Objects, profile: CanopenProfile) -> float:
     """Rad/s for one count. A drive whose unit can be set is believed only where it reads back what it is set to."""
     speed = profile.speed
     if speed.si_unit is not None:

@@ -68,7 +68,13 @@ def _s120():
     return S120Bench
 
 
-MAKERS = {"canopen": _canopen, "epos4": _epos4, "modbus": _modbus, "s120-canopen": _s120}
+def _abb():
+    from profile_benches import AbbBench
+
+    return AbbBench
+
+
+MAKERS = {"abb-fcan": _abb, "canopen": _canopen, "epos4": _epos4, "modbus": _modbus, "s120-canopen": _s120}
 
 
 @pytest.fixture(params=sorted(MAKERS))

@@ -81,6 +81,9 @@ class CanopenBench:
     ends = PowerState.QUICK_STOP
     speed_lsb, torque_lsb = 0.1 * RPM, 1.0
     ramp_rad_s2 = LIMITS.quick_stop_rad_s2
+    ramp_rel = 0.05
+    has_limits = True              # that a run can set
+    safe_action = "quick_stop"
 
     def __init__(self, params=None, *, seed=0, **options):
         self.limits = LIMITS

@@ -28,7 +28,9 @@ class ModbusBench:
     OWN_IDENTIFIERS = False        # both directions bear the unit's number
     modes = frozenset({Mode.SPEED, Mode.TORQUE})
     ends = PowerState.QUICK_STOP
-    ramp_rad_s2 = LIMITS.quick_stop_rad_s2
+    ramp_rad_s2, ramp_rel = LIMITS.quick_stop_rad_s2, 0.05
+    has_limits = True
+    safe_action = "quick_stop"
 
     def __init__(self, params=None, *, seed=0, timing=None, **options):
         self.limits = LIMITS

@@ -72,3 +72,36 @@ class S120Bench(CanopenBench):
     def setpoints(self, frames):
         words = [struct.unpack("<Hi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
         return [(counts * self.speed_lsb, None) for _, counts in words]
+
+
+class AbbBench(CanopenBench):
+    """Velocity mode: 6042h and 6044h in rpm, 16 bits; torque in thousandths, no limit and no ramp that can be set."""
+
+    PROFILE, WORN = "abb/acs880-fcan", True
+    SETTINGS = ((0x1016, 1), (0x1017, 0))
+    TARGETS = ((0x6060, 0), (0x6042, 0))
+    LEAST_FRAMES = 1600            # at 100 Hz
+    modes = frozenset({Mode.SPEED})
+    ends = PowerState.OFF
+    speed_lsb, torque_lsb = RPM, 1.0
+    has_limits = False
+    ramp_rad_s2, ramp_rel = 3.0, 0.12      # the simulated drive's own, so steep that its speed loop lags behind
+    safe_action = "coast"
+
+    def __init__(self, *args, **options):
+        super().__init__(*args, rated_torque_nm=1000.0, **options)
+
+    def decode(self, frames):
+        found, mode = [], 0
+        for frame in frames:
+            if not frame.outgoing and frame.identifier == 0x281:
+                (mode,) = struct.unpack("<b", frame.data)
+            elif not frame.outgoing and frame.identifier == 0x181:
+                status, torque, rpm = struct.unpack("<Hhh", frame.data)
+                shown = Mode.SPEED if mode == 2 else None
+                found.append((status, rpm * RPM, torque * 1.0, None, shown))
+        return found
+
+    def setpoints(self, frames):
+        words = [struct.unpack("<Hh", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
+        return [(rpm * RPM, None) for _, rpm in words]

@@ -47,7 +47,7 @@ def test_a_drive_that_can_be_armed_is_armed_all_the_same(run):
     assert found.refused == ()
     assert found.watched
     assert found.watchdog_s == run.bench.limits.watchdog_s
-    assert found.safe_action == "quick_stop"
+    assert found.safe_action == run.bench.safe_action
     assert not [check for check in found.checks if "accept" in check.found]
 
 

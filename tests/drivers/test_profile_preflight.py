@@ -2,10 +2,12 @@
 
 import pytest
 from drive_benches import CanopenBench, Run
-from profile_benches import Epos4Bench, S120Bench
+from profile_benches import AbbBench, Epos4Bench, S120Bench
 
+from drivers.cia402.bare_stop import Cia402Target
 from drivers.cia402.parameters import fulfils, wanted_text
 from drivers.drive import Mode, Outcome
+from profiles.library import load_canopen_profile
 from profiles.requirement import Require
 from profiles.schema import CanopenProfile
 
@@ -155,6 +157,17 @@ def test_torque_of_32_bits(make, monkeypatch, kind):
     assert run.cycle(speed=5.0).fresh
     assert run.drive.counters.missed == missed + 2
     assert run.samples[-1].mode is Mode.SPEED
+
+
+@pytest.mark.parametrize("kind", [AbbBench, Epos4Bench, S120Bench])
+def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
+    """The S120 counts encoder increments, an ABB in vl shows its speed elsewhere."""
+    bench = make(kind)
+    Run(bench).turning(5.0)
+    target = Cia402Target(bench._second, load_canopen_profile(kind.PROFILE), bench.drive.clock, node=1)
+    seen = target.look()
+    assert seen.speed == pytest.approx(5.0, abs=0.2)
+    assert not seen.near_zero
 
 
 @pytest.mark.parametrize(("require", "value", "good"), [

@@ -185,6 +185,19 @@ def test_limits_of_the_file_count(begin):
     assert (profile.watchdog.reaction_index, profile.watchdog.reaction) == (None, "coast")
 
 
+@pytest.mark.parametrize(("drop", "modes"), [((0x60FF, 0x606C), "0x02"), ((), "0x22"), ((), "0x02"), ((0x60FF,), "")])
+def test_a_drive_with_velocity_mode_alone(begin, drop, modes):
+    """vl, usual for inverters' adapters: by 6502h, or because there is no 60FFh."""
+    change = {(0x6042, 0): (I16, "rw", 1, "0"), (0x6044, 0): (I16, "ro", 1, ""), (0x6502, 0): (U32, "ro", 0, modes),
+              (0x604C, 1): (I32, "rw", 0, "1"), (0x604C, 2): (I32, "rw", 0, "10")}
+    begun = begin(eds(change, drop=drop))
+    assert begun.profile.speed.vl
+    assert (begun.profile.modes.speed, begun.profile.modes.torque) == ((2,), ())
+    assert (begun.profile.speed.rpm_per_lsb, begun.profile.speed.confidence) == (1.0, "unverified")
+    assert begun.profile.quick_stop.deceleration_rpm_s_per_lsb is None
+    assert "604Ch, vl dimension factor: 1, 10." in begun.text
+
+
 def test_node_guarding_where_there_is_no_heartbeat(begin):
     guarding = {(0x100C, 0): (U16, "rw", 0, "0"), (0x100D, 0): (U8, "rw", 0, "0")}
     watchdog = begin(eds(guarding, drop=(0x1016,))).profile.watchdog
@@ -266,7 +279,8 @@ def test_a_mistake_is_named_with_its_line(begin, old, new, at, words):
     ("", "no section [DeviceInfo]"), ("VendorName=x\n", "before the first [section]"),
     (b"[DeviceInfo]\nVendorName=a\0b\n", "zero bytes"), ("[DeviceInfo]\n", "no CiA 402 drive"),
     (eds(drop=(0x60FF,)), "60FFh (target velocity)"),
-    (eds({(0x6042, 0): (I16, "rw", 1, "0")}, drop=(0x60FF,)), "velocity mode, vl"),
+    (eds({(0x6042, 0): (I16, "rw", 1, "0")}, drop=(0x60FF,)), "6044h (vl velocity actual)"),
+    (eds({(0x6042, 0): (I32, "rw", 1, "0"), (0x6044, 0): (I16, "ro", 1, "")}, drop=(0x60FF,)), "is i32: i16 is wanted"),
     (eds({(0x1000, 0): (U32, "ro", 0, "0x00030191")}), "device profile 401"),
     (eds({(0x60FF, 0): (I16, "rw", 1, "0")}), "is i16: i32 is wanted"),
     (eds(extra="[606C]\nParameterName=again\nDataType=7\nAccessType=ro\n"), "a second time; first in line"),

@@ -63,6 +63,9 @@ def test_a_copy_of_generic_is_a_profile_of_ones_own(tmp_path: Path) -> None:
     [
         ("torque: [10, 4]", "torque: [9]", "can't be a speed mode and a torque mode"),
         ("speed: [9, 3]", "speed: []", "at least 1 entries"),
+        ("speed: [9, 3]", "speed: [2]", "both or neither"),
+        ("  rpm_per_lsb: 0.1\n", "  rpm_per_lsb: 0.1\n  vl: true\n", "both or neither"),
+        ("speed: [9, 3]\n", "speed: [2, 3]\n", "both or neither"),
         ("  reaction_value: 3\n", "", "belong together"),
         ("reaction: quick_stop", "reaction: none", "say what the drive does"),
         ("kind: heartbeat", "kind: none", "must be none"),

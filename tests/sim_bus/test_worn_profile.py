@@ -206,3 +206,42 @@ def test_an_encoder_that_the_profile_does_not_know(bench: Open) -> None:
     simulated, host = bench(profile=CanopenProfile.model_validate(data))
     assert (host.read(0x608F, 1), host.read(0x608F, 2)) == (4096, 1)
     assert simulated.simulator.node.application.modes
+
+
+def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Open) -> None:
+    """CiA 402-2, vl: bits 4 (ramp enabled), 5 (not locked) and 6 (reference used) of the controlword, by raw frames."""
+    simulated, host = bench(profile=load_canopen_profile("abb/acs880-fcan"))
+    for communication, mapping, cob, entries in (
+        (0x1400, 0x1600, 0x201, (0x60400010, 0x60420010)),
+        (0x1800, 0x1A00, 0x40000181, (0x60410010, 0x60770010, 0x60440010)),
+    ):
+        host.write(communication, 1, cob | 1 << 31, 4)
+        host.write(mapping, 0, 0, 1)
+        for number, entry in enumerate(entries, 1):
+            host.write(mapping, number, entry, 4)
+        host.write(mapping, 0, len(entries), 1)
+        host.write(communication, 2, 1, 1)
+        host.write(communication, 1, cob, 4)
+    host.write(MARKER_INDEX, 3, 10_000, 4)
+    host.write(0x6060, 0, 2, 1)
+    host.nmt(1)
+
+    def cycle(word: int, rpm: int) -> tuple[int, int, int]:
+        host.send(0x201, struct.pack("<Hh", word, rpm))
+        host.send(0x080)
+        return struct.unpack("<Hhh", host.wait(0x181))      # type: ignore[return-value]
+
+    for word in (0x06, 0x07, 0x0F, 0x1F, 0x2F, 0x3F, 0x4F, 0x5F, 0x6F):
+        for _ in range(60):
+            cycle(word, 60)
+        assert abs(simulated.simulator.speed_rad_s) < 0.01, f"{word:02X}h"
+    for _ in range(1500):
+        status, _, rpm = cycle(0x7F, 60)
+    assert status & 0x6F == 0x27
+    assert rpm == 60
+    assert simulated.simulator.speed_rad_s == pytest.approx(6.2831853, abs=0.05)
+    for _ in range(1500):
+        cycle(0x3F, 60)                                     # the reference isn't used any more
+    assert abs(simulated.simulator.speed_rad_s) < 0.05
+    assert host.refused(0x6060, 0, 3, 1) != 0
+    assert host.refused(0x60FF, 0, 0, 4) == 0x06020000
