@@ -100,6 +100,7 @@ class Limits:
     accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
     accept_wider: frozenset[str] = frozenset()     # of `drivers.wider.NAMES`: own limits that may be made wider
     accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
+    temperature_c: float | None = None     # °C; above it the run is stopped, where the drive tells a temperature
 
 
 @dataclass(frozen=True)

@@ -263,6 +263,25 @@ class Echo(Entry):
     times: Name | None = None
 
 
+class Temperature(Entry):
+    """Where the drive tells that something gets hot: warning bits, or a number with a limit."""
+
+    title: str = Field(min_length=3, description="the manual's number and name")
+    register_: Register = Field(alias="register")
+    too_hot: Bits | None = Field(default=None, description="bits that say so; the status word costs no request")
+    per_lsb: Positive = Field(default=1.0, description="units for one count")
+    unit: Literal["celsius", "share"] = Field(
+        default="celsius", description="celsius: held below limits.temperature_c of rig.yaml; share: of what is allowed"
+    )
+    at_most: Positive | None = Field(default=None, description="in its unit; with celsius, rig.yaml's may be lower")
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        if self.unit == "share" and self.too_hot is None and self.at_most is None:
+            refuse_if([("at_most", "a share needs its limit")])
+        return self
+
+
 _NO_ECHO = Entry(
     source="no register shows before motion what the drive has made of this setpoint; look its address, type, scale "
     "and sign up in the manual",
@@ -340,6 +359,7 @@ class ModbusProfile(DataModel):
     filters: tuple[ModbusFilter, ...] = ()
     name_plate: NamePlate | None = None
     echoes: tuple[Echo, ...] = ()
+    temperatures: tuple[Temperature, ...] = ()
     hints: tuple[str, ...] = Field(default=(), description="what else to set or know, a line each, for `profiles show`")
 
     @model_validator(mode="after")
@@ -385,6 +405,7 @@ class ModbusProfile(DataModel):
         found += [(f"parameters.{part.name}", part) for part in self.parameters]
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         found += [(f"echoes.{part.setpoint}", part) for part in self.echoes]
+        found += [(f"temperatures.{number}", part) for number, part in enumerate(self.temperatures)]
         found += [(f"echoes.{setpoint}", _NO_ECHO) for setpoint in self.unseen]
         return tuple(found)
 

@@ -104,6 +104,9 @@ class Limits(DataModel):
     time_s: Time = Field(description="s; longest run")
     quick_stop_rad_s2: Positive = Field(description="rad/s²; how hard the shaft is braked")
     watchdog_s: float = Field(default=0.5, ge=0.02, le=5, description="s of silence until the drive stops by itself")
+    temperature_c: float | None = Field(
+        default=None, gt=0, le=300, description="°C; above it a run is stopped, where the drive tells a temperature"
+    )
     probe_torque_nm: Torque = Field(description="N·m; highest torque to find out the direction and the breakaway")
     probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
 

@@ -20,7 +20,7 @@ from drivers.cia402 import arming
 from drivers.cia402 import preflight as checks
 from drivers.cia402.feedback import Feedback
 from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_doubt
-from drivers.cia402.limits import set_limits
+from drivers.cia402.limits import note_temperature, set_limits
 from drivers.cia402.link import PEER_DEAD_S, CanLink
 from drivers.cia402.look import keep_stepping, look, push
 from drivers.cia402.mapping import slow_syncs
@@ -212,6 +212,7 @@ class Cia402Drive:
         self._angle = find_angle(table, objects, self._profile)
         own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
         set_limits(table, objects, self._profile, limits, rated_nm, own)
+        note_temperature(table, limits.temperature_c)
         checks.clear_targets(table, objects, self._profile)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)

@@ -63,6 +63,16 @@ def set_limits(
         )
 
 
+def note_temperature(table: Table, limit_c: float | None) -> None:
+    """CiA 402 has no object for one: nobody watches it here, and a limit would not be held."""
+    if limit_c is None:
+        text = "nobody watches it: CiA 402 has no object for one; the drive itself reports it by an EMCY"
+        table.note("temperature", text, "profile")
+    else:
+        table.row("temperature limit", f"{limit_c:g} °C", "CiA 402 has no object for a temperature", False,
+                  "limits.temperature_c", "Take it out of rig.yaml: it would not be held on CANopen")
+
+
 def _set(
     table: Table, objects: Objects, settings: Settings, one: Parameter, limits: Limits, rated_nm: float, own: OwnLimits
 ) -> None:

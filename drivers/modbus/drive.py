@@ -34,6 +34,7 @@ from drivers.modbus.arming import arm_watchdog, check_who_feeds, measure_pace
 from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
 from drivers.modbus.echoes import check_setpoints, clear_setpoints
 from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
+from drivers.modbus.heat import Heat
 from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped
 from drivers.modbus.limits import own_speed_limits, set_limits
 from drivers.modbus.link import Link, late_replies
@@ -124,6 +125,7 @@ class ModbusDrive:
         self._failing_since_s: float | None = None
         self._told_loss = self._told_other = False
         self._out_of_operation = 0     # cycles so far, since nobody asks for it
+        self._heat = Heat(self._access, profile)
         self._other = OtherMaster(self._access, profile, self._plan)
         self._speed_limits: list[tuple[Register, float, int]] = []      # register, rad/s a count, counts as found
         self._quick_stop_rad_s2 = self._pressed_rad_s = 0.0
@@ -186,6 +188,7 @@ class ModbusDrive:
             if watched:
                 simulated = self._identity.simulated
                 shared = check_who_feeds(table, access, profile, limits, self._idle_round, simulated=simulated)
+            self._heat.prepare(table, limits.temperature_c)
             self._speed_limits = own_speed_limits(profile, found)
             if all(check.outcome is not Outcome.REFUSED for check in table.checks):
                 self._other.prepare(
@@ -271,7 +274,7 @@ class ModbusDrive:
         """One cycle: wait for the tick, write, read.
 
         Raises CommunicationLost (no good reply within half the watchdog time, line gone, a loop that was frozen,
-        somebody else who commands the drive or changes what the run rests on),
+        somebody else who commands the drive or changes what the run rests on), LimitHit (too hot),
         DriveFault (fault state, a refused request) and CommandRejected; each trouble of the drive once, so that a stop
         can go on exchanging.
         """
@@ -284,6 +287,8 @@ class ModbusDrive:
         if not self._may_write():
             return self._watch()
         self._look_for_others()
+        if self._wish is Wish.ENABLED:
+            self._heat.look(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
         word = controlword_towards(
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
@@ -311,6 +316,8 @@ class ModbusDrive:
         if self._other.seen and self._wish is not Wish.ENABLED:
             got = self._insist(got, setpoints, command.mode, begun_s)
         self._follow_state()
+        if self._wish is Wish.ENABLED:
+            self._heat.see(self._feedback.status)
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
 

@@ -38,6 +38,12 @@ def _delay_s(text: str) -> float:
     return float(found[1]) / (1000.0 if found[2] == "ms" else 1.0)
 
 
+def _celsius(text: str) -> float:
+    if not 0.0 <= float(text) <= 300.0:
+        raise ValueError("°C, from 0 to 300")
+    return float(text)
+
+
 def _name(text: str) -> Misbehaviour:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
         raise ValueError("a parameter as the profile calls it")
@@ -63,6 +69,7 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
                            lambda v: machine.limited_torque(share(v)), "10%", "SHARE"),
     "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
                       lambda v: machine.load_lost(max(0.001, share(v))), "10%", "SHARE"),
+    "hot": Kind(35, "motor and drive become so hot, °C", lambda v: machine.hot(_celsius(v)), "150", "CELSIUS"),
     "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: machine.reported(speed=-1.0))),
     "exception": Kind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
                       lambda v: line.Refusing(_code(v)), "4", "CODE"),

@@ -79,6 +79,11 @@ def limited_torque(share: float) -> Act:
     return Act(lambda machine: machine.leave_torque(share), lambda machine: machine.leave_torque(1.0))
 
 
+def hot(temperature_c: float) -> Act:
+    """Motor and drive have become so hot."""
+    return Act(lambda machine: machine.heat(temperature_c), lambda machine: machine.heat(40.0))
+
+
 def load_lost(share: float) -> Act:
     """What was coupled comes off: this share of the motor end's inertia and friction is left."""
     return Act(lambda machine: machine.inverter.lose_load(share))

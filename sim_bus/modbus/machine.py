@@ -82,6 +82,10 @@ class Machine:
         self._fed(Answer(b""))
         return bytes((pdu[0] | 0x80, code))
 
+    def heat(self, temperature_c: float) -> None:
+        """Scripted: whatever the drive tells a temperature of has this one."""
+        self._map.temperature_c = temperature_c
+
     def leave_torque(self, share: float) -> None:
         """Scripted: an internal limit leaves this share of the torque limits."""
         self._torque_share = share

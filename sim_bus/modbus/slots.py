@@ -11,13 +11,16 @@ from itertools import pairwise
 from math import floor, pi
 
 from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
-from profiles.modbus_schema import Echo, ModbusProfile, Register, Signal
+from profiles.modbus_schema import Echo, ModbusProfile, Register, Signal, Temperature
 from sim_bus.cia402_application import Application
 from sim_bus.modbus.errors import DeviceFailure, IllegalValue
 from sim_bus.modbus.families import Words
 from sim_bus.modbus.number import Layout
 from sim_bus.modbus.parameters import Parameters
 from sim_bus.modbus.wrongs import Wrong
+
+HOT_C = 120.0
+"""What the simulated drive's motor bears."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +45,11 @@ class Map:
         self._words = words
         self._application: Application = words.application
         self._wrongs = {wrong.kind for wrong in wrongs}
+        self.temperature_c = 40.0      # of everything that has one
         self._speed_counts = 0
         self._torque_counts = 0
         named = self._cycle() + self._mode() + self._echoes() + self._position() + self._families() + self._settings()
+        named += self._temperatures()
         self.slots: dict[tuple[str, int], Slot] = {}
         for slot in named:
             self._lay(replace(slot, layout=self._moved(slot.layout)))
@@ -127,6 +132,25 @@ class Map:
 
         return [Slot(layout, read)]
 
+    def _temperatures(self) -> list[Slot]:
+        slots = []
+        for one in self._profile.temperatures:
+            if one.register_ != self._profile.cycle.status.register_:
+                layout = self._layout(one.register_)
+                slots.append(Slot(layout, partial(self._temperature, layout, one)))
+        return slots
+
+    def _temperature(self, layout: Layout, one: Temperature) -> int:
+        """Its number, or a word with its bits as they must stand."""
+        if one.too_hot is not None:
+            return one.too_hot.value if self._is_hot else ~one.too_hot.value & one.too_hot.mask
+        share = self.temperature_c / (1.0 if one.unit == "celsius" else HOT_C)
+        return layout.saturated(share / one.per_lsb)
+
+    @property
+    def _is_hot(self) -> bool:
+        return self.temperature_c > HOT_C
+
     def _families(self) -> list[Slot]:
         return [Slot(Layout(address), extra.read, extra.write) for address, extra in self._words.extras().items()]
 
@@ -176,6 +200,9 @@ class Map:
         """The family's word; over it what the user has wired to it, but on ABB, whose bit 11 is the family's own."""
         word, display = self._words.status(), self._profile.modes.display
         status = self._profile.cycle.status.register_
+        for one in self._profile.temperatures:
+            if one.register_ == status and one.too_hot is not None and self._is_hot:
+                word = word & ~one.too_hot.mask | one.too_hot.value
         if display is not None and display.register_.address == status.address \
                 and display.register_.table == status.table and self._profile.control.family != "abb":
             return word & ~display.mask | self._display()

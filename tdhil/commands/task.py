@@ -46,6 +46,7 @@ def machine_limits(
         time_s=limits.time_s,
         quick_stop_rad_s2=limits.quick_stop_rad_s2,
         watchdog_s=limits.watchdog_s,
+        temperature_c=limits.temperature_c,
         probe_torque_nm=limits.probe_torque_nm,
         probe_travel_rad=limits.probe_travel_rad,
         allow_reverse=bench.allow_reverse,

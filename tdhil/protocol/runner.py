@@ -191,6 +191,7 @@ class Runner:
             Limits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
+                limits.temperature_c,
             )
         )
         self._display.preflight(preflight)

@@ -14,8 +14,8 @@ from drivers.errors import CommunicationLost, PreflightRefused
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 ROWS = [
     "identity", "state", "modes of operation", "rated torque", "angle of the motor", "torque limit", "speed limit",
-    "quick-stop ramp", "quick-stop option", "targets", "mode display for 9", "mode display for 10", "PDO mapping",
-    "cycle", "stepped time", "drive's heartbeat", "watchdog reaction", "watchdog",
+    "quick-stop ramp", "quick-stop option", "temperature", "targets", "mode display for 9", "mode display for 10",
+    "PDO mapping", "cycle", "stepped time", "drive's heartbeat", "watchdog reaction", "watchdog",
 ]
 
 
@@ -45,7 +45,8 @@ def test_a_drive_as_it_should_be(make, peer):
     assert [check.name for check in found.checks] == ROWS
     assert found.refused == ()
     assert (found.identity.vendor, found.identity.serial, found.identity.name) == (0x11, 0x44, "scripted")
-    assert {check.name for check in found.checks if check.outcome is Outcome.NOTE} == {"identity", "angle of the motor"}
+    notes = {check.name for check in found.checks if check.outcome is Outcome.NOTE}
+    assert notes == {"identity", "angle of the motor", "temperature"}
     assert peer.operational
 
 
@@ -344,6 +345,13 @@ def test_a_drive_with_a_fixed_mapping(make, peer):
     assert refused(found)["PDO mapping"].where == "1A00h"
 
 
+def test_a_temperature_limit_that_nothing_would_hold_is_refused(make, peer):
+    drive = make()
+    drive.connect()
+    found = drive.preflight(dataclasses.replace(LIMITS, temperature_c=90.0))
+    assert [check.where for check in found.refused] == ["limits.temperature_c"]
+
+
 def test_everything_wrong_at_once(make, peer, profile):
     peer.machine.state = FAULT
     peer.objects[0x6502, 0] = bits(4)
@@ -354,7 +362,7 @@ def test_everything_wrong_at_once(make, peer, profile):
     rows = [check.name for check in found.checks]
     by_row = {"identity": "identity: vendor", "mode display for 9": None, "mode display for 10": "mode display for 4"}
     assert rows == [name for row in ROWS if (name := by_row.get(row, row))]
-    good = {"stepped time", "angle of the motor"}
+    good = {"stepped time", "angle of the motor", "temperature"}
     assert set(refused(found)) == set(rows) - good
     assert all(check.where for check in found.refused)
 

@@ -95,7 +95,7 @@ FIFTY = {
     33: _scripted("STO or internal limit active", "abort with its own message", "6, 7"),
     34: _scripted("overspeed in torque mode (load lost)", "QS; the drive's own speed limit was set first", "7",
                   f"{GUARD}test_row_34_the_load_is_lost"),
-    35: _scripted("torque, temperature, travel or time limit", "QS", "7 (travel of the probe: 4)",
+    35: _scripted("torque, travel or time limit; temperature, where the profile has one", "QS", "7 (travel: 4)",
                   f"{HOST}test_row_35_time_and_travel", f"{GUARD}test_row_35_limits"),
     36: _scripted("encoder sign inverted", "sign probe, QS", "4", f"{GUARD}test_row_36_an_inverted_encoder"),
     37: Row("NaN, Inf, out-of-range setpoint", "rejected before the bus", "1",

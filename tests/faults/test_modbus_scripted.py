@@ -45,6 +45,7 @@ CASES = (
     Case(33, "sto" + IN_MOTION, 6, ("STO",), "coasts"),
     Case(33, "internal-limit@torque+3s", 7, ("internal limit",), notice_s=4.5),
     Case(34, "load-lost@torque+3s", 7, ("internal limit",), notice_s=2.0),
+    Case(35, "hot" + IN_MOTION, 7, ("too hot", "motor temperature: 150 °C", "limit of 110 °C"), notice_s=3.0),
     Case(35, "torque-scale" + IN_MOTION + "=5", 7, ("beyond the limit of 400 N·m",)),
     Case(36, "encoder-inverted", 4, ("turned backwards", "encoder wiring"), notice_s=7.0),
     Case(38, "exception" + IN_MOTION + "=2/100ms", 6, ("exception 2", "address")),
@@ -59,8 +60,10 @@ CASES = (
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.row}-{case.fault}")
-def test_row(case, rehearse):
-    run = rehearse("--drive", "modbus", "--fault", case.fault)
+def test_row(case, rehearse, tmp_path):
+    rig = tmp_path / "warm.yaml"
+    rig.write_text(PATIENT.replace("watchdog_s: 2.0", "watchdog_s: 0.5, temperature_c: 110.0"))
+    run = rehearse("--drive", "modbus", "--fault", case.fault, "--rig", rig)
     run.assert_ended(case.code, *case.words)
     assert f"scripted fault {case.fault}" in " ".join(run.done.err.split())
     if case.ends == "refused":
