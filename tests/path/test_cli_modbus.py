@@ -178,7 +178,7 @@ def real(monkeypatch, tmp_path):
     text = text.replace("name: check_sign", "name: sign_check", 1)
     head, tail = text.split("watchdog:\n", 1)
     path = tmp_path / "mine.yaml"
-    path.write_text(head + "watchdog:\n" + tail.replace("confidence: verified", "confidence: unverified", 1),
+    path.write_text(head + "watchdog:\n" + tail.replace("\n  confidence: verified", "\n  confidence: unverified", 1),
                     encoding="utf-8")
     assert load_modbus_profile(str(path)).below("unverified") == ("watchdog",)
     rig = tmp_path / "rig.yaml"
