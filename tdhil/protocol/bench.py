@@ -144,18 +144,23 @@ class Bench:
 
         In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
         there, signs of life that move no time on are all that goes out. In real time the arithmetic has to hand over
-        the interpreter sooner than usual, or cycles would come late.
+        the interpreter sooner than usual, or cycles would come late; on a computer of one processor they do all the
+        same, and that alone doesn't end the run.
 
         Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
         may be turning without a setpoint meanwhile. It goes on by itself, beside the stop, and what comes of it is
         dropped.
         """
         beside = _Beside(work)
-        while not beside.ended.is_set():
-            if self.drive.clock.stepped:
-                self._wait_alive(beside.ended)
-            else:
-                cycle()
+        self.guard.reckoning = True
+        try:
+            while not beside.ended.is_set():
+                if self.drive.clock.stepped:
+                    self._wait_alive(beside.ended)
+                else:
+                    cycle()
+        finally:
+            self.guard.reckoning = False
         return beside.result()
 
     def _wait_alive(self, ended: Event) -> None:

@@ -12,8 +12,8 @@ import threading
 import pytest
 from run_outcomes import assert_at_rest
 
-from drivers.drive import Command, Mode
-from drivers.errors import LimitHit
+from drivers.drive import Command, Counters, Mode
+from drivers.errors import CommunicationLost, LimitHit
 from tdhil.errors import Interrupted
 from tdhil.protocol import enough, plan_stage
 from tdhil.protocol.settings import ExcitationRequest
@@ -91,3 +91,18 @@ def test_what_the_arithmetic_raises_is_raised_and_the_interpreter_goes_on_as_bef
     with pytest.raises(SystemExit):
         here.bench.compute(lambda: sys.exit(3), Command(Mode.SPEED, 0.0, 0.0))
     assert sys.getswitchinterval() == usual_s
+
+
+def test_cycles_that_are_late_beside_arithmetic_do_not_end_the_run(world, monkeypatch):
+    """Every one of them, for longer than the guard's look at the pace; afterwards it looks again."""
+    here = world()
+    here.drive.clock.stepped = False
+    overruns = []
+    monkeypatch.setattr(
+        type(here.drive), "counters", property(lambda drive: Counters(drive.cycles, overruns=len(overruns)))
+    )
+    here.drive.misbehave = lambda drive, sample: overruns.append(1) or sample
+    rest = Command(Mode.SPEED, 0.0, 0.0)
+    here.bench.compute(lambda: [None for _ in iter(lambda: here.drive.cycles > 500, True)], rest)
+    with pytest.raises(CommunicationLost, match="was late in"):
+        here.bench.hold(rest, 10.0)

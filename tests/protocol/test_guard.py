@@ -303,3 +303,14 @@ def test_missing_feedback_is_this_computers_where_it_was_late():
     assert "--rate" in caught.value.next_step
     assert "--real-time-priority" in caught.value.next_step
     assert caught.value.where.startswith("host")
+
+
+def test_arithmetic_beside_the_loop_may_make_it_late():
+    watch = guard()
+    watch.reckoning = True
+    watch.check_pace(Counters(cycles=100, overruns=60))
+    watch.check_pace(Counters(cycles=200, overruns=120))
+    watch.reckoning = False
+    watch.check_pace(Counters(cycles=300, overruns=125))          # counted from its end on
+    with pytest.raises(CommunicationLost, match="late in 30 of 100"):
+        watch.check_pace(Counters(cycles=400, overruns=155))
