@@ -35,6 +35,11 @@ def wrapped(counts: float, bits: int = 32, *, signed: bool = True) -> int:
     return seen - (1 << bits) if signed and seen >> (bits - 1) else seen
 
 
+def counts_per_turn(store: ObjectStore) -> float:
+    """608Fh as it stands once the drive has put its profile on, which may bring an encoder of its own."""
+    return store.default(key_of(0x608F, 1)) / max(1, store.default(key_of(0x608F, 2)))
+
+
 class ApplicationObjects:
     """Binds an application's quantities to a store; ``setters`` are the fast ways in for RPDOs."""
 
@@ -78,8 +83,7 @@ class ApplicationObjects:
         live[key_of(0x6060)] = live[key_of(0x6061)] = lambda: application.mode.value
         live[key_of(0x606B)] = self._velocity_demand
         live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / velocity, 32)
-        per_turn = store.default(key_of(0x608F, 1))
-        live[key_of(0x6064)] = lambda: wrapped(application.inverter.state.angle_rad / TURN * per_turn)
+        live[key_of(0x6064)] = lambda: wrapped(application.inverter.state.angle_rad / TURN * counts_per_turn(store))
         live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
         live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
         live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)

@@ -9,7 +9,7 @@ from canopen.objectdictionary import datatypes
 
 from profiles.marker import MARKER_INDEX
 from profiles.schema import CanopenProfile
-from sim_bus.application_objects import clamped, wrapped
+from sim_bus.application_objects import clamped, counts_per_turn, wrapped
 from sim_bus.cia402_application import Application, Mode
 from sim_bus.node_guarding import LifeGuard
 from sim_bus.object_store import ObjectStore, key_of
@@ -162,10 +162,9 @@ class WornProfile:
         store.add(
             position.index, position.sub, DATA_TYPES[position.type], writable=False, mappable=True, name="Angle"
         )
-        per_turn = position.counts_per_turn or store.default(key_of(0x608F, 1))
 
         def counts() -> float:
-            turned = inverter.state.angle_rad / TURN * per_turn
+            turned = inverter.state.angle_rad / TURN * (position.counts_per_turn or counts_per_turn(store))
             if position.wrap_counts is not None:
                 turned %= position.wrap_counts
             if position.type == "f32":

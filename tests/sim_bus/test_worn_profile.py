@@ -205,7 +205,9 @@ def test_an_encoder_that_the_profile_does_not_know(bench: Open) -> None:
     data["parameters"] = tuple(one | {"default": None} for one in data["parameters"])
     simulated, host = bench(profile=CanopenProfile.model_validate(data))
     assert (host.read(0x608F, 1), host.read(0x608F, 2)) == (4096, 1)
-    assert simulated.simulator.node.application.modes
+    store, turned = simulated.simulator.node.store, simulated.simulator.node.application.inverter
+    turned.state = turned.state._replace(angle_rad=2.5 * 6.283185307179586)
+    assert store.live[0x606400]() == 2.5 * 4096             # and the angle counts in it
 
 
 def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Open) -> None:
