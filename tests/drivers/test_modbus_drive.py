@@ -12,7 +12,7 @@ from drivers.drive import Command, Limits, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
-from drivers.modbus.errors import CycleRefused, LinkLost
+from drivers.modbus.errors import CycleRefused, LinkLost, NoisyReply
 from profiles.library import load_modbus_profile
 from profiles.modbus_schema import ModbusProfile
 
@@ -370,3 +370,21 @@ def test_every_pdu_is_tapped():
     assert [frame.data for frame in frames if frame.outgoing] == bank.requests
     assert len([frame for frame in frames if not frame.outgoing]) == len(bank.requests)
     assert {frame.identifier for frame in frames} == {1}
+
+
+@pytest.mark.parametrize(("damaged", "missed"), [(1, 0), (2, 1)])
+def test_a_damaged_reply_is_asked_for_once_more_within_the_cycle(damaged, missed):
+    run = Run().enabled()
+    transact, left = run.drive._link.transact, [damaged]
+
+    def noisy(unit, pdu, timeout_s):
+        reply = transact(unit, pdu, timeout_s)
+        if pdu[0] == 23 and left[0]:
+            left[0] -= 1
+            raise NoisyReply("a reply with a wrong CRC", where="line")
+        return reply
+
+    run.drive._link.transact = noisy
+    before = run.drive.counters.missed
+    assert run.cycle().fresh is (missed == 0)
+    assert run.drive.counters.missed - before == missed
