@@ -1,11 +1,15 @@
-"""Deletes every single statement of the guard and of the stop sequence in turn: each deletion must make a test fail.
+"""Deletes every single statement of the lines that keep a shaft safe in turn: each deletion must make a test fail.
 
     python benchmarks/mutate_guard.py                 # all of it; 1 if a deletion survives
     python benchmarks/mutate_guard.py --branches      # which branches of them the same tests leave out; 1 if any
     python benchmarks/mutate_guard.py guard --jobs 2
+    python benchmarks/mutate_guard.py --named         # single lines changed by hand that no test noticed once
+    python benchmarks/mutate_guard.py ticks --limit 20 --skip 40
 
-Works on copies in memory: a child process per mutant is forked off this one, loads the changed module in the place of
-the real one, and runs the module's tests up to the first failure. Nothing in the checkout is written.
+Guard and stop, the protocol's stages, the drivers' time, limits, watchdogs and bare stops, the log's writer, and the
+end of `tdhil identify`. Works on copies in memory: a child process per mutant is forked off this one, loads the changed
+module in the place of the real one, and runs the module's tests up to the first failure. Nothing in the checkout is
+written. A subject whose tests fail as it is comes first: nothing can be said of it.
 """
 
 from __future__ import annotations
@@ -15,29 +19,109 @@ import ast
 import importlib.abc
 import importlib.util
 import json
+import math
 import os
 import signal
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-TESTS = ROOT / "tests" / "protocol"
+TESTS = ROOT / "tests"
+OURS = ("drivers", "profiles", "sim_bus", "tdhil")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A module below the root, the tests (below ``tests/``) that guard it, and the functions meant (none: all)."""
+
+    path: str
+    tests: tuple[str, ...]
+    within: frozenset[str] = frozenset()
+
+    @property
+    def module(self) -> str:
+        return self.path.removesuffix(".py").replace("/", ".")
+
+
+def _protocol(name: str, *tests: str) -> Subject:
+    return Subject(f"tdhil/protocol/{name}.py", tuple(f"protocol/{test}" for test in tests))
+
+
+def _driver(name: str, *tests: str) -> Subject:
+    return Subject(f"drivers/{name}.py", tuple(f"drivers/{test}" for test in tests))
+
+
 _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_looks.py",
 )
+_RUNS = ("test_bench.py", "test_runner.py", "test_run_goes_wrong.py")
 SUBJECTS = {
-    "guard": ("test_guard.py", "test_guard_prediction.py"),
-    "stop": _STOP,
-    "let_go": _STOP,
-    "stop_patience": _STOP,
-    "stop_looks": ("test_stop_looks.py",),
-    "string_rules": _STOP,
+    "guard": _protocol("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py"),
+    "stop": _protocol("stop", *_STOP),
+    "let_go": _protocol("let_go", *_STOP),
+    "stop_patience": _protocol("stop_patience", *_STOP),
+    "stop_looks": _protocol("stop_looks", "test_stop_looks.py"),
+    "string_rules": _protocol("string_rules", "test_stop_string.py"),
+    "bench": _protocol("bench", "test_bench.py", "test_deaf.py", "test_run_goes_wrong.py"),
+    "steady": _protocol("steady", "test_steady.py"),
+    "stage_setup": _protocol("stage_setup", *_RUNS, "test_run_refused.py"),
+    "stage_speed": _protocol("stage_speed", *_RUNS),
+    "stage_torque": _protocol("stage_torque", *_RUNS, "test_braking_probe.py"),
+    "stage_hold": _protocol("stage_hold", "test_kept_within.py", *_RUNS, "test_control.py"),
+    "stage_acquire": _protocol("stage_acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_enough.py"),
+    "stage_swing": _protocol("stage_swing", "test_kept_within.py", "test_swing.py"),
+    "cia402/drive": _driver("cia402/drive", "test_late_host.py", "test_drive_faults.py"),
+    "ticks": _driver("ticks", "test_late_host.py", "test_drive_faults.py"),
+    "cia402/limits": _driver("cia402/limits", "test_preflight.py", "test_profile_preflight.py"),
+    "cia402/sign_of_life": _driver(
+        "cia402/sign_of_life", "test_preflight.py", "test_guarding.py", "test_strangers.py", "test_watch.py"
+    ),
+    "cia402/arming": _driver("cia402/arming", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py"),
+    "cia402/bare_stop": _driver("cia402/bare_stop", "test_bare_stop.py"),
+    "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
+    "modbus/echoes": _driver("modbus/echoes", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
+    "modbus/arming": _driver("modbus/arming", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
+    "modbus/limits": _driver("modbus/limits", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
+    "modbus/bare_stop": _driver("modbus/bare_stop", "test_modbus_bare_stop.py"),
+    "writer": Subject("tdhil/record/writer.py", ("record/test_writer.py", "record/test_round_trip.py")),
+    "pump": Subject("tdhil/record/pump.py", ("record/test_writer.py", "record/test_round_trip.py")),
+    "backlog": Subject("tdhil/record/backlog.py", ("record/test_writer.py",)),
+    "container": Subject("tdhil/record/container.py", ("record/test_writer.py", "record/test_round_trip.py")),
+    "identify": Subject(
+        "tdhil/commands/identify.py", ("tdhil/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
+    ),
+    "stop_signals": Subject("tdhil/commands/stop_signals.py", ("tdhil/test_identify_end.py",)),
 }
-LONGEST_S = 90
-"""A mutant that loops for ever counts as found."""
+NAMED: tuple[tuple[str, str, str], ...] = (
+    ("cia402/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
+    ("cia402/limits", 'limits.torque_nm, lsb, 16, "N·m", math.floor', 'limits.torque_nm, lsb, 16, "N·m", math.ceil'),
+    ("cia402/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
+     "return _rounded(one, limits.torque_nm * nm, per_lsb, math.ceil)"),
+    ("cia402/sign_of_life", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
+    ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
+    ("modbus/arming", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
+    ("modbus/echoes", "            access.write(register, 0)\n", "            pass\n"),
+    ("stage_hold", "max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))", "ahead_nm + correction"),
+    ("stage_acquire", "max(-limits.torque_nm, min(limits.torque_nm, torque_nm))", "torque_nm"),
+    ("stage_swing", "while follower.time_s < end_s:", "while True:"),
+    ("identify", "code = code or int(exit_code(error))", "pass"),
+    ("identify", "        code = ExitCode.STOP_NOT_CONFIRMED\n", "        pass\n"),
+    ("guard", "elif sample.fresh and not self._mode.see(command.mode, sample):", "elif False:"),
+    ("guard", "if sample.fresh and not following.see(command.speed_rad_s, sample):", "if False:"),
+    ("stop", "if not (self._fed and self._watched and", "if not (self._fed and"),
+    ("string_rules", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
+    ("container", "if found.st_size < self._offset:", "if False:"),
+    ("stop_signals", '"SIGQUIT", ', ""),
+)
+"""(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
+
+LONGEST_S, LONGEST = 90, 4
+"""A mutant that loops for ever counts as found: after so long, and after so many times what the tests take as it is."""
 
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 EQUIVALENT = {
@@ -67,7 +151,7 @@ class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def path_of(subject: str) -> Path:
-    return ROOT / "tdhil" / "protocol" / f"{subject}.py"
+    return ROOT / SUBJECTS[subject].path
 
 
 def is_text(statement: ast.stmt) -> bool:
@@ -100,6 +184,8 @@ def mutants(subject: str):
         gone = block[place]
         within = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and gone in ast.walk(node)]
         name = within[-1].name if within else "module"
+        if SUBJECTS[subject].within and not {node.name for node in within} & SUBJECTS[subject].within:
+            continue
         last = " (last)" if within and within[-1].body[-1] is gone else ""
         block[place] = ast.copy_location(ast.Pass(), gone)
         yield gone.lineno, f"{name}: {ast.unparse(gone).splitlines()[0]}{last}", ast.fix_missing_locations(tree)
@@ -143,9 +229,11 @@ def run_tests(subject: str, changed: Changed) -> int:
     """In this very process: pytest's exit code."""
     import pytest
 
+    forget(SUBJECTS[subject].module)
     sys.meta_path.insert(0, changed)
     quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts="]
-    return int(pytest.main([*quiet, "--import-mode=importlib", *(str(TESTS / name) for name in SUBJECTS[subject])]))
+    files = [str(TESTS / name) for name in SUBJECTS[subject].tests]
+    return int(pytest.main([*quiet, "--import-mode=importlib", *files]))
 
 
 def preload() -> None:
@@ -165,18 +253,23 @@ def preload() -> None:
 
     assert all((hypothesis, numpy, pytest, scipy.optimize, drivers.drive, tdhil.errors, tdhil.identify,
                 tdhil.protocol.design, tdhil.protocol.excitation, tdhil.record.run_log))
-    loaded = [name for name in SUBJECTS if f"tdhil.protocol.{name}" in sys.modules]
-    assert not loaded, loaded
 
 
-def fork(subject: str, changed: Changed, report: Path | None = None) -> int:
+def forget(module: str) -> None:
+    """A subject that is loaded already: all of ours is, so that nobody holds on to what it was."""
+    if module in sys.modules:
+        for name in [name for name in sys.modules if name.split(".")[0] in OURS]:
+            del sys.modules[name]
+
+
+def fork(subject: str, changed: Changed, report: Path | None = None, longest_s: float = 900.0) -> int:
     """The child's process number."""
     child = os.fork()
     if child:
         return child
     code = 99
     try:
-        signal.alarm(LONGEST_S)
+        signal.alarm(math.ceil(longest_s))
         folder = tempfile.mkdtemp(prefix="mutate-")
         os.chdir(folder)
         hush = os.open(os.devnull if report is None else str(report) + ".log", os.O_WRONLY | os.O_CREAT)
@@ -196,9 +289,11 @@ def fork(subject: str, changed: Changed, report: Path | None = None) -> int:
         os._exit(code)
 
 
-def delete_all(subject: str, jobs: int) -> list[str]:
+def delete_all(
+    subject: str, jobs: int, longest_s: float, skip: int = 0, limit: int | None = None, within: str = ""
+) -> list[str]:
     """The deletions that no test noticed."""
-    name = f"tdhil.protocol.{subject}"
+    name = SUBJECTS[subject].module
     running: dict[int, tuple[int, str]] = {}
     survivors: list[str] = []
     count = alike = 0
@@ -215,15 +310,52 @@ def delete_all(subject: str, jobs: int) -> list[str]:
             survivors.append(f"line {line}, {text}")
             print(f"SURVIVES {survivors[-1]}", flush=True)
 
-    for line, text, tree in mutants(subject):
+    wanted = (one for one in mutants(subject) if not within or one[1].split(":")[0] in within.split(","))
+    for line, text, tree in islice(wanted, skip, None if limit is None else skip + limit):
         count += 1
         while len(running) >= jobs:
             reap()
-        running[fork(subject, Changed(name, tree, path_of(subject)))] = line, f"{subject}.py, {text}"
+        child = fork(subject, Changed(name, tree, path_of(subject)), longest_s=longest_s)
+        running[child] = line, f"{subject}.py, {text}"
     while running:
         reap()
     noticed = count - alike - len(survivors)
     print(f"{subject}.py: {count} deletions, {noticed} noticed, {alike} alike, {len(survivors)} survive", flush=True)
+    return survivors
+
+
+def as_it_is(subject: str) -> float | None:
+    """How long a mutant may take, by what the tests take on what is there; None where they fail on that."""
+    tree = ast.parse(path_of(subject).read_text("utf-8"))
+    begun_s = time.monotonic()
+    _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject))), 0)
+    took_s = time.monotonic() - begun_s
+    return None if os.waitstatus_to_exitcode(status) != 0 else max(LONGEST_S, LONGEST * took_s)
+
+
+def named(subjects: list[str]) -> list[str]:
+    """The changes by hand that no test noticed, or whose line is no longer there."""
+    survivors, longest_s = [], {}
+    for subject, old, new in NAMED:
+        if subject not in subjects:
+            continue
+        if subject not in longest_s:
+            longest_s[subject] = as_it_is(subject)
+        allowed_s = longest_s[subject]
+        if allowed_s is None:
+            survivors.append(f"{subject}.py: its tests fail as it is")
+            continue
+        text = path_of(subject).read_text("utf-8")
+        what = f"{subject}.py: {old.strip()} → {new.strip() or 'nothing'}"
+        if text.count(old) != 1:
+            survivors.append(f"{what}: found {text.count(old)} times")
+            continue
+        changed = Changed(SUBJECTS[subject].module, ast.parse(text.replace(old, new)), path_of(subject))
+        _, status = os.waitpid(fork(subject, changed, longest_s=allowed_s), 0)
+        noticed = os.waitstatus_to_exitcode(status) != 0
+        print(f"{'noticed ' if noticed else 'SURVIVES'} {what}", flush=True)
+        if not noticed:
+            survivors.append(what)
     return survivors
 
 
@@ -234,7 +366,7 @@ def branches(subject: str) -> list[str]:
     tree = ast.fix_missing_locations(counted.visit(tree))
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "went.json"
-        _, status = os.waitpid(fork(subject, Changed(f"tdhil.protocol.{subject}", tree, path_of(subject)), report), 0)
+        _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report), 0)
         if os.waitstatus_to_exitcode(status) != 0:
             print(Path(str(report) + ".log").read_text()[-3000:])
             return [f"{subject}.py: its tests fail"]
@@ -251,13 +383,26 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("subjects", nargs="*", help=f"{', '.join(SUBJECTS)} (default: all)")
     parser.add_argument("--branches", action="store_true", help="branch coverage instead")
+    parser.add_argument("--named", action="store_true", help="only the changes by hand")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--within", default="", help="only in functions of these names, with commas between")
+    parser.add_argument("--skip", type=int, default=0, help="so many deletions of each subject")
+    parser.add_argument("--limit", type=int, default=None, help="at most so many of each")
     wanted = parser.parse_args()
     begun_s = time.monotonic()
     preload()
     left: list[str] = []
-    for subject in wanted.subjects or SUBJECTS:
-        left += branches(subject) if wanted.branches else delete_all(subject, wanted.jobs)
+    subjects = wanted.subjects or list(SUBJECTS)
+    if wanted.named:
+        left += named(subjects)
+        subjects = []
+    for subject in subjects:
+        if wanted.branches:
+            left += branches(subject)
+        elif (longest_s := as_it_is(subject)) is None:
+            left.append(f"{subject}.py: its tests fail as it is")
+        else:
+            left += delete_all(subject, wanted.jobs, longest_s, wanted.skip, wanted.limit, wanted.within)
     for line in left:
         print(line)
     print(f"{time.monotonic() - begun_s:.0f} s")

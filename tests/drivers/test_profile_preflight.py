@@ -1,5 +1,7 @@
 """Preflight against drives that wear real profiles: what is set wrong by hand is refused, with the place to mend it."""
 
+from dataclasses import replace
+
 import pytest
 from drive_benches import CanopenBench, Run
 from profile_benches import AbbBench, Epos4Bench, S120Bench
@@ -179,3 +181,15 @@ def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
 def test_requirements(require, value, good):
     assert fulfils(require, value) is good
     assert wanted_text(require, " s").endswith(" s")
+
+
+@pytest.mark.parametrize("limit_nm", [123.4567, 300.0005, 7.77])
+def test_a_torque_limit_in_counts_is_never_above_what_was_asked(make, limit_nm):
+    """EPOS4: 3001h:02 in mA times 3001h:05, the torque constant in µN·m/A; a count of it is some thousandths."""
+    bench = make(Epos4Bench)
+    bench.limits = replace(bench.limits, torque_nm=limit_nm)
+    assert refused(found_with(bench)) == {}
+    store = bench.simulated.simulator.node.store
+    current, constant = (store.values[0x3001 << 8 | sub] for sub in (2, 5))
+    count_nm = 1e-9 * constant
+    assert current * count_nm <= limit_nm * (1.0 + 1e-9) and (current + 1) * count_nm > limit_nm

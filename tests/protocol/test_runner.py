@@ -89,11 +89,11 @@ def test_cycles_without_feedback_degrade_their_stage_if_they_are_many(world, eve
     assert here.log.run["counters"]["missed"] == here.drive.missed
 
 
-def test_an_excitation_that_does_not_fit_is_refused_and_the_shaft_stopped(world):
+def test_an_excitation_that_does_not_fit_what_was_found_in_motion_ends_with_the_shaft_stopped(world):
     here = world()
     result = here.runner(ExcitationRequest(amplitude_rad_s=9.0)).run()
-    assert isinstance(result.cause, PreflightRefused)
-    assert exit_code(result.cause) is ExitCode.REFUSED
+    assert isinstance(result.cause, LimitHit)
+    assert exit_code(result.cause) is ExitCode.LIMIT
     assert "amplitude of 9 rad/s" in str(result.cause)
     assert outcomes(result) == [("setup", "ok"), ("speed", "ok"), ("torque", "ok")]
     assert_at_rest(here, result)

@@ -1,12 +1,15 @@
 """How `tdhil identify` ends: the code of each way to go wrong, and what is said, without a run behind it."""
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
 from tdhil.cli import main
+from tdhil.commands.stop_signals import stop_on_signals
 from tdhil.errors import ExitCode, Interrupted
 from tdhil.protocol.stop import StopReport
 from tdhil.protocol.task import RunOutcome
@@ -129,3 +132,14 @@ def test_the_result_stands_in_the_log(ends):
 
     assert ends(None, REST)[0] == 0
     assert read_run(Path("run.mcap")).result == {"verdict": "as the test has it"}
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP"])
+def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
+    number, former = signal.Signals[name], signal.getsignal(signal.Signals[name])
+    with stop_on_signals() as request:
+        assert request.signum is None
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert (request.signum, request.count) == (number, 2)
+    assert signal.getsignal(number) is former
