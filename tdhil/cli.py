@@ -22,6 +22,9 @@ _COMMANDS = {
     "recover": "say what a damaged log still holds, and make a clean copy of it",
     "stop": "stop a drive from outside of any run: best effort, no emergency stop",
     "simulate": "run the simulated rig as a process of its own",
+    "rig": "write a rig.yaml to fill in, with no drive at hand",
+    "support": "put a log and what is around it into one archive, for a support case",
+    "docs": "where the documentation and the examples are",
     "study": "run the paper's experiments again, beside what it published",
 }
 
@@ -98,6 +101,12 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.commands.profiles import add_arguments
     elif name == "scan":
         from tdhil.commands.scan import add_arguments
+    elif name == "rig":
+        from tdhil.commands.rig_new import add_arguments
+    elif name == "support":
+        from tdhil.commands.support import add_arguments
+    elif name == "docs":
+        from tdhil.commands.docs import add_arguments
     elif name == "doctor":
         from tdhil.commands.doctor import add_arguments
     else:

@@ -12,7 +12,7 @@ from profiles.modbus_schema import ModbusProfile
 from tdhil.commands.profile_said import rated_torque_is_told_by_hand, required_text
 from tdhil.commands.scan_found import FoundDrive
 from tdhil.commands.unverified import doubtful
-from tdhil.rig import Limits
+from tdhil.rig import Limits, Rig
 
 _PLAIN = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
 _WORDS = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".inf", ".nan"}
@@ -47,6 +47,62 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     return "\n".join(parts) + "\n"
 
 
+def blank_rig(profile: Profile, named: str, load: str) -> str:
+    """The file's text with no drive at hand. ``named``: the profile as the operator names it."""
+    line = {
+        "canopen": "#bus: {interface: socketcan, channel: can0, bitrate: 500k}    # python-can's own names",
+        "modbus": "#modbus: {host: 192.0.2.10, unit: 1}    # or {serial: /dev/ttyUSB0, baud: 19200, parity: E}",
+    }[profile.bus]
+    parts = [
+        "# Written by tdhil rig new. Torque and speed are those of the motor shaft; every key: docs/rig.md,",
+        "# which lies where tdhil docs says.",
+        "# What stands behind a '#' has yet to be filled in. Without 'limits' nothing real moves.",
+        "",
+        f"drive: {profile.bus}",
+        f"profile: {scalar(named)}    # {_comment(profile.title)}",
+        "# Where the drive is. Left out, the embedded simulator runs, and says so.",
+        line,
+    ]
+    if profile.bus == "canopen":
+        parts.append("#node:    # CANopen node number, 1 to 127")
+    parts += _doubts(profile)
+    parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value, in",
+              "# the key's unit or with a unit of its own: speed_max_rad_s: 95 rpm"]
+    parts += ["#limits:", *(_blank(name) for name in _LIMITS)]
+    parts += ["", *_load(load)]
+    parts += ["", "#gear: {ratio: }    # motor turns for one of the main shaft; without it 1",
+              "", "# What the drive does not tell of itself. Leave out what you do not know.", "#drive_data:"]
+    if rated_torque_is_told_by_hand(profile):
+        parts.append("#  rated_torque_nm:         # N·m; name plate")
+    parts.append("#  torque_scale_rel_sd:     # how right the drive's torque is, 1 sd (2 %)")
+    parts += _untold(profile)
+    parts += _by_hand(profile)
+    return "\n".join(parts) + "\n"
+
+
+def to_fill_in(profile: Profile, load: str) -> list[str]:
+    """What a run on a real drive will miss."""
+    found = [f"limits: {', '.join(_LIMITS)}", "where the drive is: bus and node" if profile.bus == "canopen" else
+             "where the drive is: modbus"]
+    if load == "string":
+        found.append(f"{', '.join(_STRING)}: until then the file is refused")
+    if doubtful(profile):
+        found.append("accept_unverified: what nobody verified in this profile, once you have looked it up")
+    if _untold(profile):
+        found.append("drive_data.parameters: what this drive doesn't tell over the bus")
+    if _by_hand(profile):
+        found.append("and at the drive: what stands at the file's end")
+    return found
+
+
+def _load(load: str) -> list[str]:
+    if load == "none":
+        return ["load: none    # as you said: nothing on the shaft stores torque. With a drill string: string"]
+    return ["load: string    # as you said; until these two are filled in, this file is refused",
+            *(f"#{name}:    # {Rig.model_fields[name].description}" for name in _STRING)]
+
+
+_STRING = ("make_up_torque_nm", "torque_ramp_nm_s")
 _LIMITS = tuple(name for name, field in Limits.model_fields.items() if field.is_required())
 
 

@@ -5,6 +5,7 @@ more event, which says what was lost: the copy is a whole file, but whoever repl
 """
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +79,11 @@ def find_gaps(run: Run) -> tuple[Gap, ...]:
     return tuple(Gap(float(time_s[k]), float(time_s[k + 1])) for k in at)
 
 
-def write_copy(source: Path, target: Path, found: Salvage) -> int:
+Edit = Callable[[int, bytes], bytes]
+"""(channel, payload) → the payload to be written instead."""
+
+
+def write_copy(source: Path, target: Path, found: Salvage, edit: Edit | None = None) -> int:
     """All that can be read of ``source`` as a finished log at ``target``; the number of messages in it.
 
     Nothing stands at ``target`` before all of it does. Raises `LogError`.
@@ -91,7 +96,7 @@ def write_copy(source: Path, target: Path, found: Salvage) -> int:
                           next_step="Choose another file") from error
     try:
         with file:
-            count = _copy(source, Container(file), found)
+            count = _copy(source, Container(file), found, edit)
             with suppress(OSError):            # not every file has a disk behind it
                 os.fsync(file.fileno())
         part.replace(target)
@@ -103,12 +108,13 @@ def write_copy(source: Path, target: Path, found: Salvage) -> int:
     return count
 
 
-def _copy(source: Path, container: Container, found: Salvage) -> int:
+def _copy(source: Path, container: Container, found: Salvage, edit: Edit | None) -> int:
     count, last_ns = 0, 0
     for one in messages(source, salvage=True):
         if not isinstance(one, Ours) or not _reads(one):
             continue
-        container.add(one.number, one.log_time_ns, one.payload)
+        payload = one.payload if edit is None else edit(one.number, one.payload)
+        container.add(one.number, one.log_time_ns, payload)
         count += 1
         last_ns = one.log_time_ns
         if container.size > CHUNK_BYTES:
@@ -117,8 +123,8 @@ def _copy(source: Path, container: Container, found: Salvage) -> int:
         time_s = found.run.recording.time_s
         said = f"recovered from a damaged log; lost: {'; '.join(found.lost)}"
         event = event_message(Event(float(time_s[-1]) if len(time_s) else 0.0, RECOVERED, said))
-        container.add(event.channel, last_ns, event.payload)
-        container.add(LOG, last_ns, log_payload(RECOVERED, said, last_ns))
+        for channel, payload in ((event.channel, event.payload), (LOG, log_payload(RECOVERED, said, last_ns))):
+            container.add(channel, last_ns, payload if edit is None else edit(channel, payload))
     container.close_chunk()
     container.finish()
     return count

@@ -64,6 +64,13 @@ def test_profiles_come_with_their_eds(names):
     assert {"profiles/generic/cia402.yaml", "profiles/generic/cia402.eds"} <= names
 
 
+def test_documentation_and_examples_come_along(names):
+    wanted = {"tdhil/_docs/README.md"}
+    wanted |= {f"tdhil/_docs/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
+    wanted |= {f"tdhil/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir()}
+    assert wanted - names == set()
+
+
 def test_nothing_that_a_user_does_not_run(names):
     assert [name for name in names if name.endswith((".mcap", ".pyc")) or "tests" in name.split("/")] == []
 
@@ -81,8 +88,11 @@ def test_it_runs_from_the_wheel_alone(wheel, tmp_path):
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import tdhil; "
         f"assert tdhil.__file__.startswith({str(tmp_path)!r}), tdhil.__file__; "
         "from profiles.library import load_profile; from sim_bus.cia402_node import generic_eds; "
-        "print(load_profile('generic/cia402').name, generic_eds())"
+        "from tdhil.commands.docs import docs_folder; "
+        "print(load_profile('generic/cia402').name, generic_eds(), docs_folder())"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["generic/cia402", str(tmp_path / "profiles" / "generic" / "cia402.eds")]
+    assert done.stdout.split() == [
+        "generic/cia402", str(tmp_path / "profiles" / "generic" / "cia402.eds"), str(tmp_path / "tdhil" / "_docs")
+    ]

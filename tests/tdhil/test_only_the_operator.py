@@ -45,7 +45,8 @@ def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
 
 @pytest.mark.parametrize("section", ["", "run:\n  "])
 @pytest.mark.parametrize("key", [
-    "yes", "accept_no_watchdog", "accept_shared_watchdog", "accept_wider_limit", "reset_fault",
+    "yes", "accept_no_watchdog", "accept_shared_watchdog", "accept_wider_limit", "accept_speed_unit",
+    "reset_fault",
 ])
 def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, section, key):
     with pytest.raises(DataFileError) as caught:

@@ -1,0 +1,50 @@
+"""`tdhil rig new`: a commented rig.yaml to fill in, with no drive at hand."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from tdhil.errors import UsageError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """`new` is the one thing to be done so far."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    new = actions.add_parser("new", help="write a rig.yaml to fill in", allow_abbrev=False,
+                             description="Writes a commented rig.yaml to fill in, with no drive at hand.")
+    new.add_argument("file", type=Path, nargs="?", default=Path("rig.yaml"), metavar="rig.yaml",
+                     help="never over a file")
+    new.add_argument("--profile", default="generic/cia402", metavar="NAME",
+                     help="vendor/model, or a .yaml file (tdhil profiles shows what there is; default generic/cia402)")
+    new.add_argument("--load", choices=("none", "string"), required=True,
+                     help="what hangs on the shaft: nothing that stores torque, or a drill string")
+    new.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Write it, and say what is left to be filled in. UsageError where it can't be written."""
+    from profiles.library import load_profile
+    from tdhil.commands.scan_rig import blank_rig, to_fill_in
+
+    path: Path = namespace.file
+    profile = load_profile(namespace.profile)
+    named = namespace.profile
+    if named.endswith((".yaml", ".yml")):
+        named = Path(os.path.relpath(named, path.parent)).as_posix()      # rig.yaml looks for it beside itself
+    text = blank_rig(profile, named, namespace.load)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise UsageError("is there already, and is not written over", where=str(path),
+                         next_step="Name another file") from None
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path),
+                         next_step="Name a file in a folder that you may write to") from error
+    print(f"{path}: written. To be filled in, before that nothing real moves:", file=sys.stderr)  # noqa: T201
+    for line in to_fill_in(profile, namespace.load):
+        print(f"  {line}", file=sys.stderr)  # noqa: T201
+    return 0

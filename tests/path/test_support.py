@@ -1,0 +1,159 @@
+"""`tdhil support`, `tdhil rig new`, `tdhil docs`: what goes to others, what a bench begins with, where to read on."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import pytest
+from path_runs import tdhil
+
+from drivers.errors import PreflightRefused
+from profiles.library import profile_names
+from tdhil.commands.support import Scrub
+from tdhil.record.event import Event
+from tdhil.record.messages import Ours, messages
+from tdhil.record.reader import read_run
+from tdhil.record.recording import Stage
+from tdhil.record.writer import RunWriter
+from tdhil.rig import load_rig, require_limits
+
+HOME, USER, HOST = "/home/janedoe", "janedoe", "drilling-laptop-7"
+TELLING = ("janedoe", "drilling-laptop-7", "hunter2", "sesame", "Jane Doe", "/Users/other", "C:\\Users\\third")
+
+
+@pytest.fixture
+def log(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", HOME)
+    monkeypatch.setenv("SECRET_TOKEN", "hunter2")
+    monkeypatch.setattr("getpass.getuser", lambda: USER)
+    monkeypatch.setattr("socket.gethostname", lambda: HOST)
+    path = tmp_path / "run.mcap"
+    with RunWriter(path, epoch_ns=0, block=True) as writer:
+        writer.configuration({
+            "tdhil": "0.1.0",
+            "operator": "Jane Doe",
+            "rig_file": f"{HOME}/rigs/rig.yaml",
+            "options": {"log": {"value": f"{HOME}/rigs/run.mcap", "source": "--log"}},
+            "bus": {"password": {"value": "hunter2", "source": "--bus-kwargs"}, "url": "tcp://jd:hunter2@192.0.2.1"},
+            "profile": {"name": "generic/cia402", "source": "manual, /Users/other/manual.pdf"},
+            "bench": {"limits": {"torque_nm": 400.0}},
+            "identify": {"model": "auto"},
+        }, {"gear_ratio": 2.0})
+        writer.stage(Stage("setup", 0.0, 1.5, "aborted", f"on {HOST}"))
+        writer.event(Event(1.0, "failure", f"no such file {HOME}/x (token=sesame)",
+                           'File "C:\\Users\\third\\tdhil\\cli.py", line 3'))
+        writer.result({"log": f"{HOME}/run.mcap", "verdict": "valid"})
+    return path
+
+
+def texts(archive: Path, folder: Path) -> dict[str, str]:
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(folder)
+        names = file.namelist()
+    found = {name: (folder / name).read_text("utf-8") for name in names if name != "run.mcap"}
+    if "run.mcap" in names:
+        run = read_run(folder / "run.mcap")
+        found["run.mcap"] = repr((run.configuration, run.events, run.stages, run.result))
+        parts = [one.payload for one in messages(folder / "run.mcap") if isinstance(one, Ours)]
+        found["every message"] = b"\n".join(parts).decode("utf-8", "replace")
+    return found
+
+
+def test_the_archive_holds_all_that_is_needed_and_nobody_s_name(log, tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"# bench of Jane, {USER}@{HOST}\nnode: 3\n# password: hunter2\n")
+    done = tdhil("support", log, "--rig", rig)
+    assert done.code == 0, done.err
+    found = texts(tmp_path / "run.support.zip", tmp_path / "out")
+    assert found.keys() >= {"versions.json", "doctor.txt", "rig.yaml", "run.mcap", "log.json", "events.txt",
+                            "profile.json", "bench.json", "configuration.json"}
+    for name, text in found.items():
+        assert not any(word in text for word in TELLING), name
+    assert json.loads(found["profile.json"])["name"] == "generic/cia402"
+    assert json.loads(found["bench.json"])["limits"]["torque_nm"] == 400.0
+    assert "~/rigs/rig.yaml" in found["configuration.json"]
+    assert "numpy" in json.loads(found["versions.json"])["libraries"]
+    assert "SECRET_TOKEN" not in found["versions.json"]
+    kept = read_run(tmp_path / "out" / "run.mcap")
+    assert kept.complete
+    assert kept.recording.gear_ratio == 2.0
+    assert [(stage.name, stage.outcome) for stage in kept.stages] == [("setup", "aborted")]
+
+
+def test_it_goes_over_no_file_and_needs_a_log(log, tmp_path):
+    other = tmp_path / "mine.zip"
+    other.write_text("mine")
+    done = tdhil("support", log, "-o", other)
+    assert (done.code, other.read_text()) == (2, "mine")
+    assert tdhil("support", tmp_path / "none.mcap").code == 2
+
+
+def test_a_log_that_can_not_be_read_stays_out(tmp_path, monkeypatch):
+    broken = tmp_path / "run.mcap"
+    broken.write_bytes(b"\x89MCAP0\r\n" + b"janedoe" * 40)
+    done = tdhil("support", broken)
+    assert done.code == 3, done.err
+    assert "run.mcap" not in texts(tmp_path / "run.support.zip", tmp_path / "out")
+
+
+def test_numbers_of_the_log_are_untouched(log):
+    scrub = Scrub(home=HOME, names=[USER])
+    assert scrub.message(1, b"\x01janedoe") == b"\x01janedoe"      # samples, commands and frames hold no text
+    assert scrub.text("/opt/janedoes /home/x/y") == "/opt/janedoes /home/<user>/y"
+
+
+# -- rig new --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("profile", profile_names())
+def test_a_new_rig_loads_and_moves_nothing_real_until_it_is_filled_in(tmp_path, profile):
+    path = tmp_path / "rig.yaml"
+    done = tdhil("rig", "new", path, "--profile", profile, "--load", "none")
+    assert done.code == 0, done.err
+    bench = load_rig(path)
+    assert (bench.profile, bench.load, bench.bus.interface, bench.modbus.host) == (profile, "none", None, None)
+    with pytest.raises(PreflightRefused, match="no machine limits"):
+        require_limits(bench)
+    assert "limits: speed_min_rad_s, speed_max_rad_s" in done.err
+    filled = path.read_text().replace("#limits", "limits")
+    for key in ("speed_min_rad_s", "speed_max_rad_s", "torque_nm", "time_s", "quick_stop_rad_s2", "probe_torque_nm",
+                "probe_travel_rad"):
+        filled = filled.replace(f"#  {key}: ", f"  {key}: {5 if key == 'speed_max_rad_s' else 1} ")
+    path.write_text(filled)
+    assert require_limits(load_rig(path)).speed_max_rad_s == 5
+
+
+def test_a_string_is_refused_until_its_torques_are_there(tmp_path):
+    path = tmp_path / "rig.yaml"
+    assert tdhil("rig", "new", path, "--load", "string").code == 0
+    done = tdhil("identify", "--dry-run", "--rig", path)
+    assert done.code == 2
+    assert "make_up_torque_nm" in done.err
+    path.write_text(path.read_text().replace("#make_up_torque_nm:", "make_up_torque_nm: 900")
+                    .replace("#torque_ramp_nm_s:", "torque_ramp_nm_s: 50"))
+    assert load_rig(path).load == "string"
+
+
+def test_what_hangs_on_the_shaft_is_never_guessed(tmp_path):
+    assert tdhil("rig", "new", tmp_path / "rig.yaml").code == 2
+    assert not (tmp_path / "rig.yaml").exists()
+
+
+def test_a_rig_is_never_written_over(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text("mine")
+    assert (tdhil("rig", "new", path, "--load", "none").code, path.read_text()) == (2, "mine")
+
+
+# -- docs -----------------------------------------------------------------------------------------------------
+
+
+def test_docs_names_the_folder():
+    done = tdhil("docs")
+    assert done.code == 0
+    folder = Path(done.out.splitlines()[0])
+    assert (folder / "docs" / "rig.md").is_file()
+    assert (folder / "examples" / "rig.yaml").is_file()
+    assert "docs/rig.md" in done.out
