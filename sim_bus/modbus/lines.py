@@ -3,9 +3,7 @@
 import os
 import socket
 import struct
-import termios
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Protocol
@@ -130,6 +128,14 @@ class RtuListener:
     def __init__(self, device: str | None, *, baud: int, parity: str, stop_bits: int) -> None:
         self._slave = -1
         try:
+            import termios
+            import tty
+        except ImportError as error:
+            raise TdhilError(
+                "this system has no serial lines that a program can be at the far end of", where="--rtu",
+                next_step="Use --tcp",
+            ) from error
+        try:
             if device is None:
                 self._fd, self._slave = os.openpty()       # kept open, or reading fails whenever no host is there
                 tty.setraw(self._slave)
@@ -188,6 +194,9 @@ def _write(fd: int, frame: bytes) -> None:
 
 def _set_line(fd: int, baud: int, parity: str, stop_bits: int) -> None:
     """Raw, eight bits, at the given rate; termios.error where the device can't."""
+    import termios
+    import tty
+
     tty.setraw(fd)
     rate = getattr(termios, f"B{baud}", None)
     if rate is None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import shlex
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -35,13 +37,14 @@ def host_findings(log: Path) -> Iterator[Finding]:
 
 def library_findings(version_of: Callable[[str], str | None]) -> Iterator[Finding]:
     """Is each library there, and not older than this program needs?"""
+    pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # of this environment, whichever is active
     for name, least in LIBRARIES.items():
         version = version_of(name)
         wanted = ".".join(map(str, least))
         if version is None:
-            yield bad(name, "is not installed", f"pip install '{name}>={wanted}'")
+            yield bad(name, "is not installed", f"{pip} install '{name}>={wanted}'")
         elif _numbers(version)[: len(least)] < least:
-            yield bad(name, f"{version} is too old, {wanted} is needed", f"pip install --upgrade '{name}>={wanted}'")
+            yield bad(name, f"{version} is too old, {wanted} is needed", f"{pip} install --upgrade '{name}>={wanted}'")
         else:
             yield ok(name, version)
 

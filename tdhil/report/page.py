@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import metadata
 from importlib.util import find_spec
 from io import StringIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import tdhil
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
@@ -15,7 +20,6 @@ if TYPE_CHECKING:
 
 Draw = Callable[["FigureBase"], None]
 
-INSTALL = "pip install 'tdhil[report]'"
 NEEDED = ("matplotlib", "jinja2")
 
 STYLE = """\
@@ -33,12 +37,31 @@ th { background: #f4f4f4; font-weight: 600 }
 """
 
 
+def install_command() -> str:
+    """What installs the extra `report` here: into this environment, from the clone, or by its packages' names.
+
+    This package stands in no index, so its own name would find nothing.
+    """
+    python = shlex.quote(sys.executable or "python")
+    clone = Path(tdhil.__file__).resolve().parent.parent
+    if (clone / "pyproject.toml").is_file():
+        return f"{python} -m pip install -e {shlex.quote(f'{clone}[report]')}"
+    try:
+        stated = metadata.requires("tdhil") or []
+    except metadata.PackageNotFoundError:
+        stated = []
+    wanted = [line.split(";")[0].strip() for line in stated if line.split(";")[0].strip().startswith(NEEDED)
+              and "report" in line]
+    return f"{python} -m pip install {' '.join(map(shlex.quote, wanted or NEEDED))}"
+
+
 def require_extra(where: str) -> None:
     """Raises UsageError, in one line, where the optional packages for a report are missing."""
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         raise UsageError(
-            f"a report needs {' and '.join(missing)}, not installed here", where=where, next_step=f"Install: {INSTALL}"
+            f"a report needs {' and '.join(missing)}, not installed here", where=where,
+            next_step=f"Install: {install_command()}",
         )
 
 

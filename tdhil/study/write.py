@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from tdhil.report import page
 from tdhil.study.outcome import Cell, ResultTable, StudyOutcome
 
-INSTALL = f"no pictures without matplotlib; install it with: {page.INSTALL}"
+INSTALL = f"no pictures without matplotlib; install it with: {page.install_command()}"
 DPI = 120
 
 

@@ -141,7 +141,7 @@ def test_what_can_not_be_done_is_said_in_one_line(tmp_path, monkeypatch):
     check_report_path(tmp_path / "r.html", log)
     find = importlib.util.find_spec
     monkeypatch.setattr("tdhil.report.page.find_spec", lambda name: None if name == "jinja2" else find(name))
-    with pytest.raises(UsageError, match=r"needs jinja2, not installed here.*pip install 'tdhil\[report\]'"):
+    with pytest.raises(UsageError, match=r"needs jinja2, not installed here.*pip install -e .*\[report\]"):
         check_report_path(tmp_path / "r.html", log)
 
 
