@@ -63,6 +63,7 @@ HOUR: Final = Unit("time", "h", 3600.0)
 PERCENT: Final = Unit("share", "%", 1.0, 100.0)
 PERMILLE: Final = Unit("share", "‰", 1.0, 1000.0)
 
+TEMPERATURE: Final = Unit("temperature", "°C")
 _KILOBIT, _MEGABIT = Unit("bit rate", "kbit/s", 1e3), Unit("bit rate", "Mbit/s", 1e6)
 _TURN_ANGLE = Unit("angle", "turns", _TURN)
 _DEGREE_S2, _TURNS_S2 = Unit("acceleration", "°/s²", _TURN, 360.0), Unit("acceleration", "rev/s²", _TURN)
@@ -109,6 +110,7 @@ _SPELT: Final[tuple[tuple[Unit, str], ...]] = (
     (_KILOHERTZ, "khz"),
     (PERCENT, "% pct percent"),
     (PERMILLE, "‰ permille promille permil"),
+    (TEMPERATURE, "°c c degc"),
     (BIT_RATE, "bit/s bits/s bps bd baud"),
     (_KILOBIT, "k kbit/s kbits/s kbps kbit kbd kbaud"),
     (_MEGABIT, "mbit/s mbits/s mbps mbit mbd mbaud"),
@@ -129,7 +131,7 @@ _ENDINGS: Final = {
     "tolerance": SHARE, "confidence": SHARE, "bitrate": BIT_RATE, "baud": BIT_RATE,
     "rpm": RPM, "rpm_s": RPM_S, "deg": DEGREE, "turns": _TURN_ANGLE, "deg_s": DEGREE_S, "deg_s2": _DEGREE_S2,
     "knm": KILONEWTON_METRE, "knm_s": _KILO_RATE, "ms": MILLISECOND, "us": MICROSECOND, "percent": PERCENT,
-    "permille": PERMILLE, "kg_cm2": _CENTI, "khz": _KILOHERTZ,
+    "permille": PERMILLE, "kg_cm2": _CENTI, "c": TEMPERATURE, "khz": _KILOHERTZ,
 }
 
 

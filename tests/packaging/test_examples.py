@@ -84,7 +84,7 @@ def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
 
 
 def _indented(line: str) -> str:
-    return ("  " if "lag" in line else "") + line
+    return ("  " if "lag" in line or "temperature" in line else "") + line
 
 
 def test_plant_example_is_the_default_rig_and_complete():

