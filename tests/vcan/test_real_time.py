@@ -18,8 +18,8 @@ from tdhil.record.reader import read_run
 
 pytestmark = pytest.mark.real_time
 RUNS = 10
-SHORT = ("--mode", "speed", "--frequency", 0.5, "--periods", 7)
-"""Half a minute of motion before the excitation, and a quarter of one of it."""
+SHORT = ("--mode", "speed", "--frequency", 1, "--periods", 12)
+"""Half a minute of motion before the excitation, and twelve seconds of it."""
 
 
 @pytest.fixture(scope="module")
