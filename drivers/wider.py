@@ -5,7 +5,7 @@ it wrote. So a torque or speed limit is lowered to rig.yaml's unasked and never 
 steeper and never gentler. Where the drive is tighter, its limit stays and the run keeps within it
 (`Preflight.kept_torque_nm`, `kept_speed_rad_s`); a quick stop that brakes harder just stays.
 
-A simulated drive has nobody's settings to lose: there every limit becomes rig.yaml's.
+A simulated drive is no exception: it leaves its factory as wide as it goes.
 """
 
 from __future__ import annotations
@@ -25,14 +25,13 @@ _SLACK = 1e-6
 class OwnLimits:
     """Decides limit by limit, and keeps what stayed: ``kept`` by name, N·m, rad/s or rad/s², the tightest of each."""
 
-    def __init__(self, accepted: Collection[str], *, simulated: bool) -> None:
+    def __init__(self, accepted: Collection[str]) -> None:
         self._accepted = frozenset(accepted)
-        self._simulated = simulated
         self.kept: dict[str, float] = {}
 
     def stays(self, limit: str, wanted: float, found: float) -> bool:
         """Is the one ``found`` in the drive tighter, and not to be touched? Both in one unit, whatever their sign."""
-        return self.wider(limit, wanted, found) and not (self._simulated or limit in self._accepted)
+        return self.wider(limit, wanted, found) and limit not in self._accepted
 
     def keep(
         self, table: Table, limit: str, title: str, wanted: str, found: str, found_si: float, where: str
@@ -49,7 +48,7 @@ class OwnLimits:
     ) -> bool:
         """The row of one that was written, with what stood there before; whether it reads back as wanted."""
         changed = "" if before == now else f" (was {before})"
-        if wider and good and not self._simulated:
+        if wider and good:
             text = f"{now} (was {before}: wider, accepted by {FLAG} {limit})"
             table.checks.append(Check(title, wanted, text, Outcome.NOTE, where))
             return True

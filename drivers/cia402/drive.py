@@ -210,7 +210,7 @@ class Cia402Drive:
         self._modes = {code: mode for mode, code in self._codes.items()}
         table.checks += scaling.checks
         self._angle = find_angle(table, objects, self._profile)
-        own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
+        own = OwnLimits(limits.accept_wider)
         set_limits(table, objects, self._profile, limits, rated_nm, own)
         note_temperature(table, limits.temperature_c)
         checks.clear_targets(table, objects, self._profile)

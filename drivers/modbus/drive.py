@@ -169,7 +169,7 @@ class ModbusDrive:
             limits.accept_no_watchdog,
         )
         watched, shared = True, False
-        own = OwnLimits(limits.accept_wider, simulated=self._identity.simulated)
+        own = OwnLimits(limits.accept_wider)
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
             self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)

@@ -22,7 +22,9 @@ from profiles.library import load_canopen_profile
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from sim_bus.simulator import EmbeddedSimulator
 
-LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+LIMITS = Limits(
+    speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_wider=frozenset({"quick-stop"})
+)
 RPM = math.pi / 30.0
 
 

@@ -45,7 +45,9 @@ def test_as_delivered_it_is_accepted_and_every_limit_stands_in_the_drive(make, k
     found = found_with(make(kind))
     assert found.refused == ()
     titles = [check.name for check in found.checks if check.outcome is Outcome.OK]
-    assert {"torque limit", "speed limit", "quick-stop ramp", "unit of speed", "watchdog"} <= set(titles)
+    assert {"torque limit", "speed limit", "unit of speed", "watchdog"} <= set(titles)
+    ramp = next(check for check in found.checks if check.name == "quick-stop ramp")
+    assert "wider, accepted by --accept-wider-limit quick-stop" in ramp.found
 
 
 @pytest.mark.parametrize("unit", [0xFFB44700, 0xFDB44700, 0x00000000])
