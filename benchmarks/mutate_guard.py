@@ -112,7 +112,7 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("identify", "code = code or int(exit_code(error))", "pass"),
     ("identify", "        code = ExitCode.STOP_NOT_CONFIRMED\n", "        pass\n"),
     ("guard", "elif sample.fresh and not self._mode.see(command.mode, sample):", "elif False:"),
-    ("guard", "if sample.fresh and not following.see(command.speed_rad_s, sample):", "if False:"),
+    ("guard", "elif sample.fresh and not following.see(command.speed_rad_s, sample):", "elif False:"),
     ("stop", "if not (self._fed and self._watched and", "if not (self._fed and"),
     ("string_rules", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
     ("container", "if found.st_size < self._offset:", "if False:"),

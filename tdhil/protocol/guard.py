@@ -308,11 +308,10 @@ class Guard:
         )
 
     def _check_following(self, command: Command, sample: Sample, where: str) -> None:
-        if self.expected is not PowerState.ENABLED or command.mode is not Mode.SPEED:
-            self._following.reset()
-            return
         following = self._following
-        if sample.fresh and not following.see(command.speed_rad_s, sample):
+        if self.expected is not PowerState.ENABLED or command.mode is not Mode.SPEED:
+            following.reset()
+        elif sample.fresh and not following.see(command.speed_rad_s, sample):
             torque, helps = self.torque_told(following.torque_nm, sample.limit_active)
             raise LimitHit(
                 f"the speed does not follow: {command.speed_rad_s:.3f} rad/s commanded,"

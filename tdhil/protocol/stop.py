@@ -246,7 +246,7 @@ class StopSequence:
                 return None
             patience.see(sample.speed_rad_s, self._bench.period_s)
             if not braking.see(sample.time_s, sample.speed_rad_s) and self._leave_to_watchdog(sample):
-                patience = Patience(self._enough_s, self._at_rest_rad_s)
+                patience = Patience(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
             # Single lost frames don't unsay what the others showed; a longer gap does.
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:

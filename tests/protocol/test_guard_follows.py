@@ -82,6 +82,14 @@ def test_before_it_is_enabled_nothing_is_expected_of_the_display():
     assert shown([(Mode.TORQUE, Mode.SPEED)] * 500, expected=None) is None
 
 
+def test_what_was_displayed_before_it_is_enabled_anew_is_forgotten():
+    watch = watching()
+    for k in range(100):
+        watch.expected = None if k % 14 == 13 else PowerState.ENABLED
+        seen = sample(5.0, 90.0 + k % 2, time_s=0.02 * k)._replace(mode=Mode.SPEED)
+        watch.check_sample(Command(Mode.TORQUE, 5.0, 90.0), seen)
+
+
 # -- the following error -------------------------------------------------------------------------------------------
 
 
@@ -155,6 +163,24 @@ def test_torque_mode_and_a_drive_that_is_not_enabled_yet_are_not_judged_by_it():
     watch.expected = PowerState.ENABLED
     for k in range(3000, 3000 + round(0.9 * FOLLOW_S / 0.02)):
         watch.check_sample(Command(Mode.SPEED, 9.0, 0.0), sample(1.0, 90.0 + k % 2, time_s=0.02 * k))
+
+
+def test_what_was_before_another_mode_is_forgotten():
+    watch = watching()
+    for k in range(3000):
+        mode = Mode.TORQUE if k % 220 > 210 else Mode.SPEED        # apart for 4.2 s at a time
+        seen = sample(1.0, 90.0 + k % 2, time_s=0.02 * k)._replace(mode=mode)
+        watch.check_sample(Command(mode, 9.0, 90.0), seen)
+
+
+@pytest.mark.parametrize("period_s", [0.004, 0.02])
+def test_a_reference_faster_than_its_blocks_is_seen_whole(period_s):
+    """Ten times a second up and down: whoever looks at one phase of it only takes its mean for a wrong speed."""
+    up = round(0.05 / period_s)
+    found = followed(
+        lambda t: 7.0 if round(t / period_s) % (2 * up) < up else 3.0, lambda t, _: 5.0, 30.0, period_s=period_s
+    )
+    assert found is None
 
 
 class Rig:

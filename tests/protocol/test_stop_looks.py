@@ -6,7 +6,7 @@ import pytest
 from fake_drive import LIMITS, PERIOD_S, FakeDrive
 
 from drivers.drive import Mode, PowerState
-from drivers.errors import CommunicationLost
+from drivers.errors import CommandRejected, CommunicationLost
 from tdhil.protocol.settings import ControlAssumptions
 from tdhil.protocol.stop import REST_AFTER_S, SILENT_S, UNMOVED_S
 from tdhil.protocol.stop_looks import AFTER_S, EVERY_S, SLOWING_S, Looks, Slowing
@@ -184,9 +184,12 @@ class Starved(FakeDrive):
     watchdog_s: float = 0.5
     unfed_since_s: float | None = None
     refuses: int = 0
+    rejects: bool = False
 
     def stop_feeding(self):
         self.calls.append("stop_feeding")
+        if self.rejects:
+            raise CommandRejected("somebody else feeds it, too")
         if self.refuses:
             self.refuses -= 1
             raise CommunicationLost("busy")
@@ -212,6 +215,26 @@ def test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched(wor
     assert here.drive.unfed_since_s - begun_s == pytest.approx(UNMOVED_S, abs=0.2)
     assert report.confirmed and here.drive.speed == 0.0 and here.drive.disabled_at in ([], [0.0])
     assert any("sign of life was ended" in line for line in report.trouble)
+    assert report.trouble.count("busy") == refuses
+
+
+def test_a_watchdog_that_takes_its_time_is_waited_for(world):
+    """As long again as for a quick stop of the host's."""
+    here = world(Starved(driven=None, watchdog_s=14.0))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    assert here.stop_sequence().run().confirmed
+
+
+def test_a_drive_that_somebody_else_feeds_too_is_asked_once(world):
+    here = world(Starved(driven=None, rejects=True))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert here.drive.calls.count("stop_feeding") == 1
+    assert report.trouble[0] == "somebody else feeds it, too"
+    assert not any("sign of life was ended" in line for line in report.trouble)
 
 
 @pytest.mark.parametrize("options", [{"watched": False}, {}])

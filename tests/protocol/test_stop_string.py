@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from string_drive import RESIDUAL_NM, STRING, StringWorld
 
-from drivers.drive import Check, Mode, Outcome, PowerState
+from drivers.drive import Check, Identity, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
 from tdhil.protocol.let_go import FASTEST_SWING_S, QUIET_S, STIFFEST, TRAVEL_RAD, LetGo, LetGoLimits
 from tdhil.protocol.settings import ExcitationRequest
@@ -333,6 +333,9 @@ def test_a_long_ramp_is_waited_for_in_any_case():
 # -- what a string forbids -----------------------------------------------------------------------------------------
 
 
+REAL = Identity(1, 2, 3, 4, "real", simulated=False)
+
+
 def preflight_of(**change):
     from drivers.drive import Limits
 
@@ -351,6 +354,7 @@ def preflight_of(**change):
         (replace(STRING, accept_no_watchdog=True), ExcitationRequest(), {"watchdog_s": 0.0}, "--accept-no-watchdog"),
         (STRING, ExcitationRequest(), {"safe_action": "fault_reaction"}, "watchdog reaction is 'fault_reaction'"),
         (STRING, ExcitationRequest(), {"quick_stop_holds": False}, "lets go of it"),
+        (STRING, ExcitationRequest(), {"fed_by_any_client": True, "identity": REAL}, "any client feeds"),
         (STRING, ExcitationRequest(), {"quick_stop_holds": None}, "nobody knows"),
     ],
 )
