@@ -385,7 +385,6 @@ class _Following:
     def reset(self) -> None:
         """What comes next is seen as the first."""
         self._blocks.clear()
-        self._recent.clear()
         self._side = 0.0                   # of the reference that the shaft is away on; 0: it is not
         self._anchor_rad_s = self._anchor_s = self.since_s = 0.0
 

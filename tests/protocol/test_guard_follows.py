@@ -173,12 +173,20 @@ def test_what_was_before_another_mode_is_forgotten():
         watch.check_sample(Command(mode, 9.0, 90.0), seen)
 
 
-@pytest.mark.parametrize("period_s", [0.004, 0.02])
-def test_a_reference_faster_than_its_blocks_is_seen_whole(period_s):
-    """Ten times a second up and down: whoever looks at one phase of it only takes its mean for a wrong speed."""
-    up = round(0.05 / period_s)
+def test_a_reference_of_before_another_mode_excuses_nothing():
+    watch = watching()
+    with pytest.raises(LimitHit, match="does not follow") as caught:
+        for k in range(3000):
+            mode = Mode.TORQUE if 500 <= k < 550 else Mode.SPEED
+            seen = sample(3.0, 90.0 + k % 2, time_s=0.02 * k)._replace(mode=mode)
+            watch.check_sample(Command(mode, 3.0 if k < 550 else 7.0, 90.0), seen)
+    assert 11.0 + FOLLOW_S <= float(caught.value.where.split()[2]) <= 11.1 + FOLLOW_S
+
+
+def test_a_reference_as_fast_as_its_blocks_is_seen_whole():
+    """Two cycles up, two down, a block is four: whoever looks at one phase of it takes its mean for a wrong speed."""
     found = followed(
-        lambda t: 7.0 if round(t / period_s) % (2 * up) < up else 3.0, lambda t, _: 5.0, 30.0, period_s=period_s
+        lambda t: 7.0 if round(t / 0.03) % 4 < 2 else 3.0, lambda t, _: 5.0, 30.0, period_s=0.03
     )
     assert found is None
 
