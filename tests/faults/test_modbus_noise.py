@@ -1,4 +1,4 @@
-"""Row 76: a serial line on which every fifth reply is damaged, from some time in motion on, judged on the shaft."""
+"""Row 72: a serial line on which every fifth reply is damaged, from some time in motion on, judged on the shaft."""
 
 import random
 
@@ -27,7 +27,7 @@ class Noise:
 
 
 @pytest.mark.parametrize("profile", ["generic/modbus", "siemens/g120"])
-def test_row_76_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_user, monkeypatch, tmp_path, seen):
+def test_row_72_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_user, monkeypatch, tmp_path, seen):
     """One request a cycle, and three of them at 19,200 baud."""
     noise = Noise(monkeypatch)
 
@@ -41,5 +41,5 @@ def test_row_76_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_us
     assert "NOT confirmed" not in ended.done.err
     ended.shaft.assert_at_rest()
     ended.shaft.assert_never_let_go()
-    seen(76, f"{profile}: the run {'goes on' if ended.done.code != 5 else 'is ended, the shaft seen at rest'}",
+    seen(72, f"{profile}: the run {'goes on' if ended.done.code != 5 else 'is ended, the shaft seen at rest'}",
          None if ended.done.code != 5 else ended.standstill_s(acted[0]), ended.assert_log_whole(), ended.done.code)

@@ -1,4 +1,4 @@
-"""Rows 70 on: other clients of a Modbus drive that read, command, or change its settings; judged on the shaft."""
+"""Rows 66 on: other clients of a Modbus drive that read, command, or change its settings; judged on the shaft."""
 
 import math
 import re
@@ -57,7 +57,7 @@ def test_a_host_dies_while_another_client_reads(tmp_path, what, runs_on):
     assert bool(shaft.events("host silent")) is not runs_on
 
 
-def test_row_70_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen):
+def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen):
     """A real drive in a process of its own: nothing moves, and the way out is named."""
     profile, trace, rig = fed_by(tmp_path, "any_request"), tmp_path / "shaft.csv", tmp_path / "rig.yaml"
     rig.write_text(RIG)
@@ -77,7 +77,7 @@ def test_row_70_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen)
     assert "nobody is there to confirm" in taken.document["error"]["message"]
     shaft = Shaft.read(trace)
     assert abs(shaft.speed_rad_s).max() < TURNING_RAD_S and "operation enabled" not in set(shaft.state)
-    seen(70, message, None, "whole", 4)
+    seen(66, message, None, "whole", 4)
 
 
 # -- another master that commands, and one that changes settings, in stepped time ------------------------------
@@ -119,7 +119,7 @@ def command(control, speed_rad_s, torque_permille=0, mode=0):
     (5.0, command(15, 5.0), "speed"), (50.0, command(15, 5.0), "speed"), (100.0, command(15, 5.0), "acquire"),
     (20.0, command(15, 0.0, 300, 1), "hold"), (10.0, struct.pack(">BHHBi", 16, 1, 2, 4, 4775), "speed"),
 ], ids=["5 Hz", "50 Hz", "100 Hz in acquire", "torque in hold", "its setpoint alone"])
-def test_row_71_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_path, seen):
+def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_path, seen):
     """The stop stands against it, the shaft comes to rest, and who did it is told."""
     acted = at(monkeypatch, stage, 5.0, lambda sample: other.begin(sample.time_s, 1.0 / hz, pdu))
     ended = run(tmp_path, "--drive", "modbus")
@@ -130,7 +130,7 @@ def test_row_71_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     assert abs(shaft.speed_rad_s[after]).max() < 7.0
     quiet = shaft.time_s >= shaft.time_s[-1] - 1.0
     assert abs(shaft.speed_rad_s[quiet]).max() < 0.2, "the other master turned the shaft on"
-    seen(71, f"{hz:g} Hz in {stage}: {ended.message}", ended.standstill_s(acted[0]) if ended.done.code == 5 else None,
+    seen(67, f"{hz:g} Hz in {stage}: {ended.message}", ended.standstill_s(acted[0]) if ended.done.code == 5 else None,
          ended.assert_log_whole(), ended.done.code)
 
 
@@ -139,11 +139,11 @@ def test_row_71_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
     (41, 0, ("register 41", "reaction", "was 3, and is 0")),
     (38, 4000, ("register 38", "was 0.4 of rated torque, and is 4 of rated torque")),
 ], ids=["watchdog off", "reaction", "torque limit"])
-def test_row_72_somebody_changes_a_setting_in_motion(address, value, words, other, monkeypatch, tmp_path, seen):
+def test_row_68_somebody_changes_a_setting_in_motion(address, value, words, other, monkeypatch, tmp_path, seen):
     """Once, as a commissioning tool does: a host that died later would find no watchdog."""
     pdu = struct.pack(">BHH", 6, address, value)
     acted = at(monkeypatch, "speed", 5.0, lambda sample: other.begin(sample.time_s, 0.05, pdu, lasts_s=0.06))
     ended = run(tmp_path, "--drive", "modbus")
     ended.assert_ended(5, "somebody else changed a setting during the run", *words)
     standstill_s = ended.assert_stopped(acted[0], 2.0)
-    seen(72, ended.message, standstill_s, ended.assert_log_whole(), 5)
+    seen(68, ended.message, standstill_s, ended.assert_log_whole(), 5)

@@ -209,7 +209,7 @@ def test_the_angle_shows_a_unit_that_is_too_small(made, seen, bus, factor):
     assert "speed scaling in the profile" in cause.next_step
     assert_stopped_in_time(rig)
     if factor == 10.0:
-        seen(80, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+        seen(74, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
 @both
@@ -232,7 +232,7 @@ def test_without_an_angle_the_operator_says_no(made, seen, bus):
     assert true == pytest.approx(10.0 * reported, rel=0.1)
     assert "tells no angle" in why
     assert_stopped_in_time(rig)
-    seen(81, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+    seen(75, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
 @both
@@ -242,7 +242,7 @@ def test_without_an_angle_and_with_nobody_there(made, seen, bus):
     assert exit_code(cause) == 4
     assert "nobody is there to see whether the shaft turns" in cause.what
     assert_stopped_in_time(rig)
-    seen(82, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
+    seen(76, f"{cause.what}; the true shaft reached {rig.highest_rad_s:.1f} rad/s of 10", code=4)
 
 
 @both
@@ -345,7 +345,7 @@ def test_an_angle_that_counts_backwards(made, seen):
     assert "a sign is inverted" in cause.what
     assert "607Eh" in cause.next_step
     assert_stopped_in_time(rig)
-    seen(83, cause.what, code=4)
+    seen(77, cause.what, code=4)
 
 
 def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
@@ -356,7 +356,7 @@ def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
     (_, _, why), = rig.asked
     assert "doesn't move" in why
     assert_stopped_in_time(rig)
-    seen(84, f"{why}; {cause.what}", code=4)
+    seen(78, f"{why}; {cause.what}", code=4)
 
 
 def test_an_angle_that_stands_still_in_a_simulated_drive(made):

@@ -25,7 +25,7 @@ def test_a_string_and_a_quick_stop_that_lets_go(drive, profile, rehearse, tmp_pa
     run = rehearse("--drive", drive, "--profile", profile, "--rig", rig)
     run.assert_ended(4, "drill string", "lets go of it after a quick stop", "quick_stop of the profile")
     run.assert_nothing_moved()
-    seen(85, f"`load: string` with {profile}: {run.message}", None, run.assert_log_whole(), run.done.code)
+    seen(79, f"`load: string` with {profile}: {run.message}", None, run.assert_log_whole(), run.done.code)
 
 
 @pytest.mark.parametrize(("drive", "first", "never", "code"), [
@@ -40,7 +40,7 @@ def test_a_fault_that_never_comes_is_said(drive, first, never, code, rehearse, s
     assert said.startswith(f"tdhil: --fault {never} never came")
     events = [event.text for event in read_run(run.log).events if event.kind == "fault"]
     assert events == [f"--fault {never} never came"]
-    seen(87, said, None, run.assert_log_whole(), run.done.code)
+    seen(81, said, None, run.assert_log_whole(), run.done.code)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_a_mode_that_is_lost_in_motion(drive, when, rehearse, seen):
     run.assert_ended(6, "lost its mode", "torque mode is commanded", "second master")
     standstill_s = run.assert_stopped(run.fault_s, 1.0)
     assert run.done.outcomes[-1] == (when.split("+")[0], "aborted")
-    seen(88, f"in {when}: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
+    seen(82, f"in {when}: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
 
 
 @pytest.mark.parametrize("drive", ["canopen", "modbus"])
@@ -60,7 +60,7 @@ def test_a_shaft_that_does_not_follow_in_speed_mode(drive, rehearse, seen):
     run = rehearse("--drive", drive, "--fault", "internal-limit@speed+8s=10%")
     run.assert_ended(7, "does not follow", "apart since", "limit", "brake or the load")
     standstill_s = run.assert_stopped(run.fault_s, 8.0)
-    seen(89, run.message, standstill_s, run.assert_log_whole(), run.done.code)
+    seen(83, run.message, standstill_s, run.assert_log_whole(), run.done.code)
 
 
 def _thread_dies(path):
@@ -82,4 +82,4 @@ def test_a_log_that_is_taken_away(how, said, rehearse, monkeypatch, tmp_path, se
     run.assert_ended(3, "can't be written any more", said, "run.mcap")
     standstill_s = run.assert_stopped(acted[0], 1.5)
     assert "the shaft is at rest" in run.done.document["stop"]
-    seen(90, run.message.replace(str(tmp_path), "."), standstill_s, "gone", run.done.code)
+    seen(84, run.message.replace(str(tmp_path), "."), standstill_s, "gone", run.done.code)
