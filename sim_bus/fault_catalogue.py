@@ -97,7 +97,7 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
                            lambda v: drive.DriveFault(_code(v)), "3210h", "CODE"),
     "stuck-state": Kind(31, "the controlword is ignored", plain(drive.Deaf)),
     "mode-not-followed": Kind(32, "6061h doesn't follow 6060h", plain(drive.ModeKept)),
-    "mode-lost": Kind(88, "the drive goes over to mode 3 by itself, and stays there", plain(drive.ModeLost)),
+    "mode-lost": Kind(82, "the drive goes over to mode 3 by itself, and stays there", plain(drive.ModeLost)),
     "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(drive.SafeTorqueOff)),
     "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
                            lambda v: drive.LimitedTorque(share(v)), "10%", "SHARE"),

@@ -3,7 +3,8 @@
 import pytest
 from path_runs import QUICK, Shaft, identify, tdhil
 
-from tdhil.commands.quantities import seconds, share
+from profiles.quantities import TIME
+from tdhil.commands.quantities import amount, share
 from tdhil.record.reader import read_run
 
 
@@ -104,7 +105,7 @@ def test_one_tone_is_known_beforehand_to_tell_nothing():
 def test_quantities_as_people_type_them():
     assert share("1%") == share(" 0.01 ") == 0.01
     assert share("0.35 %") == 0.0035
-    assert [seconds(text) for text in ("300", "300s", "5min", "0.5h")] == [300.0, 300.0, 300.0, 1800.0]
+    assert [amount(TIME)(text) for text in ("300", "300s", "5min", "0.5h")] == [300.0, 300.0, 300.0, 1800.0]
 
 
 @pytest.mark.parametrize(
