@@ -25,6 +25,9 @@ _TRACE_ONLY = (
     "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd",
 )
 
+_REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
+"""Exit codes of a run that tell of the run; the others tell of the process that it was."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of replay. None as a default: not given."""
@@ -111,7 +114,7 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
 def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
     """A run that was refused, or ended in setup, holds nothing to identify from: what ended it is all to be said.
 
-    Raises NothingRecorded, with that run's own exit code.
+    Raises NothingRecorded, with that run's own exit code; a signal or a mistake that ended that run is none of this one.
     """
     from tdhil.record.errors import NothingRecorded
 
@@ -121,7 +124,8 @@ def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
         in_stage = f"in stage {found.stages[-1].name}" if found.stages else "before its first stage"
         raise NothingRecorded(
             f"the run in this log ended {in_stage}, with nothing to identify from: {ended.message}",
-            ended.exit_code, where=str(path), next_step=ended.next_step,
+            ended.exit_code if ended.exit_code in _REPEATED else ExitCode.PARTIAL,
+            where=str(path), next_step=ended.next_step,
         )
 
 

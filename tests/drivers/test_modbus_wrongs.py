@@ -17,7 +17,10 @@ from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.wrongs import parse
 from sim_bus.params import RigParams
 
-LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+LIMITS = Limits(
+    speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5,
+    accept_wider=frozenset({"torque", "speed", "quick-stop"}),         # or a register that reads tighter is let be
+)
 PROFILE = load_modbus_profile("generic/modbus")
 READ_BACK = [f"reads_back_something_else:{name}" for name in (
     "rated_torque", "rated_power", "rated_speed", "speed_limit", "speed_limit_reverse", "torque_limit",

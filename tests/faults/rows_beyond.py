@@ -52,7 +52,7 @@ SECOND_MASTER: dict[int, Row] = {
     61: Row("a stray SDO that the cycle undoes", "told in log, result and at the end", "0, 9",
             (f"{SECOND}test_stray_writes_that_the_cycle_undoes_are_told",)),
     62: Row("a second master undoes the quick stop again and again", "the host falls silent and looks on; WD", "5",
-            (f"{SECOND}test_a_quick_stop_that_is_undone_again_and_again",)),
+            (f"{SECOND}test_a_quick_stop_that_is_undone_again_and_again_is_left_to_the_watchdog",)),
     63: Row("`tdhil stop` in torque mode, where the drive's quick stop lets go", "speed mode at zero first", "0",
             ("tests/drivers/test_bare_stop.py::test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns",),
             "braked to rest, never off while it turned"),

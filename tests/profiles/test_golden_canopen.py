@@ -63,7 +63,7 @@ class Bench:
         self.drive.connect()
         for entry in golden.get("stands", ()):
             self.node.store.write(entry["index"] << 8 | entry["sub"], entry["value"])
-        self.found = self.drive.preflight(Limits(**golden["limits"]))
+        self.found = self.drive.preflight(Limits(**golden["limits"], accept_wider=frozenset({"quick-stop"})))
 
     def close(self):
         self.host.shutdown()

@@ -101,7 +101,7 @@ def test_registers_in_a_gap_may_be_read_along_and_not_written() -> None:
     host = GenericHost(drive(profile))
     assert host.read(5, 11) == (0,) * 11
     assert host.refused(bytes.fromhex("0600050001")) == 2
-    assert host.refused(bytes.fromhex("0300360001")) == 2                    # beyond the map
+    assert host.refused(bytes.fromhex("0300600001")) == 2                    # beyond the map
 
 
 def test_marker_says_simulated_and_stepped() -> None:

@@ -5,7 +5,7 @@ import signal
 import numpy as np
 import pytest
 
-from drivers.errors import PreflightRefused
+from drivers.errors import LimitHit
 from tdhil.commands.field_bench import SimulatedFieldBench, bench_rig, plant_of
 from tdhil.errors import Interrupted
 from tdhil.study.field import FieldRun
@@ -46,7 +46,7 @@ def test_progress_rises_to_one():
 
 
 def test_what_does_not_fit_is_refused_with_the_limit():
-    with pytest.raises(PreflightRefused, match="torque limit"):
+    with pytest.raises(LimitHit, match="torque limit"):
         run(amplitude_rad_s=1.5)
 
 

@@ -35,7 +35,9 @@ def with_confidence(doubts: dict[str, Confidence]) -> ModbusProfile:
     parameters = tuple(changed(f"parameters.{one.name}", one) for one in PLAIN.parameters)
     filters = tuple(changed(f"filters.{one.signal}", one) for one in PLAIN.filters)
     echoes = tuple(changed(f"echoes.{one.setpoint}", one) for one in PLAIN.echoes)
-    found = {**top, "cycle": changed("cycle", cycle), "parameters": parameters, "filters": filters, "echoes": echoes}
+    temperatures = tuple(changed(f"temperatures.{number}", one) for number, one in enumerate(PLAIN.temperatures))
+    found = {**top, "cycle": changed("cycle", cycle), "parameters": parameters, "filters": filters, "echoes": echoes,
+             "temperatures": temperatures}
     return cast(ModbusProfile, PLAIN.model_copy(update=found))
 
 
