@@ -56,7 +56,11 @@ def messages_of(error: ValidationError, data: Any, model: type[BaseModel]) -> li
 
 def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> list[tuple[Path, int, str]]:
     items = [dict(item) for item in error.errors(include_url=False)]
-    found = [explained for item in items if item["type"] not in _WANTED for explained in _explain(item, tree, model)]
+    listed: set[Path] = set()          # sections whose known keys were told: once is enough
+    found = [
+        explained for item in items if item["type"] not in _WANTED
+        for explained in _explain(item, tree, model, listed)
+    ]
     unions: dict[Path, list[str]] = {}
     for item in items:
         if item["type"] in _WANTED:      # a union gives one of these for each of its members
@@ -104,7 +108,9 @@ def _section_of(annotation: Any) -> type[DataModel] | None:
     return models[0] if len(models) == 1 else None
 
 
-def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterator[tuple[Path, int, str]]:
+def _explain(
+    item: dict[str, Any], tree: Tree, model: type[BaseModel], listed: set[Path]
+) -> Iterator[tuple[Path, int, str]]:
     kind, path = item["type"], path_in_file(item, tree)
     if kind == CROSS_FIELD:
         for at, message in item["ctx"]["findings"]:
@@ -115,7 +121,10 @@ def _explain(item: dict[str, Any], tree: Tree, model: type[BaseModel]) -> Iterat
         if said := _never_here(model, path[:-1]).get(key):
             yield path, tree.line(path), said
             return
-        yield path[:-1], tree.line(path), f"unknown key '{_clean(key)}'{_meant(key, known)}"
+        said = _meant(key, known, listed=path[:-1] not in listed)
+        if _nearest(key, known) is None:
+            listed.add(path[:-1])
+        yield path[:-1], tree.line(path), f"unknown key '{_clean(key)}'{said}"
     elif kind == "missing":
         key = str(item["loc"][-1])
         yield path, tree.line(path), f"'{key}' is missing{_description(model, path, key)}"
@@ -186,9 +195,13 @@ def _shown(value: Any) -> str:
 
 
 def _meant(word: str, known: list[str], *, listed: bool = True) -> str:
-    if close := difflib.get_close_matches(word[:80], known, n=1):
-        return f"; did you mean '{close[0]}'?"
+    if (near := _nearest(word, known)) is not None:
+        return f"; did you mean '{near}'?"
     return f"; known here: {', '.join(known)}" if listed and known else ""
+
+
+def _nearest(word: str, known: list[str]) -> str | None:
+    return next(iter(difflib.get_close_matches(word[:80], known, n=1)), None)
 
 
 def _dotted(path: Path) -> str:

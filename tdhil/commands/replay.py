@@ -114,7 +114,7 @@ def _run_log(namespace: argparse.Namespace, path: Path) -> int:
 def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
     """A run that was refused, or ended in setup, holds nothing to identify from: what ended it is all to be said.
 
-    Raises NothingRecorded, with that run's own exit code; a signal or a mistake that ended that run is none of this one.
+    Raises NothingRecorded with that run's own exit code, but for one that tells of a process and not of a run.
     """
     from tdhil.record.errors import NothingRecorded
 
