@@ -1,6 +1,6 @@
 """One setting for every property test: the same examples at every run. TDHIL_FUZZ=1 looks for new ones instead.
 
-The longest cases run with --long only, which the header of every run says.
+The longest cases run with --long only, heavy ones in CI (--heavy: those alone), which the header of every run says.
 
 And Ctrl-C as usual: a shell that starts the tests in the background has it ignored, which every child would inherit.
 """
@@ -44,6 +44,26 @@ LONG = re.compile(
 )
 """More cases of what others show already, and minutes of it: with --long."""
 
+HEAVY = re.compile(
+    r"protocol/test_design\.py::test_(it_repeats|stated_lags|the_chosen_motion.*\[(servo|heavy))"
+    r"|path/test_field_rig\.py::.*(_inertia\[1\]|_identified\[1\])"
+    r"|path/test_modbus_profiles\.py::.*\[siemens/(g120|s120)"
+    r"|path/test_two_kernels\.py"
+    r"|path/test_kill_at_random\.py"
+    r"|path/test_stop_command\.py::test_(while_a_run|a_stepped_drive|where_nobody_is_reached\[json)"
+    r"|path/test_stops\.py::test_(a_run_killed_late|a_signal_in_each_stage\[(SIGINT-(torque|speed)|SIGTERM)|a_dead_sim)"
+    r"|path/test_streams\.py::test_nothing_is_loaded_once_the_shaft_may_move\[fault1"
+    r"|path/test_real_peer\.py::test_a_wrong_word_moves_nothing\[(?!MOVE)"
+    r"|path/test_five_stages\.py::.*(\[socketcand\]|test_ctrl_c)"
+    r"|protocol/test_deaf\.py::.*--tolerance"
+    r"|identify/test_bent_friction\.py::test_on_a_rig_with_stribeck"
+    r"|identify/test_properties\.py::test_finds_the_truth_of_the_closed_form"
+    r"|study/test_coverage(_interrupted)?\.py::test_(a_small_version.*\[4-|ctrl_c)"
+    r"|study/test_field_amplitudes\.py::"
+    r"|faults/test_modbus_tcp\.py::test_a_(connection_that_dies|killed_host)"
+)
+"""Half a minute each, or more of the same: left out of the README's command, run by .ci/run."""
+
 TOGETHER = re.compile(
     r"study/test_(field_amplitudes|field_slopes|field_loops|tables|figures)\.py"
     r"|path/test_(report|cli_modbus|replay_csv)\.py"
@@ -55,6 +75,7 @@ TOGETHER = re.compile(
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="also the cases that are left out for their time")
+    parser.addoption("--heavy", action="store_true", help="only the heavy cases, which CI runs beside the README's")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -73,12 +94,15 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("--long"):
         return
-    left_out = [item for item in items if LONG.search(item.nodeid)]
+    heavy = config.getoption("--heavy")
+    left_out = [item for item in items if LONG.search(item.nodeid) or bool(HEAVY.search(item.nodeid)) is not heavy]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not LONG.search(item.nodeid)]
+        items[:] = [item for item in items if item not in set(left_out)]
 
 
 def pytest_report_header(config: pytest.Config) -> str:
-    done = "run too" if config.getoption("--long") else "LEFT OUT, see LONG in tests/conftest.py (--long)"
-    return f"long cases: {done}"
+    if config.getoption("--long"):
+        return "long and heavy cases: run too"
+    heavy = "ONLY THESE" if config.getoption("--heavy") else "LEFT OUT, run by .ci/run (--heavy)"
+    return f"long cases: LEFT OUT, see LONG in tests/conftest.py (--long); heavy cases: {heavy}"

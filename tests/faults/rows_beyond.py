@@ -36,7 +36,8 @@ STRANGERS = "tests/drivers/test_strangers.py::"
 SECOND_MASTER: dict[int, Row] = {
     56: Row("another node bears the host's number: its heartbeat feeds the drive's watchdog",
             "a free number from the start; QS in motion, however slow it is", "0, 5",
-            (f"{SECOND}test_noticed_and_stopped", f"{SECOND}test_a_number_that_is_taken_from_the_start",
+            (f"{SECOND}test_noticed_and_stopped",
+             f"{SECOND}test_a_number_that_is_taken_from_the_start_is_not_the_host_s",
              f"{STRANGERS}test_a_number_that_another_node_bears_is_not_taken",
              f"{STRANGERS}test_one_that_comes_before_motion_is_refused")),
     57: Row("a tool writes watchdog or reaction in motion", "read back at once, QS", "5",
@@ -72,18 +73,18 @@ MODBUS: dict[int, Row] = {
     66: Row(
         "Modbus drive whose watchdog any client's request feeds: a reader keeps it running when the host is killed",
         "R, unless the operator accepts it by name; requests of others are counted where the drive counts them", "4",
-        (HERE + "test_modbus_second_master.py",),
+        (HERE + "test_modbus_second_master.py::test_row_66_refused_unless_taken_by_name",),
     ),
     67: Row(
         "another master writes control word and setpoints over Modbus in motion, 5 to 100 times a second",
         "noticed by reading them back; QS that stands against it (stop word repeated, the drive's own speed limit"
         " lowered along the ramp); 8 where that one still commands at the end", "5, 8",
-        (HERE + "test_modbus_second_master.py",),
+        (HERE + "test_modbus_second_master.py::test_row_67_another_master_commands",),
     ),
     68: Row(
         "somebody sets the Modbus watchdog, its reaction or a limit in motion",
         "read back during the run: QS, naming register, old and new value", "5",
-        (HERE + "test_modbus_second_master.py",),
+        (HERE + "test_modbus_second_master.py::test_row_68_somebody_changes_a_setting_in_motion",),
     ),
     69: Row(
         "the drive's own torque or speed limit, or quick stop, is tighter than rig.yaml's (Modbus)",
@@ -108,7 +109,7 @@ MODBUS: dict[int, Row] = {
     72: Row(
         "RTU: every fifth reply is damaged from some time in motion on",
         "asked for once more within the cycle; whatever ends the run, standstill is seen and confirmed", "0, 5, 9",
-        (HERE + "test_modbus_noise.py",),
+        (HERE + "test_modbus_noise.py::test_row_72_it_comes_to_rest_and_that_is_confirmed",),
     ),
     73: Row(
         "Modbus TCP: every reply comes twice; foreign replies again and again; a new connection isn't answered",
@@ -123,15 +124,15 @@ MODBUS: dict[int, Row] = {
 UNITS: dict[int, Row] = {
     74: Row("profile's unit of speed too small by 2 to 10, and no object of the drive contradicts it",
             "found at walking pace by the drive's angle, with its factor; the true shaft stays below speed_max", "4",
-            (HERE + "test_speed_unit.py",)),
+            (HERE + "test_speed_unit.py::test_the_angle_shows_a_unit_that_is_too_small",)),
     75: Row("the same in a drive that tells no angle", "the operator is asked at speed_max/20; his no ends it", "4",
-            (HERE + "test_speed_unit.py",)),
+            (HERE + "test_speed_unit.py::test_without_an_angle_the_operator_says_no",)),
     76: Row("the same, with nobody at a terminal", "R at that speed, unless the unit is taken by name", "4",
-            (HERE + "test_speed_unit.py",)),
+            (HERE + "test_speed_unit.py::test_without_an_angle_and_with_nobody_there",)),
     77: Row("the drive's angle counts against its reported speed", "R, naming the sign", "4",
-            (HERE + "test_speed_unit.py",)),
+            (HERE + "test_speed_unit.py::test_an_angle_that_counts_backwards",)),
     78: Row("the drive's angle stands still while it reports that the shaft turns", "the operator is asked", "4",
-            (HERE + "test_speed_unit.py",)),
+            (HERE + "test_speed_unit.py::test_an_angle_that_stands_still_is_put_to_the_operator",)),
 }
 
 STAGES: dict[int, Row] = {
