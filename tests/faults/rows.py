@@ -68,7 +68,7 @@ FIFTY = {
     18: Row("duplicated or reordered PDO", "found, M", "0, 9",
             (f"{HERE}test_rows_scripted.py::test_row_with_a_run_that_goes_on",
              f"{GUARD}test_row_18_duplicated_or_late_feedback_is_found")),
-    19: _scripted("frozen feedback (stale TPDO)", "age limit, QS", "5",
+    19: _scripted("frozen feedback (stale TPDO)", "age limit, QS", "5, 8",
                   f"{GUARD}test_row_19_no_feedback_any_more",
                   f"{GUARD}test_row_19_the_same_feedback_again_and_again"),
     20: _scripted("drive heartbeat lost", "QS attempt", "5", f"{GUARD}test_rows_20_to_23_what_the_driver_raises"),

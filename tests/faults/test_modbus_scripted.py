@@ -37,7 +37,7 @@ class Case:
 
 
 CASES = (
-    Case(19, "frozen-feedback@acquire+2s", 5, ("frozen", "gateway"), notice_s=2.0),
+    Case(19, "frozen-feedback@acquire+2s", 8, ("frozen", "gateway"), notice_s=2.0),
     Case(23, "drive-fault@torque+3s", 6, ("fault", "--reset-fault")),
     Case(30, "fault-at-start", 4, ("fault", "--reset-fault"), "refused"),
     Case(31, "stuck-state@setup", 6, ("within 3 s of enabling",), "refused"),
