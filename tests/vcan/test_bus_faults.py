@@ -136,7 +136,7 @@ def test_frames_are_lost_on_the_way(tmp_path, vcan, tool, ip, lost, there, back,
 
 
 def test_setpoints_alone_are_lost(tmp_path, vcan, tool, ip):
-    """The drive goes on with its last one and hears no quick stop in that frame: one by SDO ends it, or its watchdog."""
+    """The drive goes on with its last one and hears no quick stop in that frame: an SDO ends it, or its watchdog."""
     with bridged(ip, tool("cangw"), vcan) as (other, only), simulated(tmp_path, other) as drive:
         done, _ = run_into(lambda: only(but(0x201), ()), tmp_path, drive, vcan)
         shaft = assert_safe(drive)
