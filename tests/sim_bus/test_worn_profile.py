@@ -24,19 +24,24 @@ def guard(host: Any) -> bytes:
     return host.wait(0x701)
 
 
+def map_pdo(host: Any, communication: int, mapping: int, cob: int, entries: tuple[int, ...]) -> None:
+    """Off, emptied, filled, at every SYNC, on (CiA 301)."""
+    host.write(communication, 1, cob | 1 << 31, 4)
+    host.write(mapping, 0, 0, 1)
+    for number, entry in enumerate(entries, 1):
+        host.write(mapping, number, entry, 4)
+    host.write(mapping, 0, len(entries), 1)
+    host.write(communication, 2, 1, 1)
+    host.write(communication, 1, cob, 4)
+
+
 def s120_in_motion(host: Any) -> None:
     """RPDO1 6040 + 60FF, TPDO1 6041 + 5810 + 606C at every SYNC, 10 ms each; turning at one turn a second."""
     for communication, mapping, cob, entries in (
         (0x1400, 0x1600, 0x201, (0x60400010, 0x60FF0020)),
         (0x1800, 0x1A00, 0x40000181, (0x60410010, 0x58100010, 0x606C0020)),
     ):
-        host.write(communication, 1, cob | 1 << 31, 4)
-        host.write(mapping, 0, 0, 1)
-        for number, entry in enumerate(entries, 1):
-            host.write(mapping, number, entry, 4)
-        host.write(mapping, 0, len(entries), 1)
-        host.write(communication, 2, 1, 1)
-        host.write(communication, 1, cob, 4)
+        map_pdo(host, communication, mapping, cob, entries)
     host.write(MARKER_INDEX, 3, 10_000, 4)
     host.nmt(1)
     for word in (0x06, 0x07, 0x0F):
@@ -217,13 +222,7 @@ def test_velocity_mode_follows_its_setpoint_only_where_it_is_released(bench: Ope
         (0x1400, 0x1600, 0x201, (0x60400010, 0x60420010)),
         (0x1800, 0x1A00, 0x40000181, (0x60410010, 0x60770010, 0x60440010)),
     ):
-        host.write(communication, 1, cob | 1 << 31, 4)
-        host.write(mapping, 0, 0, 1)
-        for number, entry in enumerate(entries, 1):
-            host.write(mapping, number, entry, 4)
-        host.write(mapping, 0, len(entries), 1)
-        host.write(communication, 2, 1, 1)
-        host.write(communication, 1, cob, 4)
+        map_pdo(host, communication, mapping, cob, entries)
     host.write(MARKER_INDEX, 3, 10_000, 4)
     host.write(0x6060, 0, 2, 1)
     host.nmt(1)
