@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from drivers.drive import Command, Mode, Positioned, PositionReading, Sample
 from drivers.errors import PreflightRefused
@@ -207,10 +207,11 @@ class SpeedLook:
         believed = max(abs(command.speed_rad_s), abs(sample.speed_rad_s))
         if seen is None or seen[0] <= fastest or seen[0] <= TOO_FAST * believed:
             return
-        raise self._refused(
+        self._refuse(
             f"the shaft's angle moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s were asked"
             f" for and {sample.speed_rad_s:.3g} are reported: the unit of speed is too small by a factor of about"
-            f" {seen[0] / believed:.2g}"
+            f" {seen[0] / believed:.2g}",
+            command,
         )
 
     # -- waiting, comparing, asking --------------------------------------------------------------------------
@@ -241,7 +242,7 @@ class SpeedLook:
                     self._judge(ratio, command)
                     return
             if self._too_fast(speed_rad_s):
-                raise self._refused(f"the shaft's angle moves too fast for the {speed_rad_s:.3g} rad/s asked for")
+                self._refuse(f"the shaft's angle moves too fast for the {speed_rad_s:.3g} rad/s asked for", command)
         self._ask(command)
 
     def _judge(self, ratio: Ratio, command: Command) -> None:
@@ -250,13 +251,13 @@ class SpeedLook:
         if value == 0.0:
             self._lost = f"the angle in {self._angles.where} doesn't move while the drive reports that the shaft turns"
             if self._onlooker.simulated and not self._onlooker.accepted:
-                raise self._refused(self._lost)
+                self._refuse(self._lost, command)
             self._ask(command)
             return
         open_share = 0.5 * self._resolution_rad_s / max(abs(command.speed_rad_s), 1e-9) + ratio.half_width
         off = abs(value - 1.0)
         if off > TOLERANCE + open_share:
-            self._contradicted(value)
+            self._contradicted(value, command)
         else:
             self._seen(BY_POSITION, value, self._angles.where)
             self._log(f"the angle in {self._angles.where} moves {value:.4f} times as far as the reported speed says")
@@ -267,7 +268,7 @@ class SpeedLook:
                 )
         self._done = True
 
-    def _contradicted(self, value: float) -> None:
+    def _contradicted(self, value: float, command: Command) -> None:
         """Too fast for the second mean speed: refused in any case; else unless the unit was taken by name."""
         if value < 0.0:
             what = f"the shaft's angle moves against the reported speed ({value:.3g} of its way): a sign is inverted"
@@ -279,13 +280,20 @@ class SpeedLook:
         span = self._limits.speed_max_rad_s - self._limits.speed_min_rad_s
         fastest = abs(value) * (self._limits.speed_min_rad_s + 0.7 * span)
         if not self._onlooker.accepted or fastest > self._limits.speed_max_rad_s:
-            raise self._refused(what, step)
+            self._refuse(what, command, step)
         self._seen(BY_NAME, value, self._angles.where)
         self._log(f"{what}; the unit was accepted by {BY_NAME}")
         self._onlooker.say(f"{what}; the unit was accepted by {BY_NAME}")
 
-    def _refused(self, what: str, step: str = _CHECK + _IF_RIGHT) -> PreflightRefused:
-        return PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
+    def _refuse(self, what: str, command: Command, step: str = _CHECK + _IF_RIGHT) -> NoReturn:
+        """Raise PreflightRefused, behind one more cycle, which raises what is wrong with the drive or the host.
+
+        An angle that was read when a frozen host woke up, or of a drive that has stopped by itself since its last
+        sample, says nothing of a unit.
+        """
+        self._bench.beside = None
+        self._bench.cycle(command)
+        raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
 
     def _ask(self, command: Command) -> None:
         """The operator says whether the shaft turns as fast as the drive reports. Raises PreflightRefused if not."""
@@ -298,9 +306,10 @@ class SpeedLook:
         seen = bench.hold(command, SEEN_S)
         mean_rad_s = sum(sample.speed_rad_s for sample in seen) / len(seen)
         if abs(mean_rad_s) < 0.2 * abs(command.speed_rad_s):
-            raise self._refused(
+            self._refuse(
                 f"the shaft doesn't follow a speed of {command.speed_rad_s:.3g} rad/s (reported: {mean_rad_s:.3g}), at"
                 f" which its unit could be looked at ({why})",
+                command,
                 f"Does the drive hold so low a speed? If its unit has been seen to be right, take it by {BY_NAME}",
             )
         self._log(f"{why}: the operator is asked whether the shaft turns at {mean_rad_s:.3f} rad/s")

@@ -15,7 +15,7 @@ from fake_drive import FakeDisplay, FakeLog
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.errors import PreflightRefused
+from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_canopen_profile, load_modbus_profile
@@ -67,6 +67,25 @@ class Unmarked:
     def preflight(self, limits):
         found = self._drive.preflight(limits)
         return replace(found, identity=replace(found.identity, simulated=False))
+
+
+class Waking(Unmarked):
+    """Stands for a host that was frozen: an angle far ahead, read of a drive that has stopped by itself meanwhile."""
+
+    def __init__(self, drive, reading):
+        super().__init__(drive)
+        self._left = reading
+
+    def read_position(self):
+        self._left -= 1
+        found = super().read_position()
+        return found if self._left > 0 else found._replace(position_rad=found.position_rad + 20.0)
+
+    def exchange(self, command):
+        if self._left <= 0:
+            self._left = math.inf
+            raise CommunicationLost("the drive's watchdog stopped it", where="a test")
+        return self._drive.exchange(command)
 
 
 class Rig:
@@ -357,6 +376,17 @@ def test_an_angle_that_stands_still_is_put_to_the_operator(made, seen):
     assert "doesn't move" in why
     assert_stopped_in_time(rig)
     seen(78, f"{why}; {cause.what}", code=4)
+
+
+@both
+@pytest.mark.parametrize("reading", [3, 12, 40])
+def test_an_angle_read_on_waking_up_is_no_wrong_unit(made, bus, reading):
+    """What stopped the drive is told."""
+    rig = made(bus, 1.0)
+    rig.drive = Waking(rig.drive, reading)
+    cause = rig.run().cause
+    assert isinstance(cause, CommunicationLost), cause
+    assert "watchdog" in cause.what
 
 
 def test_an_angle_that_stands_still_in_a_simulated_drive(made):
