@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from threading import Event, Thread
-from typing import Any, Generic, Protocol, TypeVar
+from threading import Event
+from typing import Any, Protocol, TypeVar
 
 from drivers.drive import Command, Drive, Mode, PowerState, Sample, Telling
 from drivers.errors import DriveFault, ModeNotConfirmed
 from tdhil.errors import Interrupted
+from tdhil.protocol.beside import Beside, Reckoner
 from tdhil.protocol.guard import Guard
 from tdhil.protocol.settings import StopRequest
 
@@ -21,8 +21,9 @@ ALIVE_S = 0.2
 SWITCH_CYCLES = 10
 """A drive on a slow line gets so many cycles for a switch of its mode: asked, done, seen, and some that were lost."""
 
-SWITCH_S = 0.0005
-"""How long arithmetic beside the control loop may keep the interpreter to itself."""
+
+NO_RECKONER = "arithmetic goes on in a thread beside the control loop, not in a process of its own"
+"""Said in the log, with the reason. Cycles may be late meanwhile, and it is no more than that."""
 
 
 class RunLog(Protocol):
@@ -52,6 +53,7 @@ class Bench:
         self.last: Sample | None = None
         self.beside: Watcher | None = None         # what a stage does beside every cycle, behind the guard
         self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
+        self.reckoner: Reckoner | None = None      # where longer arithmetic is done in real time; None: in a thread
         self.remarks: list[str] = []       # what others did on the drive's bus
         self._telling = drive if isinstance(drive, Telling) else None
         self._stop_request = stop_request
@@ -143,25 +145,39 @@ class Bench:
         """Do a longer piece of arithmetic without letting the drive starve of setpoints: ``cycle`` is one of them.
 
         In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
-        there, signs of life that move no time on are all that goes out. In real time the arithmetic has to hand over
-        the interpreter sooner than usual, or cycles would come late; on a computer of one processor they do all the
-        same, and that alone doesn't end the run.
+        there, signs of life that move no time on are all that goes out. In real time a process of its own does it
+        where one stands ready and understands the ``work`` (`beside.Reckoner.ask`): a thread shares the interpreter,
+        and cycles come late beside it. They may all the same on a computer of one processor, and that alone doesn't
+        end the run.
 
         Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
-        may be turning without a setpoint meanwhile. It goes on by itself, beside the stop, and what comes of it is
-        dropped.
+        may be turning without a setpoint meanwhile. A process is killed; a thread goes on by itself, beside the stop,
+        and what comes of it is dropped.
         """
-        beside = _Beside(work)
+        beside = Beside(work, None if self.drive.clock.stepped else self.reckoner)
+        told = False
         self.guard.reckoning = True
         try:
             while not beside.ended.is_set():
+                if beside.instead and not told:
+                    self.no_reckoner(beside.instead)
+                    told = True
                 if self.drive.clock.stepped:
                     self._wait_alive(beside.ended)
                 else:
                     cycle()
+        except BaseException:
+            beside.drop()
+            raise
         finally:
             self.guard.reckoning = False
+        if beside.instead and not told:
+            self.no_reckoner(beside.instead)
         return beside.result()
+
+    def no_reckoner(self, why: str) -> None:
+        """Note that arithmetic has to share this process with the control loop."""
+        self.log.event(self.now_s, "host", f"{NO_RECKONER}: {why}")
 
     def _wait_alive(self, ended: Event) -> None:
         """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
@@ -170,36 +186,3 @@ class Bench:
         keep_alive = getattr(self.drive, "keep_alive", None)
         if not ended.wait(ALIVE_S) and keep_alive is not None:
             keep_alive()
-
-
-class _Beside(Generic[T]):
-    """Work in a thread of its own, begun at once, that nobody has to wait for: neither a stop nor the process's end.
-
-    As long as it runs, whoever controls the shaft gets the interpreter sooner than usual, also once the work has been
-    left alone.
-    """
-
-    def __init__(self, work: Callable[[], T]) -> None:
-        self.ended = Event()
-        self._work = work
-        self._found: list[T] = []
-        self._failure: BaseException | None = None
-        self._usual_s = sys.getswitchinterval()
-        sys.setswitchinterval(min(self._usual_s, SWITCH_S))
-        # A pool's threads are joined when the interpreter ends; a daemon is not.
-        Thread(target=self._run, name="tdhil-beside", daemon=True).start()
-
-    def result(self) -> T:
-        """Once it has ended: what it gave, or raises what it raised."""
-        if self._failure is not None:
-            raise self._failure
-        return self._found[0]
-
-    def _run(self) -> None:
-        try:
-            self._found.append(self._work())
-        except BaseException as error:         # raised where the result is asked for
-            self._failure = error
-        finally:
-            sys.setswitchinterval(self._usual_s)
-            self.ended.set()

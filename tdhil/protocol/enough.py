@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from statistics import NormalDist
 from typing import Any
 
@@ -55,11 +56,11 @@ class Enough:
     decisions: list[Decision] = field(default_factory=list)
 
     def question(self, spent_s: float) -> Callable[[], Decision]:
-        """The work of one look, to be done in any thread; the samples are taken now."""
+        """The work of one look, to be done in any thread or process; the samples are taken now."""
         recording, rule = self.snapshot(), self.stopping
         left_s = rule.allowed_s - spent_s
         seen = self.decisions[-1].seen if self.decisions else 0
-        return lambda: decide(recording, rule, self.plan, left_s, len(self.decisions), seen)
+        return partial(decide, recording, rule, self.plan, left_s, len(self.decisions), seen)
 
     def decided(self, decision: Decision) -> int:
         """Keep and tell a decision; the periods that it asks for."""

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 from drivers.drive import Command, Mode
 from drivers.errors import LimitHit, PreflightRefused
+from tdhil.identify.samples import Samples
 from tdhil.protocol import excitation
 from tdhil.protocol.bench import Bench
-from tdhil.protocol.design import Knowledge, assumed_noise, measured_noise
+from tdhil.protocol.design import Knowledge, Noise, assumed_noise, measured_noise
 from tdhil.protocol.enough import Decision, Enough
-from tdhil.protocol.excitation import Plan, PlanRefused, SwingPlan
+from tdhil.protocol.excitation import Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.protocol.guard import Guard
 from tdhil.protocol.planning import Planned, as_followed, plan_acquisition
-from tdhil.protocol.stage_speed import SpeedResult
+from tdhil.protocol.settings import ExcitationRequest
+from tdhil.protocol.stage_speed import Course, SpeedResult
 from tdhil.protocol.task import Display, Say, Task
-from tdhil.record.recording import LagPrior, SteppedSetpoint
+from tdhil.record.recording import FloatArray, LagPrior, SteppedSetpoint
 from tdhil.record.run_log import RunLog
 
 RESERVE_S = 30.0
@@ -51,13 +54,7 @@ class StagePlanner:
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
         theta = Knowledge(assumed, prior).theta(model)
 
-        def work() -> Planned:
-            known = Knowledge(measured_noise(speed.steady, theta, assumed), prior)
-            if course is None:
-                return plan_acquisition(request, mode.value, room, model, known, left_s)
-            seen, within = as_followed(model, room, course, known.speed_lag_s)
-            return plan_acquisition(request, mode.value, within, seen, known, left_s)
-
+        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course, left_s)
         try:
             planned = bench.compute(work, keep)
         except PlanRefused as error:
@@ -120,3 +117,23 @@ class StagePlanner:
     def _tell(self, text: str) -> None:
         self._log.event(self._bench.now_s, "plan", text)
         self._say(text)
+
+
+def _reckon(
+    request: ExcitationRequest,
+    mode: Mode,
+    room: excitation.MachineLimits,
+    model: RigGuess,
+    prior: LagPrior,
+    assumed: Noise,
+    steady: tuple[Samples, ...],
+    theta: FloatArray,
+    course: Course | None,
+    left_s: float,
+) -> Planned:
+    """The arithmetic: plain data in and out, so that it can be done anywhere."""
+    known = Knowledge(measured_noise(steady, theta, assumed), prior)
+    if course is None:
+        return plan_acquisition(request, mode.value, room, model, known, left_s)
+    seen, within = as_followed(model, room, course, known.speed_lag_s)
+    return plan_acquisition(request, mode.value, within, seen, known, left_s)

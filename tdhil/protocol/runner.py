@@ -14,6 +14,7 @@ from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog, others
 from tdhil.protocol.bench import Bench
+from tdhil.protocol.beside import Reckoner, begin
 from tdhil.protocol.braking_probe import NOT_YET, slow_down
 from tdhil.protocol.choose_mode import choose_mode, keep_within, no_torque
 from tdhil.protocol.choose_rate import choose_rate, quieten
@@ -70,6 +71,7 @@ class Runner:
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._prior = LagPrior()
+        self._reckoner: Reckoner | None = None
 
     def run(self) -> RunOutcome:
         """Connect, five stages, stop, close."""
@@ -81,6 +83,8 @@ class Runner:
             cause = error
             self._log_failure(error)
         finally:
+            if self._reckoner is not None:
+                self._reckoner.end()
             if self._stop is not None:
                 report = self._stop.run()
                 with suppress(Exception):
@@ -102,6 +106,8 @@ class Runner:
                 with suppress(Exception):
                     for line in left:
                         self._log.event(self._drive.clock.now_s(), "left", f"not given back: {line}")
+            if self._reckoner is not None:
+                self._reckoner.close()
         return RunOutcome(tuple(self._book.stages), cause, report, self._book.preflight)
 
     # -- the stages ------------------------------------------------------------------------------------------
@@ -185,8 +191,9 @@ class Runner:
         if self._reset_fault:
             self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
             self._drive.reset_fault()
+        no_reckoner = ""
         if not self._drive.clock.stepped:
-            quieten()
+            no_reckoner = self._make_ready()
         preflight = self._book.preflight = self._drive.preflight(
             Limits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
@@ -235,7 +242,19 @@ class Runner:
         )
         guard.no_braking = NOT_YET
         guard.host_late = getattr(self._drive, "host_late", guard.host_late)
-        return task, Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle), preflight
+        bench = Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle)
+        bench.reckoner = self._reckoner
+        if no_reckoner:
+            bench.no_reckoner(no_reckoner)
+        return task, bench, preflight
+
+    def _make_ready(self) -> str:
+        """Load and start whatever would hold the loop up later; why there is no process for arithmetic, if so."""
+        stop_request = self._stop_request
+        self._reckoner, why = begin(quieten, lambda: stop_request.signum is not None)
+        if stop_request.signum is not None:
+            raise Interrupted(stop_request.signum)
+        return why
 
     def _choose_rate(self) -> None:
         """Where nobody has named it and this computer's clock is what counts: the highest that holds."""

@@ -70,14 +70,14 @@ def test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on():
     program = """
 import threading
 import numpy as np
-from tdhil.protocol.bench import _Beside
+from tdhil.protocol.beside import Beside
 begun = threading.Event()
 def work():
     square = np.eye(200)
     begun.set()
     while True:
         square = square @ square
-_Beside(work); _Beside(work)
+Beside(work); Beside(work)
 begun.wait()
 print("left alone")
 """
