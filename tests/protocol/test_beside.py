@@ -96,8 +96,10 @@ def test_it_gives_what_the_function_gives_and_raises_what_it_raises(live):
     assert texts(live) == []
 
 
-@pytest.mark.parametrize("request_", [ExcitationRequest(periods=2, mode="speed"), ExcitationRequest(tolerance=0.05, frequency_hz=0.5)])
-def test_the_plan_is_the_one_that_a_thread_makes(world, reckoner, monkeypatch, request_):
+@pytest.mark.parametrize(
+    "wish", [ExcitationRequest(periods=2, mode="speed"), ExcitationRequest(tolerance=0.05, frequency_hz=0.5)]
+)
+def test_the_plan_is_the_one_that_a_thread_makes(world, reckoner, monkeypatch, wish):
     """To the last bit, all that is logged of it included."""
     asked = []
 
@@ -106,7 +108,7 @@ def test_the_plan_is_the_one_that_a_thread_makes(world, reckoner, monkeypatch, r
         raise Interrupted(signal.SIGINT)
 
     monkeypatch.setattr(plan_stage.Bench, "compute", compute)
-    world().runner(request_).run()
+    world().runner(wish).run()
     (work,) = asked
     there, here = reckoner.ask(work), work()
     assert pickle.dumps(there.plain()) == pickle.dumps(here.plain())
