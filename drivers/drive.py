@@ -182,7 +182,8 @@ class Drive(Protocol):
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
 
-    A drive may also be a `Looking`, a `Telling` and a `Positioned` one, and one that `StopsFeeding`.
+    A drive may also be `Looking`, `Telling`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and one that
+    `StopsFeeding`.
     """
 
     @property
@@ -245,6 +246,27 @@ class StopsFeeding(Protocol):
     """
 
     def stop_feeding(self) -> None: ...
+
+
+@runtime_checkable
+class KeptAlive(Protocol):
+    """A drive whose peer, in stepped time, must hear of a host that reckons for a while; no time passes by it."""
+
+    def keep_alive(self) -> None: ...
+
+
+@runtime_checkable
+class Rehearsed(Protocol):
+    """A drive that tells a simulated peer which stage begins: scripted faults wait for that."""
+
+    def announce(self, stage: str) -> None: ...
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """A drive that knows whether this computer has been late; in words then, and empty else."""
+
+    def host_late(self) -> str: ...
 
 
 @runtime_checkable

@@ -17,7 +17,7 @@ from typing import Any
 
 from drivers.errors import DataFileError, Problem
 from tdhil.errors import UsageError
-from tdhil.options import Setting
+from tdhil.options import Origin, Setting
 from tdhil.rig import Rig, bit_rate_problem
 
 _FLAGS = {
@@ -78,7 +78,7 @@ def bus_config(cli: Mapping[str, Any], rig: Rig | None = None) -> BusConfig:
     for source in (_from_cli(cli), _from_rig(rig), _from_environment(), _from_files()):
         for name, setting in source.items():
             settings.setdefault(name, setting)
-    if not settings.get("interface", Setting(None, "")).value:
+    if "interface" in settings and not settings["interface"].value:
         settings.pop("interface", None)
     _check(settings)
     first = [name for name in ("interface", "channel", "bitrate") if name in settings]
@@ -87,9 +87,9 @@ def bus_config(cli: Mapping[str, Any], rig: Rig | None = None) -> BusConfig:
 
 
 def _from_cli(cli: Mapping[str, Any]) -> dict[str, Setting]:
-    found = {name: Setting(cli[name], flag) for name, flag in _FLAGS.items() if cli.get(name) is not None}
+    found = {name: Setting.by_flag(cli[name], flag) for name, flag in _FLAGS.items() if cli.get(name) is not None}
     for name, value in (cli.get("bus_kwargs") or {}).items():
-        found.setdefault(name, Setting(value, "--bus-kwargs"))
+        found.setdefault(name, Setting.by_flag(value, "--bus-kwargs"))
     return found
 
 
@@ -99,14 +99,17 @@ def _from_rig(rig: Rig | None) -> dict[str, Setting]:
     found = {}
     for name in ("interface", "channel", "bitrate"):
         if (value := getattr(rig.bus, name)) is not None:
-            found[name] = Setting(value, rig.source(f"bus.{name}") or "rig")
+            found[name] = Setting.by_rig(value, rig, f"bus.{name}")
     for name, value in rig.bus.options.items():
-        found.setdefault(name, Setting(value, rig.source(f"bus.options.{name}") or "rig"))
+        found.setdefault(name, Setting.by_rig(value, rig, f"bus.options.{name}"))
     return found
 
 
 def _from_environment() -> dict[str, Setting]:
-    found = {name: Setting(_cast(value), key) for name, key in _VARIABLES.items() if (value := os.environ.get(key))}
+    found = {
+        name: Setting(_cast(value), key, Origin.BUS_FILE)
+        for name, key in _VARIABLES.items() if (value := os.environ.get(key))
+    }
     text = os.environ.get("CAN_CONFIG")
     if text is None:
         return found
@@ -118,7 +121,7 @@ def _from_environment() -> dict[str, Setting]:
         step = 'Write it like {"interface": "socketcan"}, or unset it'
         raise UsageError("not a JSON object", where="CAN_CONFIG", next_step=step)
     for name, value in more.items():
-        found.setdefault(_option(name), Setting(_cast(value), "CAN_CONFIG"))
+        found.setdefault(_option(name), Setting(_cast(value), "CAN_CONFIG", Origin.BUS_FILE))
     return found
 
 
@@ -129,7 +132,7 @@ def _from_files() -> dict[str, Setting]:
     found: dict[str, Setting] = {}
     for name in CONFIG_FILES:
         for option, value in _section(Path(os.path.expanduser(name))).items():  # noqa: PTH111 (as python-can does)
-            found[_option(option)] = Setting(_cast(value), name)
+            found[_option(option)] = Setting(_cast(value), name, Origin.BUS_FILE)
     return found
 
 

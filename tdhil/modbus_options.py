@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from profiles.modbus_schema import Line, ModbusProfile
 from profiles.yaml_messages import messages_of
 from tdhil.errors import UsageError
-from tdhil.options import Setting
+from tdhil.options import Origin, Setting
 from tdhil.rig import Modbus, Rig
 
 FLAGS = {
@@ -71,6 +71,10 @@ class ModbusConfig:
     def source(self, name: str) -> str:
         return self.settings[name].source if name in self.settings else ""
 
+    def origin(self, name: str) -> Origin | None:
+        """Who said it, None where nobody did."""
+        return self.settings[name].origin if name in self.settings else None
+
     def rows(self) -> Iterator[tuple[str, str, str]]:
         """(option, value, source) to print."""
         for name, setting in self.settings.items():
@@ -85,19 +89,21 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
 
     UsageError where a value can't be used. Without a profile what it would say is left as the standard has it.
     """
-    given = {name: Setting(cli[name], flag) for name, flag in FLAGS.items() if cli.get(name) is not None}
+    given = {name: Setting.by_flag(cli[name], flag) for name, flag in FLAGS.items() if cli.get(name) is not None}
     _check(given)
     settings = dict(given)
     for name in FLAGS:
         if rig is not None and (value := getattr(rig.modbus, name)) is not None:
-            settings.setdefault(name, Setting(value, rig.source(f"modbus.{name}") or "rig"))
+            settings.setdefault(name, Setting.by_rig(value, rig, f"modbus.{name}"))
     for one, other in (("host", "serial"), ("serial", "host")):
         if one in given and other not in given:
             settings.pop(other, None)
-    line, source = (profile.line, f"profile {profile.name}") if profile is not None else (_STANDARD, "default")
+    line, source, origin = _STANDARD, "default", Origin.BUILT_IN
+    if profile is not None:
+        line, source, origin = profile.line, f"profile {profile.name}", Origin.PROFILE
     for name in FLAGS:
         if name not in ("host", "serial"):
-            settings.setdefault(name, Setting(getattr(line, name), source))
+            settings.setdefault(name, Setting(getattr(line, name), source, origin))
     known = RTU if "serial" in settings else TCP if "host" in settings else ("unit",)
     found = ModbusConfig(MappingProxyType({name: settings[name] for name in known if name in settings}))
     for name in given:

@@ -172,6 +172,9 @@ _OPERATORS = {
     "accept_speed_unit": "--accept-speed-unit",
     "reset_fault": "--reset-fault",
 }
+ExcitationKind = Literal["multisine", "sine", "step", "pulses", "coast-down"]
+"""What stage 5 can do."""
+
 _ONLY_THE_OPERATOR = {
     key: f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the command line"
     for key, flag in _OPERATORS.items()
@@ -183,7 +186,7 @@ class Run(DataModel):
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
-    excitation: Literal["multisine", "sine", "step", "pulses", "coast-down"] | None = None
+    excitation: ExcitationKind | None = None
     mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
     frequency_hz: Frequency | None = Field(default=None, description="Hz; base frequency of the excitation")
     amplitude_rad_s: Amplitude | None = Field(default=None, description="rad/s; amplitude of the speed")

@@ -13,7 +13,7 @@ from profiles.modbus_schema import ModbusProfile
 from tdhil.bus_options import BusConfig, bus_config
 from tdhil.errors import UsageError
 from tdhil.modbus_options import ModbusConfig, asked_for, modbus_config
-from tdhil.options import Resolved, Setting
+from tdhil.options import Origin, RunOptions, Setting
 
 if TYPE_CHECKING:
     from profiles.library import Profile
@@ -51,14 +51,14 @@ class Connection:
         return self.modbus.rows() if self.drive == "modbus" else self.bus.rows()
 
 
-def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: Resolved) -> tuple[Resolved, Connection]:
+def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> tuple[RunOptions, Connection]:
     """The options with drive and profile decided, and the way to the drive.
 
     UsageError for options of the other bus, DataFileError for a profile that can't be used.
     """
     options = choose_drive(cli, rig, options)
-    if options["drive"] == "modbus":
-        profile = load_modbus_profile(options["profile"])
+    if options.drive == "modbus":
+        profile = load_modbus_profile(options.profile)
         _refuse_canopen_flags(cli)
         found = Connection(profile, NO_BUS, modbus_config(cli, rig, profile))
         _refuse_the_other_bus(found, rig, options)
@@ -66,14 +66,14 @@ def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: Resolved) ->
     flag = asked_for(cli)
     if flag is not None:
         raise UsageError("belongs to Modbus", where=flag, next_step="Add --drive modbus, or leave it out")
-    found = Connection(load_canopen_profile(options["profile"]), bus_config(cli, rig), NO_MODBUS)
+    found = Connection(load_canopen_profile(options.profile), bus_config(cli, rig), NO_MODBUS)
     _refuse_the_other_bus(found, rig, options)
     return options, found
 
 
-def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: Resolved) -> None:
+def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
     """A rig.yaml that says where a drive is, but on the other bus: nobody meant the simulator. Raises DataFileError."""
-    if rig is None or found.configured or options["simulate"]:
+    if rig is None or found.configured or options.simulate:
         return
     if found.drive == "canopen" and (rig.modbus.host or rig.modbus.serial):
         section, missing = "modbus", "bus: (interface, channel)"
@@ -88,24 +88,24 @@ def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: Resolved)
     ),))
 
 
-def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: Resolved) -> Resolved:
+def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> RunOptions:
     """Who doesn't name the bus has named it by the profile, or by saying where the drive is."""
-    if options.source("drive") == "default":
-        if options.source("profile") != "default":
-            profile = load_profile(options["profile"])
-            options = options.replaced(drive=Setting(profile.bus, f"profile {profile.name}"))
+    if not options.given("drive"):
+        if options.given("profile"):
+            profile = load_profile(options.profile)
+            options = options.replaced(drive=Setting(profile.bus, f"profile {profile.name}", Origin.PROFILE))
         elif (flag := asked_for(cli)) is not None:
-            options = options.replaced(drive=Setting("modbus", flag))
+            options = options.replaced(drive=Setting.by_flag("modbus", flag))
         elif rig is not None and rig.bus.interface is None and (rig.modbus.host or rig.modbus.serial):
-            options = options.replaced(drive=Setting("modbus", rig.source("modbus") or "rig"))
-    if options["drive"] == "modbus" and options.source("profile") == "default":
-        options = options.replaced(profile=Setting(MODBUS_PROFILE, "default"))
+            options = options.replaced(drive=Setting.by_rig("modbus", rig, "modbus"))
+    if options.drive == "modbus" and not options.given("profile"):
+        options = options.replaced(profile=Setting(MODBUS_PROFILE, "default", Origin.BUILT_IN))
     return options
 
 
-def simulated_canopen(options: Resolved) -> Connection:
+def simulated_canopen(options: RunOptions) -> Connection:
     """The way to an embedded CANopen drive."""
-    return Connection(load_canopen_profile(options["profile"]), NO_BUS, NO_MODBUS)
+    return Connection(load_canopen_profile(options.profile), NO_BUS, NO_MODBUS)
 
 
 def can_torque(profile: Profile) -> bool:

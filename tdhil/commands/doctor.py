@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tdhil.commands.connection import Connection
     from tdhil.commands.doctor_modbus import RegisterSeen
     from tdhil.commands.finding import Finding
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
     from tdhil.rig import Rig
 
 
@@ -41,7 +41,7 @@ def run(namespace: argparse.Namespace) -> int:
 
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
-    if options["json"] is True:
+    if options.json is True:
         namespace.json = True
     registers: list[RegisterSeen] = []
     found: list[Finding] = []
@@ -60,7 +60,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def findings(
-    cli: Mapping[str, Any], rig: Rig | None, options: Resolved, registers: list[RegisterSeen]
+    cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[RegisterSeen]
 ) -> Iterator[Finding]:
     """From the computer to the drive; ``registers`` is filled with those of a Modbus drive."""
     from drivers.errors import DataFileError
@@ -68,8 +68,8 @@ def findings(
     from tdhil.commands.doctor_host import host_findings
     from tdhil.commands.finding import note, of_error
 
-    yield from host_findings(Path(options["log"]))
-    yield from _left(Path(options["log"]).parent)
+    yield from host_findings(Path(options.log))
+    yield from _left(Path(options.log).parent)
     try:
         options, connection = connection_of(cli, rig, options)
     except DataFileError as error:
@@ -77,7 +77,7 @@ def findings(
         return
     yield from _profile(options, connection)
     yield from _limits(rig)
-    if not (options["simulate"] or connection.configured):
+    if not (options.simulate or connection.configured):
         yield note("drive", f"{connection.nothing_there}: no drive was looked at",
                    "Name it, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0")
     elif connection.drive == "modbus":
@@ -103,14 +103,14 @@ def _left(folder: Path) -> Iterator[Finding]:
                   "and remove the file")
 
 
-def _profile(options: Resolved, connection: Connection) -> Iterator[Finding]:
+def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
     from tdhil.commands.finding import note, ok
     from tdhil.commands.profile_said import sure_text
     from tdhil.commands.unverified import doubtful, is_accepted
 
     profile = connection.profile
     yield ok("profile", f"{profile.name} ({options.source('profile')}): {sure_text(profile)}")
-    accepted = options["accept_unverified"]
+    accepted = options.accept_unverified
     open_questions = [name for name, entry in doubtful(profile) if not is_accepted(name, entry, accepted)]
     if open_questions:
         yield note("profile", f"not verified: {', '.join(open_questions)}",
@@ -128,7 +128,7 @@ def _limits(rig: Rig | None) -> Iterator[Finding]:
         yield note("limits", "none: nothing real will be moved", step)
 
 
-def _canopen(options: Resolved, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
+def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
     from drivers.errors import TdhilError
     from profiles.schema import CanopenProfile
     from tdhil import bus_open
@@ -141,7 +141,7 @@ def _canopen(options: Resolved, connection: Connection, rig: Rig | None) -> Iter
     profile, bus = connection.profile, connection.bus
     assert isinstance(profile, CanopenProfile)
     plan = plan_peer(options, connection)
-    node = options["node"] if options["node"] is not None else profile.node
+    node = options.node if options.node is not None else profile.node
     if not plan.embedded and bus.interface == "socketcan" and bus.channel:
         found = attempted("link", lambda: doctor_can.link_findings(bus_open.link_report(bus.channel), bus.channel))
         yield from found
@@ -159,7 +159,7 @@ def _canopen(options: Resolved, connection: Connection, rig: Rig | None) -> Iter
 
 
 def _modbus(
-    options: Resolved, connection: Connection, rig: Rig | None, registers: list[RegisterSeen]
+    options: RunOptions, connection: Connection, rig: Rig | None, registers: list[RegisterSeen]
 ) -> Iterator[Finding]:
     from drivers.clock import Clock, MonotonicClock, SteppedClock
     from drivers.errors import TdhilError

@@ -13,7 +13,7 @@ from drivers.errors import PreflightRefused
 from profiles.quantities import RPM
 from tdhil import __version__
 from tdhil.commands.task import bench_of, excitation_request, lag_prior, machine_limits
-from tdhil.options import Resolved
+from tdhil.options import RunOptions
 from tdhil.rig import Rig, simulated_default_rig
 
 if TYPE_CHECKING:
@@ -46,13 +46,13 @@ class Figure:
         return f"{self.value:.4g} {self.unit}"
 
 
-def dry_run(options: Resolved, rig: Rig | None, simulated: bool, can_torque: bool = True) -> int:
+def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True) -> int:
     """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would.
 
     ``can_torque``: the drive can regulate torque; without it stage 5 is planned in speed mode.
     """
     planned, figures, limits = plan_dry(options, rig, simulated, can_torque)
-    if options["json"]:
+    if options.json:
         plain = document(planned, figures, limits)
         plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
         json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
@@ -68,7 +68,7 @@ def dry_run(options: Resolved, rig: Rig | None, simulated: bool, can_torque: boo
 
 
 def plan_dry(
-    options: Resolved, rig: Rig | None, simulated: bool, can_torque: bool = True
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
     from tdhil.protocol.excitation import PlanRefused
@@ -89,7 +89,7 @@ def plan_dry(
     return planned, figures, limits
 
 
-def refuse_hopeless(options: Resolved, rig: Rig | None, can_torque: bool) -> None:
+def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> None:
     """Before a run touches its drive: PreflightRefused for what no shaft could do within the limits.
 
     Nothing is known of the shaft yet, nor whether it is a simulated one, whose limits need not be given.
@@ -99,7 +99,7 @@ def refuse_hopeless(options: Resolved, rig: Rig | None, can_torque: bool) -> Non
 
     bench = simulated_default_rig(rig)
     limits = machine_limits(bench)
-    modes = (options["mode"],) if options["mode"] else ("torque", "speed") if can_torque else ("speed",)
+    modes = (options.mode,) if options.mode else ("torque", "speed") if can_torque else ("speed",)
     guess, known, _ = _assumed(bench, limits)
     try:
         planning.refuse_hopeless(excitation_request(options), modes, _room(options, limits), guess, known)
@@ -107,26 +107,26 @@ def refuse_hopeless(options: Resolved, rig: Rig | None, can_torque: bool) -> Non
         raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step) from error
 
 
-def _mode(options: Resolved, can_torque: bool) -> str:
-    wanted: str | None = options["mode"]
+def _mode(options: RunOptions, can_torque: bool) -> str:
+    wanted: str | None = options.mode
     if wanted == "torque" and not can_torque:
         raise PreflightRefused(
             "torque mode was asked for, but this drive has none that can be entered while it turns",
-            where=f"profile {options['profile']}",
+            where=f"profile {options.profile}",
             next_step="Use --mode speed",
         )
     return wanted or ("torque" if can_torque else "speed")
 
 
-def _room(options: Resolved, limits: MachineLimits) -> excitation.MachineLimits:
+def _room(options: RunOptions, limits: MachineLimits) -> excitation.MachineLimits:
     """What a plan may use of the limits at the rate that was asked for."""
     from tdhil.protocol import excitation
     from tdhil.protocol.guard import Guard
     from tdhil.protocol.settings import ControlAssumptions
 
     assumptions = ControlAssumptions()
-    if options["rate_hz"]:
-        assumptions = assumptions.at_period(1.0 / options["rate_hz"])
+    if options.rate_hz:
+        assumptions = assumptions.at_period(1.0 / options.rate_hz)
     return excitation.MachineLimits(
         limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
     )

@@ -13,7 +13,7 @@ from tdhil import __version__
 if TYPE_CHECKING:
     from drivers.drive import Command, Identity, Preflight, Sample
     from sim_bus.params import RigParams
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
     from tdhil.protocol.excitation import Plan, SwingPlan
     from tdhil.protocol.task import Idle, RunOutcome, Task
     from tdhil.record.recording import Recording, Stage
@@ -103,7 +103,7 @@ def _asked(wish: FieldRun) -> dict[str, object]:
     }
 
 
-def _task(options: Resolved, rig: Rig, identity: Identity) -> Task:
+def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
     from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
     from tdhil.protocol.task import Task
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from profiles.library import Profile
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
     from tdhil.protocol.task import Idle, RunOutcome, Task
     from tdhil.record.run_log import RunLog
     from tdhil.rig import Rig
@@ -106,18 +106,18 @@ def run(namespace: argparse.Namespace) -> int:
         return list_faults()
     rig = load_rig(namespace.rig) if namespace.rig else None
     options = resolve(vars(namespace), rig)
-    if options["json"] is True:
+    if options.json is True:
         namespace.json = True
     options, connection = connection_of(vars(namespace), rig, options)
-    check_names(connection.profile, options["accept_unverified"], options.source("accept_unverified"))
+    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
     console = stderr_console()
     if namespace.report is not None:
         from tdhil.report.html import check_report_path
 
-        check_report_path(namespace.report, Path(options["log"]))
+        check_report_path(namespace.report, Path(options.log))
     _check_files(namespace, options)
     if namespace.dry_run:
-        simulated = bool(options["simulate"]) or not connection.configured
+        simulated = options.simulate or not connection.configured
         return dry_run(options, rig, simulated, can_torque(connection.profile))
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
@@ -126,21 +126,21 @@ def run(namespace: argparse.Namespace) -> int:
     return _run(namespace, options, connection, peer, bench, console)
 
 
-def _check_files(namespace: argparse.Namespace, options: Resolved) -> None:
+def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
     """Before anything is opened: no file of this run is another's. UsageError names the option."""
     from tdhil.commands.log_file import check_log_path, check_names
 
-    log, trace = Path(options["log"]), options["trace"]
-    profile = options["profile"]
+    log, trace = Path(options.log), options.trace
+    profile = options.profile
     check_names({
         "--rig": namespace.rig,
         "--profile": Path(profile) if profile.endswith((".yaml", ".yml")) else None,
-        "--plant": None if options["plant"] is None else Path(options["plant"]),
+        "--plant": None if options.plant is None else Path(options.plant),
         "--log": log,
         "--report": namespace.report,
         "--trace": None if trace is None else Path(trace),
     })
-    check_log_path(log, options.source("log") if options.source("log") != "default" else "--log")
+    check_log_path(log, options.source("log") if options.given("log") else "--log")
     if trace is not None:
         from sim_bus.trace import check_trace_path
 
@@ -171,7 +171,7 @@ def _load_the_end(report: bool) -> None:
 
 def _run(
     namespace: argparse.Namespace,
-    options: Resolved,
+    options: RunOptions,
     connection: Connection,
     peer: PeerPlan,
     rig: Rig | None,
@@ -193,7 +193,7 @@ def _run(
     from tdhil.report.live import LiveDisplay
 
     _load_the_end(namespace.report is not None)
-    place = LogPlace(Path(options["log"]))
+    place = LogPlace(Path(options.log))
     writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
                        modbus=connection.drive == "modbus")
     writer.path = place.path
@@ -210,15 +210,15 @@ def _run(
 
     def confirm(task: Task, preflight: Preflight, idle: Idle) -> None:
         confirm_motion(
-            task, preflight, idle, yes=bool(options["yes"]), console=console, pause_display=display.pause,
-            unverified=accepted_lines(connection.profile, options["accept_unverified"]),
+            task, preflight, idle, yes=options.yes, console=console, pause_display=display.pause,
+            unverified=accepted_lines(connection.profile, options.accept_unverified),
         )
         place.motion = True
 
     said = {"operator": namespace.operator, "note": namespace.note}
     log = RunLog(writer, configuration(options, connection, peer, rig) | said)
     data = rig.drive_data if rig is not None else None
-    trace = None if options["trace"] is None else Path(options["trace"])
+    trace = None if options.trace is None else Path(options.trace)
     say = partial(console.print, style="dim", markup=False, highlight=False)
     try:
         with stop_on_signals() as stop_request, open_drive(
@@ -248,7 +248,7 @@ def _run(
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
             console.print(f"tdhil: --fault {fault} never came: this run did not reach its moment", style="yellow",
                           markup=False, soft_wrap=True)
-        code, document = _finish(outcome, log, str(place.name(stub=stub())), bool(options["json"]), console)
+        code, document = _finish(outcome, log, str(place.name(stub=stub())), options.json, console)
     except BaseException:
         with suppress(LogError):  # the first cause stays the cause
             log.close()
@@ -256,7 +256,7 @@ def _run(
         raise
     try:
         if document is not None:
-            print_result(document, bool(options["json"]))
+            print_result(document, options.json)
     finally:            # whoever should have read stdout may be gone: log and report are finished all the same
         try:
             log.close()
@@ -272,7 +272,7 @@ def _run(
 
 
 def _task(
-    options: Resolved,
+    options: RunOptions,
     profile: Profile,
     rig: Rig | None,
     log: RunLog,
@@ -287,8 +287,8 @@ def _task(
     bench = bench_of(identity, rig)
     log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
     if not identity.simulated:
-        require_accepted(profile, options["accept_unverified"])
-        log.configure(unverified=list(accepted_lines(profile, options["accept_unverified"])))
+        require_accepted(profile, options.accept_unverified)
+        log.configure(unverified=list(accepted_lines(profile, options.accept_unverified)))
     elif text := note(profile):
         say(text)
     limits = machine_limits(

@@ -13,7 +13,7 @@ from drivers.clock import Clock, MonotonicClock, SteppedClock
 from drivers.drive import Drive, FrameTap
 from tdhil.commands.connection import Connection
 from tdhil.errors import UsageError
-from tdhil.options import Resolved
+from tdhil.options import RunOptions
 from tdhil.rig import DriveData
 
 
@@ -34,34 +34,34 @@ class PeerPlan:
         return time.time_ns()
 
 
-def plan_peer(options: Resolved, connection: Connection) -> PeerPlan:
+def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
     """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
-    embedded = bool(options["simulate"]) or not connection.configured
+    embedded = options.simulate or not connection.configured
     if not embedded:
-        if options["stepped"] and connection.drive == "modbus":
+        if options.stepped and connection.drive == "modbus":
             raise UsageError(
                 "a Modbus line has no SYNC to step by: over a wire it runs in real time",
                 where=options.source("stepped"),
                 next_step="Leave --stepped out, or use --simulate, which is stepped",
             )
-        return PeerPlan(False, bool(options["stepped"]), None, None)
+        return PeerPlan(False, options.stepped, None, None)
     from sim_bus.params import RigParams
 
     plant = RigParams()
-    if options["plant"] is not None:
+    if options.plant is not None:
         from profiles.strict_yaml import load_model
 
-        plant = load_model(Path(options["plant"]), RigParams)
-    seed = options["seed"]
+        plant = load_model(Path(options.plant), RigParams)
+    seed = options.seed
     if seed is None:
         import secrets
 
         seed = secrets.randbelow(2**31)
-    return PeerPlan(True, not options["real_time"], seed, plant)
+    return PeerPlan(True, not options.real_time, seed, plant)
 
 
 @contextmanager
-def open_drive(plan: PeerPlan, options: Resolved, connection: Connection, data: DriveData | None, tap: FrameTap,
+def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData | None, tap: FrameTap,
                trace: Path | None) -> Iterator[Drive]:
     """The drive, closed with its bus and simulator afterwards. ``data``: what the bench knows and the drive doesn't."""
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()

@@ -14,7 +14,7 @@ from drivers.left_behind import LeftBehind
 from profiles.schema import CanopenProfile
 from tdhil.commands.connection import Connection
 from tdhil.commands.profile_said import rated_torque_is_told_by_hand
-from tdhil.options import Resolved
+from tdhil.options import RunOptions
 from tdhil.rig import DriveData
 
 if TYPE_CHECKING:
@@ -27,22 +27,22 @@ PLAIN = "generic/cia402"
 
 
 @contextmanager
-def open_canopen(plan: PeerPlan, options: Resolved, connection: Connection, data: DriveData, clock: Clock,
+def open_canopen(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
                  tap: FrameTap, trace: Path | None) -> Iterator[Cia402Drive]:
     """The node that the options, or else the profile, name."""
     profile = connection.profile
     assert isinstance(profile, CanopenProfile)
-    node = options["node"] if options["node"] is not None else profile.node
+    node = options.node if options.node is not None else profile.node
     with open_can(plan, connection, node, trace) as channel:
         yield Cia402Drive(
             channel,
             profile,
             clock,
             node=node,
-            rate_hz=options["rate_hz"],
+            rate_hz=options.rate_hz,
             rated_torque_nm=rated_torque_nm(plan, profile, data),
             tap=tap,
-            left=None if plan.embedded else LeftBehind(Path(options["log"]).parent, f"node{node}"),
+            left=None if plan.embedded else LeftBehind(Path(options.log).parent, f"node{node}"),
         )
 
 

@@ -15,7 +15,7 @@ from drivers.modbus.drive import ModbusDrive
 from profiles.modbus_schema import ModbusProfile
 from tdhil.commands.connection import Connection
 from tdhil.modbus_options import ModbusConfig
-from tdhil.options import Resolved
+from tdhil.options import RunOptions
 from tdhil.rig import DriveData
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class SettingsRefused(PreflightRefused):
 
 
 @contextmanager
-def open_modbus(plan: PeerPlan, options: Resolved, connection: Connection, data: DriveData, clock: Clock,
+def open_modbus(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
                 tap: FrameTap, trace: Path | None) -> Iterator[ModbusDrive]:
     """The unit that the options, or else the profile, name."""
     with open_line(plan, connection, data, clock, trace) as line:
@@ -36,7 +36,7 @@ def open_modbus(plan: PeerPlan, options: Resolved, connection: Connection, data:
             line.link,
             line.profile,
             unit=connection.modbus.unit,
-            rate_hz=options["rate_hz"],
+            rate_hz=options.rate_hz,
             rated_torque_nm=line.rated_torque_nm,
             given=line.given,
             tap=tap,

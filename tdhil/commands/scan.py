@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
     from tdhil.commands.scan_found import FoundDrive
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
 
 LISTEN_S = 1.0
 
@@ -52,7 +52,7 @@ def run(namespace: argparse.Namespace) -> int:
         _check_free(namespace.write)
     rig = load_rig(namespace.rig) if namespace.rig else None
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
-    if not (options["simulate"] or connection.configured):
+    if not (options.simulate or connection.configured):
         raise UsageError(
             f"{connection.nothing_there}", where="scan",
             next_step="Say where to look, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0",
@@ -69,7 +69,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _canopen(
-    plan: PeerPlan, connection: Connection, options: Resolved, listen_s: float
+    plan: PeerPlan, connection: Connection, options: RunOptions, listen_s: float
 ) -> tuple[tuple[FoundDrive, ...], list[str]]:
     from drivers.errors import CommunicationLost
     from profiles.schema import CanopenProfile
@@ -78,7 +78,7 @@ def _canopen(
 
     profile = connection.profile
     assert isinstance(profile, CanopenProfile)
-    own = options["node"] if options["node"] is not None else profile.node
+    own = options.node if options.node is not None else profile.node
     with open_can(plan, connection, own) as bus:
         link, heard = ask_all(bus, range(1, 128), listen_s)
         found = identify_all(link, heard)
@@ -105,11 +105,12 @@ def _modbus(plan: PeerPlan, connection: Connection, units: str | None) -> tuple[
     from tdhil.commands.scan_lines import scan_lines
     from tdhil.commands.scan_modbus import UNITS_RTU, UNITS_TCP, parse_units
     from tdhil.errors import UsageError
+    from tdhil.options import Origin
 
     serial = connection.modbus.serial is not None and not plan.embedded
     own = str(connection.modbus.unit)
-    given = connection.modbus.source("unit")
-    text = units or (own if given == "--unit" else f"{own},{UNITS_RTU if serial else UNITS_TCP}")
+    given = connection.modbus.origin("unit") is Origin.COMMAND_LINE
+    text = units or (own if given else f"{own},{UNITS_RTU if serial else UNITS_TCP}")
     try:
         asked = parse_units(text)
     except ValueError as error:
@@ -144,15 +145,15 @@ def _check_free(path: Path) -> None:
         raise UsageError("is there already, and is not written over", where=str(path), next_step="Name another file")
 
 
-def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: Resolved) -> None:
+def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
     """The starter file, of the one drive that was found, or of the one asked for among several."""
     from profiles.library import load_profile
     from tdhil.commands.scan_rig import starter
     from tdhil.errors import UsageError
 
     one = _chosen(found, connection, options)
-    if options.source("profile") != "default":
-        one = replace(one, profile=options["profile"], why=f"as named: {options.source('profile')}")
+    if options.given("profile"):
+        one = replace(one, profile=options.profile, why=f"as named: {options.source('profile')}")
     profile = load_profile(one.profile) if one.profile is not None else None
     try:
         with path.open("x", encoding="utf-8") as file:
@@ -166,11 +167,13 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
     print(f"{path}: written. Fill in its limits: before that nothing real moves", file=sys.stderr)  # noqa: T201
 
 
-def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: Resolved) -> FoundDrive:
+def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
     from tdhil.errors import UsageError
+    from tdhil.options import Origin
 
     modbus = connection.drive == "modbus"
-    named = connection.modbus.unit if modbus and connection.modbus.source("unit") == "--unit" else options["node"]
+    by_flag = modbus and connection.modbus.origin("unit") is Origin.COMMAND_LINE
+    named = connection.modbus.unit if by_flag else options.node
     drives = [one for one in found if named in (None, one.address)]
     if named is None and len(drives) > 1:
         drives = [one for one in drives if one.profile is not None] or drives

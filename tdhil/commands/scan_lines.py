@@ -15,7 +15,7 @@ from tdhil.commands.peer_modbus import SettingsRefused, open_line
 from tdhil.commands.scan_found import FoundDrive
 from tdhil.commands.scan_modbus import BAUDS, FORMATS, identify, probe
 from tdhil.modbus_options import ModbusConfig
-from tdhil.options import Setting
+from tdhil.options import Origin, Setting
 from tdhil.rig import DriveData
 
 if TYPE_CHECKING:
@@ -87,10 +87,10 @@ def _settings(plan: PeerPlan, line: ModbusConfig) -> Iterator[ModbusConfig]:
             if (baud, parity, stops) != (line.baud, line.parity, line.stop_bits):
                 changed = {"baud": baud, "parity": parity, "stop_bits": stops}
                 yield ModbusConfig(MappingProxyType(
-                    {**line.settings, **{name: Setting(value, SCAN) for name, value in changed.items()}}
+                    {**line.settings, **{name: Setting(value, SCAN, Origin.SCAN) for name, value in changed.items()}}
                 ))
 
 
 def _said(line: ModbusConfig, name: str) -> bool:
     """On the command line or in rig.yaml, not by the profile."""
-    return not line.source(name).startswith(("profile", "default"))
+    return line.origin(name) in (Origin.COMMAND_LINE, Origin.RIG_FILE)

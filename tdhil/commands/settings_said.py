@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
     from tdhil.commands.connection import Connection
     from tdhil.commands.peer import PeerPlan
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
     from tdhil.rig import Rig
 
 
-def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
+def configuration(options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
     """For the log: everything that identification needs.
 
     And the whole profile, so that a later decoder can start again from the raw frames.
@@ -34,18 +34,18 @@ def configuration(options: Resolved, connection: Connection, peer: PeerPlan, rig
         "seed": peer.seed,
         "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
         "faults": [fault.text for fault in peer.faults],
-        "identify": {name: options[name] for name in ("confidence", "tolerance", "model")},
+        "identify": {"confidence": options.confidence, "tolerance": options.tolerance, "model": options.model},
         "converted": [list(row) for row in rig.conversions] if rig is not None else [],
         "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
     }
 
 
 def show_settings(
-    console: Console, options: Resolved, connection: Connection, peer: PeerPlan, rig: Rig | None = None
+    console: Console, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None = None
 ) -> None:
     """Which value came from where: everything that isn't a default; and what became of a value with a unit."""
     if peer.embedded:
-        why = "as asked for" if options["simulate"] else connection.nothing_there
+        why = "as asked for" if options.simulate else connection.nothing_there
         clock = "stepped time" if peer.stepped else "real time"
         what = "Modbus drive and rig" if connection.drive == "modbus" else "drive and rig on a virtual bus"
         console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drivers.bare_stop import BareStopReport, Target
     from drivers.clock import Clock
     from tdhil.commands.connection import Connection
-    from tdhil.options import Resolved
+    from tdhil.options import RunOptions
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
@@ -88,7 +88,7 @@ def _not_reached(error: Exception, *, as_json: bool) -> int:
 
 
 @contextmanager
-def _open_target(options: Resolved, connection: Connection, clock: Clock) -> Iterator[Target]:
+def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
     from profiles.modbus_schema import ModbusProfile
 
     profile = connection.profile
@@ -106,7 +106,7 @@ def _open_target(options: Resolved, connection: Connection, clock: Clock) -> Ite
     from tdhil.bus_open import open_bus
 
     bus = open_bus(connection.bus)
-    node = options["node"] if options["node"] is not None else profile.node
+    node = options.node if options.node is not None else profile.node
     target = Cia402Target(bus, profile, clock, node=node)
     try:
         yield target

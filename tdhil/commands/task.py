@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import Any
 
 from drivers.drive import Identity
-from tdhil.options import Resolved
+from tdhil.options import RunOptions
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits
 from tdhil.record.recording import LagPrior
 from tdhil.rig import Rig, require_limits, simulated_default_rig
@@ -59,18 +59,18 @@ def machine_limits(
     )
 
 
-def excitation_request(options: Resolved) -> ExcitationRequest:
+def excitation_request(options: RunOptions) -> ExcitationRequest:
     """What stage 5 shall do."""
     return ExcitationRequest(
-        kind=options["excitation"],
-        mode=options["mode"],
-        frequency_hz=options["frequency_hz"],
-        amplitude_rad_s=options["amplitude_rad_s"],
-        offset_rad_s=options["offset_rad_s"],
-        periods=options["periods"],
-        confidence=options["confidence"],
-        tolerance=options["tolerance"] if options.source("tolerance") != "default" else None,
-        max_time_s=options["max_time_s"],
+        kind=options.excitation,
+        mode=options.mode,
+        frequency_hz=options.frequency_hz,
+        amplitude_rad_s=options.amplitude_rad_s,
+        offset_rad_s=options.offset_rad_s,
+        periods=options.periods,
+        confidence=options.confidence,
+        tolerance=options.tolerance if options.given("tolerance") else None,
+        max_time_s=options.max_time_s,
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from threading import Event
 from typing import Any, Protocol, TypeVar
 
-from drivers.drive import Command, Drive, Mode, PowerState, Sample, Telling
+from drivers.drive import Command, Drive, KeptAlive, Mode, PowerState, Sample, Telling
 from drivers.errors import DriveFault, ModeNotConfirmed
 from tdhil.errors import Interrupted
 from tdhil.protocol.beside import Beside, Reckoner
@@ -183,6 +183,5 @@ class Bench:
         """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
         if self._stop_request.signum is not None:
             raise Interrupted(self._stop_request.signum)
-        keep_alive = getattr(self.drive, "keep_alive", None)
-        if not ended.wait(ALIVE_S) and keep_alive is not None:
-            keep_alive()
+        if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
+            self.drive.keep_alive()

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 
-from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample
+from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample, Timed
 from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
 from tdhil.protocol import no_watchdog, others
@@ -241,7 +241,8 @@ class Runner:
             task.assumptions,
         )
         guard.no_braking = NOT_YET
-        guard.host_late = getattr(self._drive, "host_late", guard.host_late)
+        if isinstance(self._drive, Timed):
+            guard.host_late = self._drive.host_late
         bench = Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle)
         bench.reckoner = self._reckoner
         if no_reckoner:

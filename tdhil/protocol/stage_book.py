@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.drive import Drive, Preflight
+from drivers.drive import Drive, Preflight, Rehearsed
 from tdhil.protocol import no_watchdog
 from tdhil.protocol.stage_quality import stage_quality
 from tdhil.protocol.task import Display, Say
@@ -63,9 +63,8 @@ class StageBook:
 
     def _announce(self, name: str) -> None:
         """A drive may pass it on to a simulated peer, whose scripted faults wait for it."""
-        announce = getattr(self._drive, "announce", None)
-        if announce is not None:
-            announce(name)
+        if isinstance(self._drive, Rehearsed):
+            self._drive.announce(name)
 
     def _end(self, stage: Stage) -> None:
         self.stages.append(stage)

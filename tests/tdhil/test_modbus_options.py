@@ -36,8 +36,8 @@ def rig_of(tmp_path: Path, text: str) -> Rig:
 def chosen(cli: dict[str, Any], rig: Rig | None = None) -> tuple[str, str, str, str]:
     """(drive, who said so, profile, who said so)."""
     options, connection = connection_of(cli, rig, resolve(cli, rig))
-    assert connection.drive == options["drive"]
-    return options["drive"], options.source("drive"), options["profile"], options.source("profile")
+    assert connection.drive == options.drive
+    return options.drive, options.source("drive"), options.profile, options.source("profile")
 
 
 def test_nobody_says_where() -> None:

@@ -58,19 +58,19 @@ def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, sectio
 
 def test_no_option_takes_the_confirmation_from_a_rig():
     assert {option.name for option in OPTIONS if not option.at} == {"yes"}
-    assert resolve({"yes": True}, None)["yes"] is True
-    assert resolve({}, None)["yes"] is False
+    assert resolve({"yes": True}, None).yes is True
+    assert resolve({}, None).yes is False
 
 
 def test_consent_in_a_file_is_for_the_profile_of_that_file(tmp_path):
     bench = load_rig(rig(tmp_path, "profile: danfoss/fc302\naccept_unverified: [likely]\n"))
-    assert resolve({}, bench)["accept_unverified"] == ("likely",)
-    assert resolve({"profile": "danfoss/fc302"}, bench)["accept_unverified"] == ("likely",)
+    assert resolve({}, bench).accept_unverified == ("likely",)
+    assert resolve({"profile": "danfoss/fc302"}, bench).accept_unverified == ("likely",)
     other = resolve({"profile": "abb/acs880-enhanced"}, bench)
-    assert other["accept_unverified"] == ()
+    assert other.accept_unverified == ()
     assert other.source("accept_unverified") == "rig.yaml:2 is for the profile of that file, not for --profile"
     both = resolve({"profile": "abb/acs880-enhanced", "accept_unverified": ["watchdog"]}, bench)
-    assert (both["accept_unverified"], both.source("accept_unverified")) == (("watchdog",), "--accept-unverified")
+    assert (both.accept_unverified, both.source("accept_unverified")) == (("watchdog",), "--accept-unverified")
 
 
 def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):

@@ -155,9 +155,9 @@ def test_a_rig_that_the_simulated_limits_do_not_fit(tmp_path: Path) -> None:
 
 def test_command_line_before_rig_before_default(tmp_path: Path) -> None:
     found = resolve({"node": 9, "seed": None}, rig_of(tmp_path, "node: 3\nrun:\n  seed: 7\n"))
-    assert (found["node"], found.source("node")) == (9, "--node")
-    assert (found["seed"], found.source("seed")) == (7, "rig.yaml:3")
-    assert (found["excitation"], found.source("excitation")) == ("multisine", "default")
+    assert (found.node, found.source("node")) == (9, "--node")
+    assert (found.seed, found.source("seed")) == (7, "rig.yaml:3")
+    assert (found.excitation, found.source("excitation")) == ("multisine", "default")
     assert ("node", "9", "--node") in list(found.rows())
     assert ("mode", "-", "default") in list(found.rows())
     assert ("yes", "false", "default") in list(found.rows())
@@ -171,24 +171,24 @@ def test_every_option_can_stand_in_the_rig(tmp_path: Path) -> None:
 def test_what_is_accepted_in_both_places_counts_once(tmp_path: Path) -> None:
     rig = rig_of(tmp_path, "accept_unverified: [watchdog, likely]\n")
     found = resolve({"accept_unverified": ["speed", "watchdog"]}, rig)
-    assert found["accept_unverified"] == ("speed", "watchdog", "likely")
+    assert found.accept_unverified == ("speed", "watchdog", "likely")
     assert found.source("accept_unverified") == "--accept-unverified and rig.yaml:1"
     assert ("accept_unverified", "speed, watchdog, likely", "--accept-unverified and rig.yaml:1") in list(found.rows())
-    assert resolve({}, None)["accept_unverified"] == ()
+    assert resolve({}, None).accept_unverified == ()
 
 
 def test_files_named_in_the_rig_lie_beside_it(tmp_path: Path) -> None:
     found = resolve({}, rig_of(tmp_path, FULL))
-    assert found["plant"] == str(tmp_path / "plant.yaml")
-    assert found["profile"] == str(tmp_path / "mine.yaml")
-    assert found["log"] == "here.mcap"
+    assert found.plant == str(tmp_path / "plant.yaml")
+    assert found.profile == str(tmp_path / "mine.yaml")
+    assert found.log == "here.mcap"
     found = resolve({"plant": "p.yaml"}, rig_of(tmp_path, "profile: generic/cia402"))
-    assert (found["plant"], found["profile"]) == ("p.yaml", "generic/cia402")
+    assert (found.plant, found.profile) == ("p.yaml", "generic/cia402")
 
 
 def test_the_clock_of_the_command_line_undoes_the_rigs(tmp_path: Path) -> None:
     found = resolve({"stepped": True}, rig_of(tmp_path, FULL))
-    assert (found["stepped"], found["real_time"], found.source("real_time")) == (True, False, "--stepped")
+    assert (found.stepped, found.real_time, found.source("real_time")) == (True, False, "--stepped")
 
 
 def test_wrong_values_on_the_command_line_are_named_all() -> None:
