@@ -3,8 +3,8 @@
 Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
 shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
 wave's frequency 1/T, tells. So where two masses explain the data, J_r and J_L are theirs, but their intervals hold
-whatever string the data do not contradict (`result.py`); J_r + J_L is the same in both. Only who says
-``--model two-mass`` takes the spring's weight for nothing.
+whatever string the data do not contradict (`result.py`; one whose lowest swing the lines can see, `fit.too_slow`);
+J_r + J_L is the same in both. Only who says ``--model two-mass`` takes the spring's weight for nothing.
 
 So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up too
 early: the string must gain what would be as unlikely by chance as residuals that reject a model (χ²(1); half of that
@@ -16,14 +16,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.compliant.fit import CompliantFit, fit_compliant
+from tdhil.identify.compliant.fit import SLOWEST_SEEN, CompliantFit, chance_gain, fit_compliant
 from tdhil.identify.compliant.string_shaft import StringShaft
 from tdhil.identify.compliant.two_mass import LOAD, SWING, TwoMassShaft
 from tdhil.identify.faults.quality import Refusal
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.model import GaussianPrior
-from tdhil.identify.lines.residual import REJECT_P, rejects
+from tdhil.identify.lines.residual import rejects
 from tdhil.identify.lines.rigid_result import RigidResult
 from tdhil.identify.lines.shaft import INERTIA
 from tdhil.identify.lines.spectrum import Line
@@ -34,7 +34,7 @@ _MUCH = 9.0                  # of −2 ln L, for one parameter more than the rig
 _REPORTS = 3                 # unknown besides the shaft: two lags and the skew
 _SIGNIFICANT = 25.0          # |mean|² over its variance, as `Line.excited`
 _LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
-_NEAR = (0.5, 2.0)           # where a swing can be seen, of the lowest and the highest line
+_NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,7 @@ def choose(
 
 def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
     """Does the string gain more on two masses, by its one parameter, than chance gives?"""
-    from scipy.stats import chi2
-
-    return bool(two.fitted.whole.objective - string.fitted.whole.objective > chi2.isf(REJECT_P, 1))
+    return two.fitted.whole.objective - string.fitted.whole.objective > chance_gain()
 
 
 def may_swing(

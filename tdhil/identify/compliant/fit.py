@@ -11,17 +11,18 @@ from tdhil.identify.compliant.string_shaft import resonances as string_resonance
 from tdhil.identify.compliant.two_mass import DAMPING, LOAD, SWING, TwoMassShaft
 from tdhil.identify.compliant.views import RESONANCE, STIFFNESS, TOTAL, viewed
 from tdhil.identify.identification import Estimate, ResidualTest
-from tdhil.identify.lines.fit import Held
+from tdhil.identify.lines.fit import Apart, Held
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.interval import estimate
 from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.identify.lines.model import GaussianPrior, Model
-from tdhil.identify.lines.residual import residual_of
+from tdhil.identify.lines.residual import REJECT_P, residual_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS, RigidShaft
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.lines.structure import Fitted, fit_model
 from tdhil.record.recording import FloatArray
 
+SLOWEST_SEEN = 0.5        # of the lowest line: a slower swing is not seen
 _RIGID = len(RigidShaft.names)
 _LIGHT = 0.02      # share of the load that a string weighs which is all but a spring
 
@@ -77,8 +78,31 @@ def fit_compliant(
     starts = compliant_starts(problem, held)
     if near is not None:
         starts = [np.insert(near.fitted.simple.theta, STRING_SHARE, _LIGHT), *starts]
-    fitted = fit_model(problem, held, starts)
+    fitted = fit_model(problem, held, starts, apart=too_slow(problem))
     return CompliantFit(fitted, residual_of(fitted))
+
+
+def too_slow(problem: Likelihood) -> Apart:
+    """A shaft whose lowest swing the lines can't see stands where it explains more than chance does, not by a hair.
+
+    A string always has such a double: at multiples of a frequency f, tan ωT is the same with T + 1/(2f), a wave that
+    takes longer by half a period (10 s at 0.05 Hz: 32 km of pipe). What it gains on its double is scatter, and whether
+    a descent finds it hangs on rounding.
+    """
+    slowest = SLOWEST_SEEN * float(np.min(np.abs(problem.s)))
+    size = problem.model.mechanical
+
+    def stands(theta: FloatArray) -> bool:
+        return (string_resonances(theta[:size])[0] if size > STRING_SHARE else float(theta[SWING])) < slowest
+
+    return Apart(stands, chance_gain())
+
+
+def chance_gain() -> float:
+    """By how much one parameter more lowers −2 ln L as seldom by chance as residuals reject a true model, χ²(1)."""
+    from scipy.stats import chi2
+
+    return float(chi2.isf(REJECT_P, 1))
 
 
 def inertias(fit: CompliantFit, confidence: float) -> dict[str, Estimate]:

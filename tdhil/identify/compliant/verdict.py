@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.identify.compliant.choice import Chosen, choose
-from tdhil.identify.compliant.fit import CompliantFit
+from tdhil.identify.compliant.fit import SLOWEST_SEEN, CompliantFit
 from tdhil.identify.compliant.result import CompliantResult, result_of
 from tdhil.identify.faults.refusal import Refusal
 from tdhil.identify.identification import Estimate, Identification, InertiaEstimate, Verdict
@@ -123,7 +123,9 @@ def _inertia(one: Estimate, chosen: Chosen, recording: Recording, options: Optio
         shaft = "the motor turns a uniform string"
     else:
         shaft = "the spring weighs nothing" if chosen.beside is None else "the motor turns a spring or a uniform string"
-    conditions = ("torque scale exact", shaft, *of_reports(recording.lag_prior))
+    slowest_hz = SLOWEST_SEEN * min(line.hertz for line in chosen.fit.fitted.problem.lines)
+    seen = f"its lowest swing is above {slowest_hz:.3g} Hz"
+    conditions = ("torque scale exact", shaft, seen, *of_reports(recording.lag_prior))
     return with_total(one, recording.torque_scale_rel_sd, options.confidence, conditions)
 
 

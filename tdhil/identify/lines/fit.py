@@ -1,6 +1,7 @@
 """Where to begin: rough sizes, and linear least squares for shafts behind first-order lags; then the best of many."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +18,14 @@ _PROPOSALS = 3
 _NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
 
 Held = dict[int, float]
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Answers (P,) that stand apart, and by how much they must lower −2 ln L to be preferred."""
+
+    stands: Callable[[FloatArray], bool]
+    gain: float
 
 
 def box(problem: Likelihood, rough_inertia: float) -> Box:
@@ -72,9 +81,21 @@ def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterat
         yield begin
 
 
-def best_fit(problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray]) -> Fit:
-    """The lowest of several descents; the first of equals, so that the same data give the same bits."""
-    return min((minimise(problem, limits, start, held) for start in starts), key=lambda fit: fit.objective)
+def best_fit(
+    problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray], apart: Apart | None = None
+) -> Fit:
+    """The `lowest` of several descents."""
+    return lowest([minimise(problem, limits, start, held) for start in starts], apart)
+
+
+def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:
+    """The first of equals, so that the same data give the same bits; what stands ``apart`` must gain more."""
+    best = min(fits, key=lambda fit: fit.objective)
+    if apart is None or not apart.stands(best.theta):
+        return best
+    others = [fit for fit in fits if not apart.stands(fit.theta)]
+    other = min(others, key=lambda fit: fit.objective, default=best)
+    return best if other.objective - best.objective > apart.gain else other
 
 
 def rigid_starts(problem: Likelihood) -> list[FloatArray]:

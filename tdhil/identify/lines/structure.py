@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.identify.lines.descent import Box, Fit
-from tdhil.identify.lines.fit import Held, best_fit, box, minimise, rough_inertia_of
+from tdhil.identify.lines.fit import Apart, Held, best_fit, box, lowest, minimise, rough_inertia_of
 from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.identify.lines.reports import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
 from tdhil.record.recording import FloatArray
@@ -73,25 +73,28 @@ def fit_model(
     held: Held,
     starts: Sequence[FloatArray],
     rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
+    apart: Apart | None = None,
 ) -> Fitted:
-    """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be."""
+    """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be.
+
+    ``apart``: answers that stand only where they gain more on the others than they must.
+    """
     model = problem.model
     limits = box(problem, rough_inertia_of(problem))
     first_order = {**dict.fromkeys(model.structure, 0.0), **held}
-    simple = best_fit(problem, limits, first_order, starts)
+    simple = best_fit(problem, limits, first_order, starts, apart)
     open_structure = [index for index in model.structure if index not in held]
     others = tuple(minimise(problem, limits, start, held) for start in (rivals_of(simple.theta) if rivals_of else []))
     if not open_structure:
         return Fitted(problem, limits, held, simple, simple, 1.0, others)
-    whole = simple
+    fits = [simple]
     for shape, value in _SHAPES:
         start = simple.theta.copy()
         if model.at(shape) not in held:
             start[model.at(shape)] = value
-            found = minimise(problem, limits, start, held)
-            whole = found if found.objective < whole.objective else whole
-    from_simple = minimise(problem, limits, simple.theta, held)
-    whole = from_simple if from_simple.objective < whole.objective else whole
+            fits.append(minimise(problem, limits, start, held))
+    fits.append(minimise(problem, limits, simple.theta, held))
+    whole = lowest(fits, apart)
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(held))
     excess = gain - len(open_structure) * math.log(problem.numbers)
     weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
