@@ -160,7 +160,7 @@ def is_text(statement: ast.stmt) -> bool:
 
 
 def deletable(tree: ast.Module) -> list[tuple[list[ast.stmt], int]]:
-    """(the list that a statement stands in, its place); imports, texts and whole definitions are left alone."""
+    """(the list that a statement stands in, its place); imports, names for others, texts and definitions stay."""
     found = []
     for node in ast.walk(tree):
         for name in ("body", "orelse", "finalbody"):
@@ -170,7 +170,8 @@ def deletable(tree: ast.Module) -> list[tuple[list[ast.stmt], int]]:
             for place, statement in enumerate(block):
                 kept = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.ClassDef, ast.Pass)
                 annotation = isinstance(statement, ast.AnnAssign) and statement.value is None
-                if not isinstance(statement, kept) and not is_text(statement) and not annotation:
+                about_names = ast.unparse(statement).startswith(("__all__ = ", "if TYPE_CHECKING:"))
+                if not isinstance(statement, kept) and not is_text(statement) and not annotation and not about_names:
                     found.append((block, place))
     return found
 

@@ -162,6 +162,42 @@ def test_standing_still_is_remembered_for_a_while(fake_time):
     assert ticks.stood_still_s(1.0) == 0.0
 
 
+def test_a_stall_is_told_once_and_the_beat_goes_on_from_there(fake_time):
+    """Whoever comes back stops the shaft: that must not be refused again, at once, for the same stall."""
+    ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
+    ticks.wait()
+    fake_time.sleep(3.0)
+    with pytest.raises(CommunicationLost, match=r"still for 3\.00 s"):
+        ticks.check()
+    ticks.check()
+    ticks.check_end()
+    back_s = fake_time.now_s
+    ticks.wait()
+    assert fake_time.now_s == pytest.approx(back_s + PERIOD_S)
+    assert ticks.overruns == 0
+
+
+def test_a_talk_that_takes_long_is_no_stall(fake_time):
+    """A reply that was waited for until after the next tick was due is told by its own error, if by any."""
+    ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
+    ticks.wait()
+    fake_time.sleep(1.0)
+    ticks.done()
+    ticks.wait()
+    assert ticks.stood_still_s(10.0) == 0.0
+
+
+def test_time_spent_well_is_not_overslept(fake_time):
+    """An SDO beside the cycle may take a while: no tick was missed for it."""
+    ticks = Ticks(MonotonicClock(), PERIOD_S, 0.25)
+    ticks.wait()
+    fake_time.sleep(0.1)
+    ticks.put_off()
+    ticks.wait()
+    assert ticks.overruns == 0
+    assert ticks.late_s[-1] == 0.0
+
+
 # -- another rate ---------------------------------------------------------------------------------------------------
 
 
