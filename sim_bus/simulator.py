@@ -72,8 +72,7 @@ class Simulator:
     def run(self, stop: threading.Event) -> None:
         """Serves the bus until ``stop`` is set. The trace is closed at the end."""
         with self._trace:
-            self.node.boot()
-            self._wall_s = time.monotonic()
+            self.begin()
             while not stop.is_set():
                 own_time = self._running_on or not self.node.stepped
                 timeout_s = _POLL_OWN_TIME_S if own_time else min(_POLL_STEPPED_S, self._silence_s)
@@ -85,10 +84,28 @@ class Simulator:
                     continue
                 if message is None:
                     self._nothing_came(timeout_s, before_s, stop)
-                elif not (message.is_extended_id or message.is_error_frame):
-                    self._frame_came(message)
-            if self._faults is not None and self.node.stepped and self.node.sync_seen:
-                self._run_out()
+                else:
+                    self.hear(message)
+            self.end()
+
+    def begin(self) -> None:
+        """Power-on, with its boot-up message."""
+        self.node.boot()
+        self._wall_s = time.monotonic()
+
+    def hear(self, message: can.Message) -> None:
+        """One frame from the bus; what it makes the drive say has been sent when this returns."""
+        if not (message.is_extended_id or message.is_error_frame):
+            self._frame_came(message)
+
+    def end(self) -> None:
+        """The host is gone for good: a rehearsal is played to its end."""
+        if self._faults is not None and self.node.stepped and self.node.sync_seen:
+            self._run_out()
+
+    def close_trace(self) -> None:
+        """Closes the trace; safe to repeat."""
+        self._trace.close()
 
     def _run_out(self) -> None:
         """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
@@ -117,9 +134,9 @@ class Simulator:
             if node.stepped and message.data[:1] == CYCLE_ASKED:
                 self._sender.put(CYCLE_ID, CYCLE_ANSWER + message.data[1:2])
         elif self._faults is not None:
-            self._faults.came(message.arbitration_id, message.data)
+            self._faults.came(message.arbitration_id, bytes(message.data))
         else:
-            node.on_frame(message.arbitration_id, message.data)
+            node.on_frame(message.arbitration_id, bytes(message.data))
         if was_stepped and not node.stepped:
             self._wall_s = time.monotonic()
 
@@ -164,18 +181,53 @@ class Simulator:
         self._wall_s += behind * _CHUNK_US * 1e-6
 
 
-class EmbeddedSimulator:
+class Embedded:
+    """A simulator in this process; how frames reach it is a subclass's. What fails in it is raised by `check`."""
+
+    def __init__(self) -> None:
+        self._failure: BaseException | None = None
+
+    def open(self) -> Self:
+        """Powers the drive on."""
+        raise NotImplementedError
+
+    def _end(self) -> None:
+        """Ends the simulation and gives the bus back; safe to repeat."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raises RuntimeError for what failed in the simulation."""
+        if self._failure is not None:
+            raise RuntimeError("the simulated drive failed") from self._failure
+
+    def close(self) -> None:
+        """Ends the simulation, gives the bus back and raises what failed; safe to repeat."""
+        self._end()
+        self.check()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 where: TracebackType | None) -> None:
+        self._end()
+        if error is None:
+            self.check()
+
+
+class EmbeddedSimulator(Embedded):
     """A simulator in a daemon thread of this process, on a python-can ``virtual`` channel of its own.
 
     ``with EmbeddedSimulator(params) as simulated: bus = can.Bus(interface="virtual", channel=simulated.channel)``.
     ``profile`` is what the simulated drive wears. By default stepped, and a pause of the host, however long, changes
-    nothing: host and simulator share a fate, and a run must repeat on a slow machine. What fails in the thread is
-    raised by `check` and by `close`.
+    nothing: host and simulator share a fate, and a run must repeat on a slow machine. In stepped time
+    `sim_bus.inline.InlineSimulator` says the same, several times as fast.
     """
 
     def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
                  stepped: bool = True, silence_s: float = math.inf, profile: CanopenProfile | None = None,
                  faults: tuple[Scripted, ...] = ()) -> None:
+        super().__init__()
         self.channel = f"tdhil-{uuid.uuid4().hex}"
         self._bus = can.Bus(interface="virtual", channel=self.channel)
         self.simulator = Simulator(
@@ -184,23 +236,12 @@ class EmbeddedSimulator:
             faults=faults,
         )
         self._stop = threading.Event()
-        self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="simulated drive", daemon=True)
 
     def open(self) -> Self:
         """Starts the thread."""
         self._thread.start()
         return self
-
-    def check(self) -> None:
-        """Raises what failed in the thread."""
-        if self._failure is not None:
-            raise RuntimeError("the simulated drive failed") from self._failure
-
-    def close(self) -> None:
-        """Ends the thread, gives the channel back and raises what failed; safe to repeat."""
-        self._end()
-        self.check()
 
     def _end(self) -> None:
         self._stop.set()
@@ -213,12 +254,3 @@ class EmbeddedSimulator:
             self.simulator.run(self._stop)
         except BaseException as error:        # kept for the host's thread, which raises it
             self._failure = error
-
-    def __enter__(self) -> Self:
-        return self.open()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 where: TracebackType | None) -> None:
-        self._end()
-        if error is None:
-            self.check()

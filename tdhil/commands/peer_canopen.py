@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import Clock
@@ -20,6 +20,7 @@ from tdhil.rig import DriveData
 if TYPE_CHECKING:
     import can
 
+    from sim_bus.simulator import Simulator
     from tdhil.commands.peer import PeerPlan
 
 PLAIN = "generic/cia402"
@@ -58,23 +59,37 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
     """The bus, shut down afterwards, with the simulated drive on it where one was asked for."""
     with ExitStack() as stack:
         if plan.embedded:
-            import can
-
-            from sim_bus.simulator import EmbeddedSimulator
-
-            worn: dict[str, Any] = {} if connection.profile.name == PLAIN else {"profile": connection.profile}
-            simulator = stack.enter_context(
-                EmbeddedSimulator(
-                    plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=plan.stepped,
-                    faults=plan.faults, **worn,
-                )
-            )
-            channel = can.Bus(interface="virtual", channel=simulator.channel)
+            simulator, channel = _embedded(stack, plan, connection, node, trace)
             # Before the simulator runs out by itself: what comes then is no part of the run.
-            stack.callback(lambda: plan.never_came.extend(simulator.simulator.faults_waiting))
+            stack.callback(lambda: plan.never_came.extend(simulator.faults_waiting))
         else:
             from tdhil.bus_open import open_bus
 
             channel = open_bus(connection.bus)
         stack.callback(channel.shutdown)
         yield channel
+
+
+def _embedded(
+    stack: ExitStack, plan: PeerPlan, connection: Connection, node: int, trace: Path | None
+) -> tuple[Simulator, can.BusABC]:
+    """The simulator and the host's bus to it: in this thread where it is stepped, else in one of its own."""
+    worn = None if connection.profile.name == PLAIN else connection.profile
+    assert worn is None or isinstance(worn, CanopenProfile)
+    if plan.stepped:
+        from sim_bus.inline import InlineSimulator
+
+        inline = stack.enter_context(
+            InlineSimulator(plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, profile=worn,
+                            faults=plan.faults)
+        )
+        return inline.simulator, inline.bus
+    import can
+
+    from sim_bus.simulator import EmbeddedSimulator
+
+    simulated = stack.enter_context(
+        EmbeddedSimulator(plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=False, profile=worn,
+                          faults=plan.faults)
+    )
+    return simulated.simulator, can.Bus(interface="virtual", channel=simulated.channel)

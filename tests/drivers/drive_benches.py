@@ -19,8 +19,8 @@ from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from profiles.library import load_canopen_profile
+from sim_bus.inline import InlineSimulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
-from sim_bus.simulator import EmbeddedSimulator
 
 LIMITS = Limits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_wider=frozenset({"quick-stop"})
@@ -65,7 +65,7 @@ class TamperedBus:
 
 
 class CanopenBench:
-    """Cia402Drive on the embedded simulator, stepped, over python-can's virtual bus."""
+    """Cia402Drive on the embedded simulator, stepped, in this thread."""
 
     SETTINGS = ((0x1006, 0), (0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x6072, 0), (0x6080, 0), (0x6085, 0))
     TARGETS = ((0x6060, 0), (0x6071, 0), (0x60FF, 0))
@@ -91,11 +91,11 @@ class CanopenBench:
         self.limits = LIMITS
         self.rated_nm = 1000.0
         profile = load_canopen_profile(self.PROFILE)
-        self.simulated = EmbeddedSimulator(
+        self.simulated = InlineSimulator(
             params or RigParams(noise=QUIET, reporting=FAITHFUL), seed=seed, profile=profile if self.WORN else None
         ).open()
-        self._second = can.Bus(interface="virtual", channel=self.simulated.channel)
-        self.bus = TamperedBus(can.Bus(interface="virtual", channel=self.simulated.channel))
+        self._second = self.simulated.station()
+        self.bus = TamperedBus(self.simulated.station())
         self.frames = []
         self.drive = Cia402Drive(self.bus, profile, SteppedClock(), node=1, tap=self._tap, **options)
 
