@@ -26,7 +26,8 @@ list` shows the names).
 **QS** the one stop sequence: quick stop, standstill seen, trapped torque down, only then disable · **WD** the drive's
 own watchdog stops the shaft · **R** refused before the shaft has moved · **M** the run goes on, and what was degraded
 is marked. *To rest* is plant time from the fault to the last movement of the simulated shaft (0.02 rad/s), from some
-4 rad/s unless the row says otherwise, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop.
+4 rad/s unless the row says otherwise, on a ramp of 2 rad/s². A dash: nothing moved, or nothing had to stop. *Exit*: how
+the process may end.
 
 """
 
@@ -50,12 +51,17 @@ def table(lines):
         said = "<br>".join(dict.fromkeys(_cell(line["said"]) for line in found)) or _cell(row.said)
         rest = [line["standstill_s"] for line in found if line["standstill_s"] is not None]
         logs = ", ".join(dict.fromkeys(line["log"] for line in found if line["log"])) or "–"
-        codes = ", ".join(str(code) for code in dict.fromkeys(line["code"] for line in found)) or row.codes
+        codes = _codes([str(line["code"]) for line in found], row.codes)
         shown = "–" if not rest else f"{min(rest):.1f} s" if len(rest) == 1 else f"{min(rest):.1f} to {max(rest):.1f} s"
         out.append(f"| {number} | {row.fault} | {row.expected} | {said} | {shown} | {logs} | {codes} |")
         names = dict.fromkeys([*row.tests, *(line["test"].split("[")[0] for line in found)])
         tests.append(f"{number}. " + ", ".join(f"`{name}`" for name in names))
     return "\n".join([*out, *tests]) + "\n"
+
+
+def _codes(found, stated):
+    """What the row itself says, where that holds all that was seen: a case of another round may end otherwise."""
+    return stated if set(found) <= set(stated.split(", ")) else ", ".join(dict.fromkeys(found))
 
 
 def _cell(text):

@@ -46,12 +46,15 @@ class Figure:
         return f"{self.value:.4g} {self.unit}"
 
 
-def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True) -> int:
+def dry_run(
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
+) -> int:
     """Plan and print; exit code 0. Raises PreflightRefused where there is nothing to plan, as a run would.
 
-    ``can_torque``: the drive can regulate torque; without it stage 5 is planned in speed mode.
+    ``can_torque``: the drive can regulate torque; without it stage 5 is planned in speed mode. ``lets_go``: by its
+    profile the drive's torque is off after a quick stop.
     """
-    planned, figures, limits = plan_dry(options, rig, simulated, can_torque)
+    planned, figures, limits = plan_dry(options, rig, simulated, can_torque, lets_go)
     if options.json:
         plain = document(planned, figures, limits)
         plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
@@ -68,14 +71,16 @@ def dry_run(options: RunOptions, rig: Rig | None, simulated: bool, can_torque: b
 
 
 def plan_dry(
-    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
     from tdhil.protocol.excitation import PlanRefused
     from tdhil.protocol.planning import plan_acquisition
+    from tdhil.protocol.string_rules import refuse_by_plan
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)
+    refuse_by_plan(limits, excitation_request(options), lets_go)
     guess, known, figures = _assumed(bench, limits)
     left_s = limits.time_s - BEFORE_ACQUIRE_S
     try:

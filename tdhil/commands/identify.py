@@ -118,7 +118,8 @@ def run(namespace: argparse.Namespace) -> int:
     _check_files(namespace, options)
     if namespace.dry_run:
         simulated = options.simulate or not connection.configured
-        return dry_run(options, rig, simulated, can_torque(connection.profile))
+        lets_go = connection.profile.quick_stop.ends == "off"
+        return dry_run(options, rig, simulated, can_torque(connection.profile), lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     bench = suited(rig, peer.plant)

@@ -11,8 +11,11 @@ _LETS_GO = ("coast", "none", "fault_reaction")
 """Reactions to a silent host after which nothing holds the string; a drive in fault has its torque off (CiA 402)."""
 
 
-def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
-    """PreflightRefused where torque could be lost while a string is wound up; nothing without a string."""
+def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: bool) -> None:
+    """`refuse_with_string`, as far as it can be said with no drive at hand.
+
+    ``lets_go``: the drive's profile says that it does after a quick stop.
+    """
     if limits.load != "string":
         return
     if request.kind == "coast-down":
@@ -27,6 +30,15 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
             where="torque_ramp_nm_s",
             next_step="Give torque_ramp_nm_s in rig.yaml, such as 50",
         )
+    if lets_go:
+        _refuse_quick_stop(holds=False)
+
+
+def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
+    """PreflightRefused where torque could be lost while a string is wound up; nothing without a string."""
+    if limits.load != "string":
+        return
+    refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
     if not preflight.watched:
         raise PreflightRefused(
             f"a drill string hangs on the shaft, and no watchdog is armed in the drive: {FLAG} is not for strings",
@@ -48,12 +60,16 @@ def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, prefli
             next_step="Choose a reaction that brakes and holds: in CiA 402 object 6007h = 3 (quick stop)",
         )
     if not preflight.quick_stop_holds:
-        known = preflight.quick_stop_holds is not None
-        raise PreflightRefused(
-            "a drill string hangs on the shaft, and "
-            + ("the drive lets go of it after a quick stop" if known
-               else "nobody knows whether the drive holds it after a quick stop"),
-            where="quick_stop of the profile",
-            next_step="Use a drive that stays in quick stop (605Ah = 5 or 6), or run without the string"
-            if known else "Look it up in the drive's manual, and write quick_stop.ends into a profile of your own",
-        )
+        _refuse_quick_stop(preflight.quick_stop_holds)
+
+
+def _refuse_quick_stop(holds: bool | None) -> None:
+    known = holds is not None
+    raise PreflightRefused(
+        "a drill string hangs on the shaft, and "
+        + ("the drive lets go of it after a quick stop" if known
+           else "nobody knows whether the drive holds it after a quick stop"),
+        where="quick_stop of the profile",
+        next_step="Use a drive that stays in quick stop (605Ah = 5 or 6), or run without the string"
+        if known else "Look it up in the drive's manual, and write quick_stop.ends into a profile of your own",
+    )

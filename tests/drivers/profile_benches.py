@@ -10,31 +10,39 @@ REMOTE = 1 << 30
 """Set in the identifier of a remote frame, as SocketCAN does; the drive's answer has the same one without it."""
 
 
-class Epos4Bench(CanopenBench):
-    """rpm, thousandths of a rated torque that stands in µN·m, no 6074h, torque limit by current."""
+class ProfileBench(CanopenBench):
+    """Mode in TPDO2; status, torque and speed in TPDO1, as ``FEEDBACK`` has them."""
 
-    PROFILE, WORN = "maxon/epos4", True
-    SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
-    speed_lsb, torque_lsb = RPM, 1.0
-    brakes_in_torque_mode = False  # its quick stop lets go there: `Preflight.quick_stop_in_torque_mode`
-    ramp_rad_s2 = 10.0 * RPM       # 1 rad/s² is 9.55 rpm/s, the next one up
+    FEEDBACK = "<Hhi"
+    MODES = ()                     # what is displayed: the mode it stands for
 
     def decode(self, frames):
-        found, mode = [], 0
+        found, mode, shown = [], 0, dict(self.MODES)
         for frame in frames:
             if not frame.outgoing and frame.identifier == 0x281:
                 (mode,) = struct.unpack("<b", frame.data)
             elif not frame.outgoing and frame.identifier == 0x181:
-                status, torque, rpm = struct.unpack("<Hhi", frame.data)
-                found.append((status, rpm * RPM, torque * 1.0, None, {9: Mode.SPEED, 10: Mode.TORQUE}.get(mode)))
+                status, torque, speed = struct.unpack(self.FEEDBACK, frame.data)
+                found.append((status, speed * self.speed_lsb, torque * self.torque_lsb, None, shown.get(mode)))
         return found
+
+
+class Epos4Bench(ProfileBench):
+    """rpm, thousandths of a rated torque that stands in µN·m, no 6074h, torque limit by current."""
+
+    PROFILE, WORN = "maxon/epos4", True
+    SETTINGS = ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x605A, 0), (0x3001, 2), (0x6080, 0), (0x6085, 0))
+    MODES = ((9, Mode.SPEED), (10, Mode.TORQUE))
+    speed_lsb, torque_lsb = RPM, 1.0
+    brakes_in_torque_mode = False  # its quick stop lets go there: `Preflight.quick_stop_in_torque_mode`
+    ramp_rad_s2 = 10.0 * RPM       # 1 rad/s² is 9.55 rpm/s, the next one up
 
     def setpoints(self, frames):
         words = [struct.unpack("<Hhi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
         return [(rpm * RPM, torque * 1.0) for _, torque, rpm in words]
 
 
-class S120Bench(CanopenBench):
+class S120Bench(ProfileBench):
     """Encoder increments a second (2048 pulses x 2^11), torque in 5810h with 4000h = 1000 N·m, node guarding."""
 
     PROFILE, WORN = "siemens/s120-canopen", True
@@ -44,6 +52,7 @@ class S120Bench(CanopenBench):
     LEAST_FRAMES = 1600            # at 100 Hz
     modes = frozenset({Mode.SPEED})
     ends = PowerState.OFF
+    MODES = ((3, Mode.SPEED),)
     speed_lsb, torque_lsb = 60.0 * RPM / 4194304, 1000.0 / 16384
 
     def _tap(self, frame):
@@ -58,23 +67,12 @@ class S120Bench(CanopenBench):
             frames.append((identifier, bytes(message.data)))
         return frames
 
-    def decode(self, frames):
-        found, mode = [], 0
-        for frame in frames:
-            if not frame.outgoing and frame.identifier == 0x281:
-                (mode,) = struct.unpack("<b", frame.data)
-            elif not frame.outgoing and frame.identifier == 0x181:
-                status, torque, counts = struct.unpack("<Hhi", frame.data)
-                shown = Mode.SPEED if mode == 3 else None
-                found.append((status, counts * self.speed_lsb, torque * self.torque_lsb, None, shown))
-        return found
-
     def setpoints(self, frames):
         words = [struct.unpack("<Hi", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]
         return [(counts * self.speed_lsb, None) for _, counts in words]
 
 
-class AbbBench(CanopenBench):
+class AbbBench(ProfileBench):
     """Velocity mode: 6042h and 6044h in rpm, 16 bits; torque in thousandths, no limit and no ramp that can be set."""
 
     PROFILE, WORN = "abb/acs880-fcan", True
@@ -83,6 +81,7 @@ class AbbBench(CanopenBench):
     LEAST_FRAMES = 1600            # at 100 Hz
     modes = frozenset({Mode.SPEED})
     ends = PowerState.OFF
+    FEEDBACK, MODES = "<Hhh", ((2, Mode.SPEED),)
     speed_lsb, torque_lsb = RPM, 1.0
     has_limits = False
     ramp_rad_s2, ramp_rel = 3.0, 0.12      # the simulated drive's own, so steep that its speed loop lags behind
@@ -90,17 +89,6 @@ class AbbBench(CanopenBench):
 
     def __init__(self, *args, **options):
         super().__init__(*args, rated_torque_nm=1000.0, **options)
-
-    def decode(self, frames):
-        found, mode = [], 0
-        for frame in frames:
-            if not frame.outgoing and frame.identifier == 0x281:
-                (mode,) = struct.unpack("<b", frame.data)
-            elif not frame.outgoing and frame.identifier == 0x181:
-                status, torque, rpm = struct.unpack("<Hhh", frame.data)
-                shown = Mode.SPEED if mode == 2 else None
-                found.append((status, rpm * RPM, torque * 1.0, None, shown))
-        return found
 
     def setpoints(self, frames):
         words = [struct.unpack("<Hh", frame.data) for frame in frames if frame.outgoing and frame.identifier == 0x201]

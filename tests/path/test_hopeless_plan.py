@@ -53,3 +53,24 @@ def test_what_hangs_on_the_shaft_is_left_to_the_run(tmp_path):
     )
     options = resolve({"amplitude_rad_s": 1.0, "excitation": "sine", "frequency_hz": 0.5}, load_rig(rig))
     refuse_hopeless(options, load_rig(rig), can_torque=True)
+
+
+@pytest.mark.parametrize(("profile", "lets_go"), [
+    ("siemens/s120-canopen", True), ("siemens/g130-s120", True), ("generic/cia402", False), ("generic/modbus", False),
+])
+def test_a_dry_run_knows_what_lets_go_of_a_string(tmp_path, profile, lets_go):
+    """By the profile, as the run itself refuses it in preflight."""
+    rig = tmp_path / "string.yaml"
+    rig.write_text(
+        "load: string\nmake_up_torque_nm: 29000\ntorque_ramp_nm_s: 400\n"
+        "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10, torque_nm: 400, time_s: 900, quick_stop_rad_s2: 2,"
+        " probe_torque_nm: 200, probe_travel_rad: 3}\n"
+    )
+    done = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile)
+    assert done.code == (4 if lets_go else 0), done.err
+    assert ("the drive lets go of it after a quick stop" in done.err) == lets_go
+    assert ("quick_stop of the profile" in done.err) == lets_go
+    coasting = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile,
+                     "--excitation", "coast-down")
+    assert coasting.code == 4
+    assert "coast-down was asked for, and a drill string hangs on the shaft" in coasting.err
