@@ -44,21 +44,25 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
 
     That is beside a file that has come there meanwhile. Raises UsageError where it can't be written.
     """
-    report = report_of(document, recording, sha256_of(Path(document["log"])))
-    if path.suffix.lower() == PDF:
-        from tdhil.report.pdf import pdf_bytes
-
-        data = pdf_bytes(report)
-    else:
-        data = report_page(report).encode()
-    if path.is_file():
-        path = fresh(path)
     try:
+        report = report_of(document, recording, sha256_of(Path(document["log"])))
+        if path.suffix.lower() == PDF:
+            from tdhil.report.pdf import pdf_bytes
+
+            data = pdf_bytes(report)
+        else:
+            data = report_page(report).encode()
+        if path.is_file():
+            path = fresh(path)
         with path.open("xb" if not path.exists() else "wb") as file:
             file.write(data)
         return path
-    except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}") from error
+    except OSError as error:      # of the file; or of a module or a font, with no descriptor left to read it by
+        raise UsageError(
+            f"can't be written ({error.strerror or error})",
+            where=f"--report {path}",
+            next_step=f"The run and its log are whole: tdhil replay {document['log']} --report {path.name}",
+        ) from error
 
 
 def sha256_of(path: Path) -> str:

@@ -2,8 +2,11 @@
 
 import importlib.util
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -154,3 +157,30 @@ def test_the_envelope_loses_no_peak():
     assert high.max() == 50.0
     assert low.min() == signal.min()
     assert np.all(low <= high)
+
+
+@pytest.mark.parametrize("name", ["r.html", "r.pdf"])
+def test_no_descriptor_left_for_the_report_is_said_plainly(tmp_path, name):
+    """Fonts and modules that are read late fail as the file does: not a mistake of ours."""
+    pytest.importorskip("resource")
+    script = f"""
+import resource, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from findings import RUN, full, recording
+from tdhil.errors import UsageError
+from tdhil.report import html, page, pictures
+from tdhil.report.document import result_document
+own = recording()
+document = result_document(full(), own, RUN, "run.mcap")
+resource.setrlimit(resource.RLIMIT_NOFILE, (3, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+try:
+    html.write_report(document, own, Path({str(tmp_path / name)!r}))
+except UsageError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"{name}: can't be written (Too many open files)" in done.stdout
+    assert f"tdhil replay run.mcap --report {name}" in done.stdout
+    assert not (tmp_path / name).exists()
