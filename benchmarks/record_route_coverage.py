@@ -23,9 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "identify"))
 from record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
 from tdhil.identify.identification import Identification
+from tdhil.identify.identify import identify
 from tdhil.identify.options import Options
-from tdhil.identify.record_route import identify_record
-from tdhil.identify.samples import usable_samples
 from tdhil.record.recording import LagPrior, Recording
 
 GROUP = 20
@@ -105,7 +104,7 @@ def main() -> int:
             seeds = list(range(first, min(first + GROUP, asked.first + asked.seeds)))
             recordings = simulate(machine, motion, seeds, prior=prior)
             begun_s = time.perf_counter()
-            found += [identify_record(one, usable_samples(one), Options(), None) for one in recordings]
+            found += [identify(one, Options()) for one in recordings]
             took_s += time.perf_counter() - begun_s
             kept += recordings if len(kept) < GROUP else []
         good &= row(machine, motion, found, kept, took_s)

@@ -147,6 +147,22 @@ class LinePoint:
 
 
 @dataclass(frozen=True)
+class Refusal:
+    """Why there can be no number, and what to do about it; a sentence each."""
+
+    reason: str
+    advice: str
+
+
+class Refused(Exception):
+    """Raised where an estimate can't be had. `identify` alone catches it, and makes it ``not_identifiable``."""
+
+    def __init__(self, reason: str, advice: str) -> None:
+        super().__init__(reason)
+        self.refusal = Refusal(reason, advice)
+
+
+@dataclass(frozen=True)
 class Identification:
     """The whole conclusion. Estimates are None where the verdict is a refusal or the quantity isn't in the model."""
 

@@ -20,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.identify.identification import BudgetLine, Identification, Verdict
-from tdhil.identify.options import Options
+from tdhil.identify.case import Finding
+from tdhil.identify.identification import BudgetLine
 from tdhil.record.recording import FloatArray, Recording, SteppedSetpoint
 
 NEGLIGIBLE = 1e-3         # of J
@@ -30,36 +30,25 @@ _LONGEST_S = 40.0
 _MOST = 0.5               # of J: beyond it there is no number
 
 
-def with_stepping(found: Identification, recording: Recording, options: Options) -> Identification:
-    """The result with its interval stretched, where the recording says that the setpoint was stepped slowly."""
-    stepped, inertia = recording.stepped_setpoint, found.inertia
+def stretched(finding: Finding, recording: Recording) -> Finding:
+    """The finding with what stepping may do to J, where the recording says that the setpoint was stepped slowly."""
+    stepped, inertia = recording.stepped_setpoint, finding.inertia
     if stepped is None or inertia is None:
-        return found
-    lag_s = 0.0 if found.torque_lag_s is None else max(found.torque_lag_s.low, 0.0)
+        return finding
+    lag_s = 0.0 if finding.torque_lag_s is None else max(finding.torque_lag_s.low, 0.0)
     share = worst_share(stepped, lag_s)
     if share < NEGLIGIBLE:
-        return found
+        return finding
     half = share * inertia.value
-    wider = replace(
-        inertia,
-        low=max(inertia.low - half, 0.0),
-        high=inertia.high + half,
-        low_total=max(inertia.low_total - half, 0.0),
-        high_total=inertia.high_total + half,
-    )
-    relative = 0.5 * (wider.high - wider.low) / wider.value
-    verdict, reason, advice = found.verdict, found.reason, found.advice
-    if verdict is Verdict.VALID and relative > options.tolerance:
-        verdict = Verdict.VALID_WIDE
-        reason = f"{reason}, but the interval is ±{relative:.2%}, wider than ±{options.tolerance:.2%}"
     note = f"torque is read once in {1e3 * stepped.period_s:.3g} ms, in step with the setpoint that moves the drive"
-    warnings = found.warnings
-    if half > 0.5 * (inertia.high - inertia.low):
-        advice = "shorten the cycle (baud rate, function 23, TCP), or use a drive's torque mode"
-        warnings = (*warnings, f"{note}: J may be off by {share:.1%} for that alone")
-    budget = (*found.budget, BudgetLine("stepped setpoint", half, note)) if found.budget else found.budget
+    budget = (*finding.budget, BudgetLine("stepped setpoint", half, note)) if finding.budget else finding.budget
+    finding = replace(finding, reading_kg_m2=half, budget=budget)
+    if half <= 0.5 * (inertia.high - inertia.low):
+        return finding
     return replace(
-        found, inertia=wider, verdict=verdict, reason=reason, advice=advice, warnings=warnings, budget=budget
+        finding,
+        advice="shorten the cycle (baud rate, function 23, TCP), or use a drive's torque mode",
+        warnings=(*finding.warnings, f"{note}: J may be off by {share:.1%} for that alone"),
     )
 
 

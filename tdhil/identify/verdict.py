@@ -1,177 +1,94 @@
-"""From numbers to a conclusion: which verdict, why, and what the number rests on."""
+"""From a finding to the conclusion: which verdict, why, and what the number rests on. Here alone is one made."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import replace
 
-from tdhil.identify.faults.quality import Refusal
-from tdhil.identify.identification import Identification, InertiaEstimate, PaperEstimate, Verdict
-from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.line_points import fitted_points
-from tdhil.identify.lines.model import GaussianPrior, Model
-from tdhil.identify.lines.reports import SKEW
-from tdhil.identify.lines.residual import REJECT_P, rejects
-from tdhil.identify.lines.rigid_result import RigidResult, turned
+from tdhil.identify.case import Case, Finding
+from tdhil.identify.identification import Identification, InertiaEstimate, Verdict
 from tdhil.identify.options import Options
-from tdhil.identify.torque_scale import with_total
-from tdhil.record.recording import LagPrior, Recording
+from tdhil.identify.torque_scale import widened_most_by_scale, with_total
+from tdhil.record.recording import Stage
 
-RIGID = "rigid+lags"
-_RIGID_WORDS = "a rigid shaft seen through reporting lags"
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What was there to conclude from."""
-
-    paper: PaperEstimate | None
-    periods: int
-    samples: int
-    warnings: tuple[str, ...]
+_SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"
+_BY_SCALE = "the drive's torque, checked against a known one, would sharpen this most"
 
 
-def refused(
-    refusal: Refusal,
-    paper: PaperEstimate | None,
-    periods: int,
-    samples: int,
-    warnings: tuple[str, ...],
-) -> Identification:
-    """No number, a reason and advice."""
-    return Identification(
-        verdict=Verdict.NOT_IDENTIFIABLE,
-        model="none",
-        reason=refusal.reason,
-        advice=refusal.advice,
-        inertia=None,
-        viscous_nm_s_rad=None,
-        coulomb_nm=None,
-        speed_lag_s=None,
-        torque_lag_s=None,
-        skew_s=None,
-        paper=paper,
-        periods_used=periods,
-        samples_used=samples,
-        warnings=warnings,
-    )
+def conclude(case: Case, finding: Finding) -> Identification:
+    """The verdict on whatever was found. An abort goes before all else that the data say: without it they might differ.
 
-
-def conclude(
-    result: RigidResult | None,
-    recording: Recording,
-    options: Options,
-    evidence: Evidence,
-    tie: ViscousTie | None,
-    priors: tuple[GaussianPrior, ...],
-    words: str = _RIGID_WORDS,
-) -> Identification:
-    """The verdict on a fitted rigid model; ``words``: which, for the reader."""
-    rejected = result is not None and rejects(result.residual)
-    if result is None or not (rejected or result.inertia.bounded):
-        return refused(
-            Refusal(
-                "the data leave the inertia open: it can't be told from the lags of the reported signals",
-                "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
-            ),
-            evidence.paper,
-            evidence.periods,
-            evidence.samples,
-            evidence.warnings,
-        )
-    as_paper = options.model == "paper"
-    test = result.residual
-    inertia = None if rejected else _inertia(result, recording, options, evidence, priors)
-    relative = 0.5 * (inertia.high - inertia.low) / inertia.value if inertia is not None else math.inf
-    verdict = Verdict.VALID if relative <= options.tolerance else Verdict.VALID_WIDE
-    if inertia is None:
-        verdict = Verdict.MODEL_REJECTED
-    reason, advice = _words(verdict, result, options, tie, relative, words)
-    kept = not rejected
+    ``valid`` where the interval is as narrow as was asked for, ``valid_wide`` where it is bounded, ``model_rejected``
+    by the residuals' p-value, ``not_identifiable`` where a route had to refuse.
+    """
+    inertia = _inertia(case, finding)
+    verdict, reason, advice = _judged(case.options, finding, inertia)
+    warnings = (*case.warnings, *finding.warnings)
+    if case.aborted is not None:
+        said = _aborted(case.aborted)
+        if inertia is not None:
+            warnings = (f"{said}: the result is from what was recorded before", *warnings)
+        else:
+            reason = f"{said}; what was recorded before can't tell: {reason}"
+            advice = "mend what ended the run, and run it again"
     return Identification(
         verdict=verdict,
-        model="paper" if as_paper else RIGID,
+        model=finding.model,
         reason=reason,
         advice=advice,
         inertia=inertia,
-        viscous_nm_s_rad=result.viscous if kept else None,
-        coulomb_nm=result.coulomb if kept else None,
-        speed_lag_s=result.speed_lag_s if kept and not as_paper else None,
-        torque_lag_s=result.torque_lag_s if kept and not as_paper else None,
-        skew_s=result.skew_s if kept and not as_paper else None,
-        paper=evidence.paper,
-        residual=test,
-        periods_used=evidence.periods,
-        samples_used=evidence.samples,
-        warnings=(*evidence.warnings, *_caveats(result, tie, as_paper)),
-        budget=result.budget if kept else (),
-        lines=fitted_points(result.fitted, options.confidence),
+        viscous_nm_s_rad=finding.viscous_nm_s_rad,
+        coulomb_nm=finding.coulomb_nm,
+        speed_lag_s=finding.speed_lag_s,
+        torque_lag_s=finding.torque_lag_s,
+        skew_s=finding.skew_s,
+        paper=case.paper,
+        residual=finding.residual,
+        periods_used=case.periods_used,
+        samples_used=case.samples_used if finding.samples_used is None else finding.samples_used,
+        warnings=warnings,
+        budget=finding.budget,
+        second_opinions=finding.second_opinions,
+        friction_curve=finding.friction_curve,
+        compliant=finding.compliant,
+        lines=finding.lines,
     )
 
 
-def _inertia(
-    result: RigidResult,
-    recording: Recording,
-    options: Options,
-    evidence: Evidence,
-    priors: tuple[GaussianPrior, ...],
-) -> InertiaEstimate:
-    estimate = result.inertia
-    if options.model == "paper" and evidence.paper is not None:
-        estimate = turned(estimate, evidence.paper.stepped.inertia_kg_m2)
-    conditions = _conditions(result, options, recording, priors)
-    return with_total(estimate, recording.torque_scale_rel_sd, options.confidence, conditions)
+def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
+    """With the torque scale's uncertainty in quadrature, and what the reading of torque adds on either side."""
+    if finding.inertia is None:
+        return None
+    conditions = ("torque scale exact", *finding.conditions)
+    told = with_total(finding.inertia, case.recording.torque_scale_rel_sd, case.options.confidence, conditions)
+    half = finding.reading_kg_m2
+    if half == 0.0:
+        return told
+    return replace(
+        told,
+        low=max(told.low - half, 0.0),
+        high=told.high + half,
+        low_total=max(told.low_total - half, 0.0),
+        high_total=told.high_total + half,
+    )
 
 
-def _conditions(
-    result: RigidResult, options: Options, recording: Recording, priors: tuple[GaussianPrior, ...]
-) -> tuple[str, ...]:
-    conditions = ["torque scale exact"]
-    if options.model == "paper":
-        return (*conditions, "no reporting lags")
-    conditions += of_reports(recording.lag_prior)
-    skew = Model().at(SKEW)
-    conditions += [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in priors if p.index == skew]
-    return tuple(conditions)
+def _judged(options: Options, finding: Finding, inertia: InertiaEstimate | None) -> tuple[Verdict, str, str]:
+    """The verdict, its reason and the advice."""
+    if finding.rejected:
+        return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected
+    if finding.inertia is None or inertia is None:
+        return Verdict.NOT_IDENTIFIABLE, finding.refusal.reason, finding.refusal.advice
+    wide = f"wider than ±{options.tolerance:.2%}"
+    own = 0.5 * (finding.inertia.high - finding.inertia.low) / finding.inertia.value
+    whole = 0.5 * (inertia.high - inertia.low) / inertia.value
+    if not own <= options.tolerance:
+        reason = f"{finding.explained}, but the {finding.words.spread} is ±{own:.2%}, {wide}"
+        return Verdict.VALID_WIDE, reason, finding.advice or finding.words.if_wide
+    if whole > options.tolerance:
+        reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
+        return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER
+    advice = _BY_SCALE if widened_most_by_scale(inertia) else finding.advice or _SHARPER
+    return Verdict.VALID, finding.explained, advice
 
 
-def of_reports(prior: LagPrior) -> list[str]:
-    """What an inertia is conditional on, of the reports."""
-    stated = [
-        name for name, lag in (("speed", prior.speed_lag_s), ("torque", prior.torque_lag_s)) if lag is not None
-    ]
-    found = []
-    if stated:
-        by = f" by {prior.source}" if prior.source else ""
-        found.append(f"reporting lags as stated{by}, first order: {', '.join(stated)}")
-    if len(stated) < 2:
-        found.append("unstated reporting filters: two poles, a moving average and a delay at most")
-    return found
-
-
-def _words(
-    verdict: Verdict, result: RigidResult, options: Options, tie: ViscousTie | None, relative: float, words: str
-) -> tuple[str, str]:
-    what = "the paper's model, without lags," if options.model == "paper" else words
-    p_value = result.residual.p_value if result.residual is not None else None
-    if verdict is Verdict.MODEL_REJECTED:
-        advice = (
-            "identify with the rigid model, which includes reporting lags"
-            if options.model == "paper"
-            else "look for a compliant load, play, or friction that changes with speed or time; try lower lines"
-        )
-        return f"the residuals contradict {what} (p = {p_value:.1g})", advice
-    fits = f"{what} explains the data" + (f" (p = {p_value:.2g})" if p_value is not None else ", untested")
-    if verdict is Verdict.VALID:
-        return fits, "identical filters on reported speed and torque, or known ones, would sharpen this further"
-    advice = "excite with more amplitude or for longer" + (", and about two mean speeds" if tie is None else "")
-    return f"{fits}, but the repeatability is ±{relative:.2%}, wider than ±{options.tolerance:.2%}", advice
-
-
-def _caveats(result: RigidResult, tie: ViscousTie | None, as_paper: bool) -> tuple[str, ...]:
-    found = []
-    if tie is None:
-        found.append("only one mean speed: viscous friction rests on the lines, not on levels")
-    if not as_paper and not result.first_order:
-        found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
-    if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
-        found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
-    return tuple(found)
+def _aborted(stage: Stage) -> str:
+    cause = f" ({stage.detail})" if stage.detail else ""
+    return f"the run was aborted in stage {stage.name}{cause}"

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
-from tdhil.identify import Options, Verdict
-from tdhil.identify.record_route import identify_record
+from tdhil.identify import Options, Verdict, identify
 from tdhil.identify.record_route.bins import joined, measure, windows
 from tdhil.identify.record_route.equation import PARAMETERS, evaluate
 from tdhil.identify.record_route.stretches import runs, thinned
@@ -19,7 +18,7 @@ from tdhil.study.coverage_simulator import simulate as simulate_plan
 
 
 def found(recording, **options):
-    return identify_record(recording, usable_samples(recording), Options(**options), None)
+    return identify(replace(recording, excitation=None), Options(**options))
 
 
 def quiet(machine):
@@ -182,6 +181,6 @@ def test_what_stands_beside_a_line_need_not_stand_clear():
         coverage_plants.Reading(jitter_s=0.001), lowest_hz=0.2,
     )
     for recording in simulate_plan(plant, [(1, 2, 0), (1, 2, 1)], 20):
-        got = found(replace(recording, excitation=None))
+        got = found(recording)
         assert got.verdict in (Verdict.VALID, Verdict.VALID_WIDE), got.reason
         assert got.inertia.low <= plant.inertia_kg_m2 <= got.inertia.high

@@ -12,9 +12,10 @@ from scipy.stats import binom
 from shaft_bench import Rig, simulate
 from stages_bench import Stages, run_stages, usual_runs
 
-from tdhil.identify import Compliant, Estimate, Identification, InertiaEstimate, Options, Verdict
+from tdhil.identify import Compliant, Estimate, Options
 from tdhil.identify.beside.momentum_rows import through
 from tdhil.identify.beside.second_opinion import disagreements, second_opinions
+from tdhil.identify.case import Case, Finding
 from tdhil.identify.lines.friction import measure_levels
 from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import Samples, stretches, usable_samples
@@ -31,9 +32,8 @@ def around(value, half):
 def result(inertia=TRUE, half=0.45, delay=0.25, delay_sd=0.018):
     """What the lines may have said; delay None: nothing of the lags."""
     lag = None if delay is None else around(delay, 1.96 * delay_sd)
-    own = InertiaEstimate(inertia, inertia - half, inertia + half, inertia - 4.0, inertia + 4.0, 0.95, ())
     zero = None if delay is None else around(0.0, 0.0)
-    return Identification(Verdict.VALID, "rigid+lags", "", "", own, None, None, lag, zero, zero, None)
+    return Finding(inertia=around(inertia, half), speed_lag_s=lag, torque_lag_s=zero, skew_s=zero)
 
 
 def levels_of(recording, samples):
@@ -45,7 +45,7 @@ def levels_of(recording, samples):
 def opinions_of(recording, found=None, levels=True):
     samples = usable_samples(recording)
     own = levels_of(recording, samples) if levels else None
-    return second_opinions(recording, samples, own, found or result(), Options())
+    return second_opinions(Case(recording, Options(), samples=samples, levels=own), found or result())
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_without_knowing_the_lags_it_is_wider_and_still_covers():
 
 def test_without_excited_segments_the_rows_tell_the_scatter():
     """As after a refusal, or in a foreign trace: no levels, nothing of the lags, no result."""
-    nothing = replace(result(delay=None), inertia=None, verdict=Verdict.NOT_IDENTIFIABLE)
+    nothing = replace(result(delay=None), inertia=None)
     covered = 0
     for recording in usual_runs()[:60]:
         first, *_ = opinions_of(replace(recording, excitation=None), nothing, levels=False)
@@ -203,7 +203,7 @@ def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
         recording = record(stamp, speed[: len(stamp)], torque[: len(stamp)])
         samples = Samples(recording.time_s, recording.speed_rad_s, recording.torque_nm)
         with np.errstate(all="ignore"):
-            opinions = second_opinions(recording, samples, None, result(), Options())
+            opinions = second_opinions(Case(recording, Options(), samples=samples), result())
         if name != "ramp":
             assert opinions == ()
         assert all(math.isfinite(o.inertia_kg_m2.high) and o.inertia_kg_m2.value > 0.0 for o in opinions)

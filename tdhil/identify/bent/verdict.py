@@ -10,59 +10,54 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.identify.bent.fit import BentFit, Motion, fit_bends, inertia_of
-from tdhil.identify.identification import BudgetLine, Estimate, Identification
+from tdhil.identify.bent.wave import wave_of
+from tdhil.identify.case import Finding, PeriodicCase
+from tdhil.identify.identification import BudgetLine, Estimate, Refusal
 from tdhil.identify.lines.budget import budget_of
-from tdhil.identify.lines.fit import Held, rigid_rivals
-from tdhil.identify.lines.friction import ViscousTie
+from tdhil.identify.lines.fit import rigid_rivals
+from tdhil.identify.lines.friction import ViscousTie, tie_viscous
 from tdhil.identify.lines.interval import estimate
-from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.profile import student_quantile
 from tdhil.identify.lines.residual import rejects
-from tdhil.identify.lines.rigid_result import RigidResult, lags_of
+from tdhil.identify.lines.rigid_result import RIGID, RigidResult, lags_of, rigid_finding
 from tdhil.identify.lines.shaft import INERTIA
-from tdhil.identify.options import Options
-from tdhil.identify.verdict import RIGID, Evidence, conclude
-from tdhil.record.recording import Recording
 
 MODEL = f"{RIGID}, bent friction"
 _MORE = 2      # parameters than with straight friction
 
 
-def identify_bent(
-    recording: Recording,
-    options: Options,
-    evidence: Evidence,
-    motion: Motion,
-    priors: tuple[GaussianPrior, ...],
-    held: Held,
-    rigid: RigidResult,
-) -> Identification | None:
-    """``rigid``, ``priors`` and ``held``: of the rigid shaft with straight friction, which the data contradict.
+def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
+    """``rigid``: the rigid shaft with straight friction, which the data contradict.
 
     None where this one does no better, or leaves the inertia open.
     """
-    tie = motion.tie
+    tie = tie_viscous(case.levels)
     if tie is None or rigid_rivals(rigid.fitted.simple.theta):
         return None
+    waves = tuple(
+        wave_of(fit, one.segment) for fit, one in zip(case.fits, case.stretches, strict=True) if len(fit.speed)
+    )
+    straight = rigid.fitted
+    motion = Motion(waves, case.levels, straight.problem.lines, tie)
     try:
-        found = fit_bends(motion, priors, held, rigid)
+        found = fit_bends(motion, straight.problem.priors, straight.held, rigid)
         if not found or found[0].residual is None or rejects(found[0].residual):
             return None
-        if rigid.fitted.whole.objective - found[0].objective <= _MORE * math.log(found[0].fitted.problem.numbers):
+        if straight.whole.objective - found[0].objective <= _MORE * math.log(found[0].fitted.problem.numbers):
             return None
-        result = _result(found, tie, options.confidence, recording.torque_scale_rel_sd)
+        result = _result(found, tie, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
-    words = "a rigid shaft whose friction is no straight line over speed"
-    said = conclude(result, recording, options, evidence, tie, priors, words)
-    if said.inertia is None:
+    finding = rigid_finding(result, case, "a rigid shaft whose friction is no straight line over speed")
+    if isinstance(finding, Refusal):
         return None
     against = rigid.residual.p_value if rigid.residual is not None else 0.0
     return replace(
-        said,
+        finding,
         model=MODEL,
-        reason=f"the residuals contradict straight friction (p = {against:.1g}); {said.reason}",
-        warnings=(*said.warnings, _told(found[0], motion)),
+        bent=True,
+        preface=f"the residuals contradict straight friction (p = {against:.1g}); ",
+        warnings=(*finding.warnings, _told(found[0], motion)),
     )
 
 

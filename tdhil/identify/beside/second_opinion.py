@@ -15,13 +15,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from tdhil.identify.beside.friction_curve import friction_curve
+from tdhil.identify.beside.friction_curve_points import Inertia
 from tdhil.identify.beside.momentum import Balances, balances
 from tdhil.identify.beside.momentum_fit import UNKNOWN_DELAY, Delay, Density, MomentumFit, Resolution, fit_momentum
 from tdhil.identify.beside.momentum_rows import Kind
-from tdhil.identify.identification import Estimate, Identification, SecondOpinion
-from tdhil.identify.lines.friction import Levels
+from tdhil.identify.case import Case, Finding
+from tdhil.identify.identification import Estimate, SecondOpinion
 from tdhil.identify.lines.profile import student_quantile
-from tdhil.identify.options import Options
 from tdhil.identify.samples import Samples
 from tdhil.record.recording import FloatArray, Recording
 
@@ -30,35 +31,54 @@ _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
 
 
-def second_opinions(
-    recording: Recording,
-    samples: Samples,
-    levels: Levels | None,
-    identification: Identification,
-    options: Options,
-) -> tuple[SecondOpinion, ...]:
-    """J by every route that the run has; () where there is none. Never raises.
+def cross_checked(finding: Finding, case: Case) -> Finding:
+    """The finding with what else the run says. Without excited segments there is no friction curve. Never raises.
 
-    ``levels``: of the excited segments, None if there were none. ``identification``: as far as it has come; its lags
-    and its J are looked at, where it has them.
+    Not for data that were refused as such: a second opinion would be a number out of them (`Case.sound`).
     """
+    opinions = second_opinions(case, finding)
+    warnings = (*finding.warnings, *disagreements(opinions, finding))
+    inertia = _inertia(case, finding, opinions)
+    if inertia is None or case.levels is None:
+        return replace(finding, second_opinions=opinions, warnings=warnings)
+    curve = friction_curve(case.recording, case.samples, case.levels, inertia, case.options)
+    # where the bend is part of the model, J knows of it
+    warnings = (*warnings, *(() if finding.bent else curve.warnings))
+    return replace(finding, second_opinions=opinions, friction_curve=curve.points, warnings=warnings)
+
+
+def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) -> Inertia | None:
+    """J of everything that turns with its standard deviation: the finding's, else a second opinion's."""
+    known = reference_inertia(finding)
+    if known is None and opinions:
+        known = opinions[0].inertia_kg_m2
+    if known is None:
+        return None
+    sd = 0.5 * (known.high - known.low) / student_quantile(case.options.confidence, 1e6)
+    finite = math.isfinite(known.value) and math.isfinite(sd)
+    return Inertia(known.value, sd, known_delay(case.recording, finding)) if finite else None
+
+
+def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
+    """J by every route that the run has; () where there is none. The finding's own J and lags are looked at, where it
+    has them. Never raises.
+    """
+    levels = case.levels
     try:
-        found = balances(recording, samples, alone=levels is None or levels.dof < _LEAST_DOF)
-        if found is None:
-            return ()
-        opinions = _opinions(recording, samples, found, levels, identification, options)
+        found = balances(case.recording, case.samples, alone=levels is None or levels.dof < _LEAST_DOF)
+        opinions = () if found is None else _opinions(case, found, finding)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
         return ()
     share = _FALSE_ALARM / max(1, len(opinions))
     return tuple(
-        replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, identification, options.confidence, share))
+        replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, finding, case.options.confidence, share))
         for opinion in opinions
     )
 
 
-def disagreements(opinions: tuple[SecondOpinion, ...], identification: Identification) -> tuple[str, ...]:
-    """One warning for each second opinion that contradicts the result."""
-    reference = reference_inertia(identification)
+def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
+    """One warning for each second opinion that contradicts the finding."""
+    reference = reference_inertia(finding)
     if reference is None:
         return ()
     return tuple(
@@ -70,23 +90,17 @@ def disagreements(opinions: tuple[SecondOpinion, ...], identification: Identific
     )
 
 
-def _opinions(
-    recording: Recording,
-    samples: Samples,
-    found: Balances,
-    levels: Levels | None,
-    identification: Identification,
-    options: Options,
-) -> tuple[SecondOpinion, ...]:
+def _opinions(case: Case, found: Balances, finding: Finding) -> tuple[SecondOpinion, ...]:
+    recording, levels = case.recording, case.levels
     density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
-    delay = known_delay(recording, identification)
-    resolution = _resolution(recording, samples, found)
+    delay = known_delay(recording, finding)
+    resolution = _resolution(recording, case.samples, found)
     steps = recording.excitation is not None and recording.excitation.kind == "step"
     opinions = []
     for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
         if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):
             continue
-        fit = fit_momentum(found, kind, density, delay, resolution, options.confidence)
+        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence)
         if fit is None or not fit.half_width < _OPEN * fit.inertia:
             continue
         inertia = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
@@ -94,9 +108,9 @@ def _opinions(
     return tuple(opinions)
 
 
-def known_delay(recording: Recording, identification: Identification) -> Delay:
+def known_delay(recording: Recording, finding: Finding) -> Delay:
     """δ = τ_w − τ_T − skew: fitted, else stated, else unknown."""
-    speed, torque, skew = identification.speed_lag_s, identification.torque_lag_s, identification.skew_s
+    speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
     if speed is not None and torque is not None and skew is not None:
         value = speed.value - torque.value - skew.value
         halves = [0.5 * (part.high - part.low) for part in (speed, torque, skew)]
@@ -134,17 +148,14 @@ def _rounding(quantum: float, parts: list[FloatArray]) -> float:
     return quantum / math.sqrt(12.0) * math.exp(-2.0 * math.pi**2 * before / quantum**2)
 
 
-def reference_inertia(identification: Identification) -> Estimate | None:
+def reference_inertia(finding: Finding) -> Estimate | None:
     """What a momentum balance must be compared with: all that turns, also behind a compliant shaft."""
-    if identification.compliant is not None:
-        return identification.compliant.total_inertia
-    inertia = identification.inertia
-    return None if inertia is None else Estimate(inertia.value, inertia.low, inertia.high)
+    return finding.inertia if finding.compliant is None else finding.compliant.total_inertia
 
 
-def _agrees(own: Estimate, identification: Identification, confidence: float, miss_share: float) -> bool | None:
+def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: float) -> bool | None:
     """Is the difference within what two independent intervals leave? ``miss_share``: the chance to say no wrongly."""
-    reference = reference_inertia(identification)
+    reference = reference_inertia(finding)
     if reference is None or not reference.finite:
         return None
     below = own.value < reference.value

@@ -19,7 +19,7 @@ import numpy as np
 from tdhil.identify.compliant.fit import SLOWEST_SEEN, CompliantFit, chance_gain, fit_compliant
 from tdhil.identify.compliant.string_shaft import StringShaft
 from tdhil.identify.compliant.two_mass import LOAD, SWING, TwoMassShaft
-from tdhil.identify.faults.quality import Refusal
+from tdhil.identify.identification import Refusal
 from tdhil.identify.lines.fit import Held
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.model import GaussianPrior
@@ -89,9 +89,7 @@ def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
     return two.fitted.whole.objective - string.fitted.whole.objective > chance_gain()
 
 
-def may_swing(
-    rigid: RigidResult, lines: tuple[Line, ...], tie: ViscousTie | None, priors: tuple[GaussianPrior, ...], held: Held
-) -> bool:
+def may_swing(rigid: RigidResult) -> bool:
     """Should another shaft be tried? Where the rigid one is rejected; and where a load that swings behind first-order
     lags explains the data much better than the lags of a rigid shaft do, whatever their structure.
 
@@ -99,17 +97,18 @@ def may_swing(
     the price of an inertia far too low. Looked into only where first-order lags don't do and the test is in doubt:
     a rigid shaft with plain lags pays nothing for it.
     """
+    fitted, problem = rigid.fitted, rigid.fitted.problem
     if rejects(rigid.residual):
         return True
     if rigid.first_order or rigid.residual is None or rigid.residual.p_value > _DOUBT:
         return False
-    if _refuse_count(TwoMassShaft(), lines, tie, priors) is not None:
+    if _refuse_count(TwoMassShaft(), problem.lines, problem.tie, problem.priors) is not None:
         return False
     try:
-        two = fit_compliant(TwoMassShaft(), lines, tie, priors, held)
+        two = fit_compliant(TwoMassShaft(), problem.lines, problem.tie, problem.priors, fitted.held)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return False
-    return rigid.fitted.whole.objective - two.fitted.simple.objective > _MUCH
+    return fitted.whole.objective - two.fitted.simple.objective > _MUCH
 
 
 def plausible(fit: CompliantFit) -> bool:

@@ -11,7 +11,7 @@ it bends nothing.
 
 import numpy as np
 
-from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.identification import Refused
 from tdhil.identify.samples import Samples
 from tdhil.record.recording import FloatArray, Recording, Segment
 
@@ -27,15 +27,15 @@ _LOOKED_AT = 50_000       # of them at most
 _ADVICE = "use less amplitude, or more torque if the machine allows it"
 
 
-def refuse_limited(
+def check_limited(
     recording: Recording, windows: list[tuple[float, float]], parts: list[tuple[Segment, Samples]], kind: str
-) -> Refusal | None:
-    """The drive's flag and limit over all the excitation, then each segment's shape."""
+) -> None:
+    """Raise Refused by the drive's flag and limit over all the excitation, then by each segment's shape."""
     flags = [recording.limited[slice(*np.searchsorted(recording.time_s, window))] for window in windows]
     count = sum(len(flag) for flag in flags)
     flagged = sum(int(np.count_nonzero(flag)) for flag in flags) / count if count else 0.0
     if flagged > LIMIT_SHARE:
-        return Refusal(f"the drive was at an internal limit for {flagged:.1%} of the excitation", _ADVICE)
+        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the excitation", _ADVICE)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
         above, below = _AT_LIMIT * limit - recording.torque_offset_nm, -_AT_LIMIT * limit - recording.torque_offset_nm
@@ -46,9 +46,9 @@ def refuse_limited(
         saturated = hits / sum(len(part) for _, part in parts)
         if saturated > LIMIT_SHARE:
             reason = f"the torque was at its limit of {limit:g} N·m for {saturated:.1%} of the excitation"
-            return Refusal(reason, _ADVICE)
+            raise Refused(reason, _ADVICE)
     if kind == "step":
-        return None
+        return
     for segment, part in parts:
         for name, signal, quantum in (
             ("torque", part.torque_nm, recording.torque_resolution_nm),
@@ -57,11 +57,10 @@ def refuse_limited(
             share = flat_share(signal, quantum)
             if share is not None:
                 where = f"about {segment.offset_rad_s:.3g} rad/s"
-                return Refusal(
+                raise Refused(
                     f"the {name} is cut off flat for {share:.1%} of the excitation {where}",
                     f"{_ADVICE}; or widen the range in which the {name} is reported",
                 )
-    return None
 
 
 def flat_share(signal: FloatArray, quantum: float) -> float | None:

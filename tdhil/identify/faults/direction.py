@@ -9,19 +9,19 @@ number at lines that are far apart, torque is a copy of speed: inertia and lags 
 
 import numpy as np
 
-from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.identification import Refused
 from tdhil.identify.lines.spectrum import Line
 
 _CLEAR = 5.0      # sd by which Im(T W*) must be below zero at one line at least; at the others it must be below
 _COPY = 1e-3      # relative
 
 
-def refuse_direction(lines: tuple[Line, ...], mean_speed: float, mean_torque: float) -> Refusal | None:
-    """A refusal if at every one of the excited lines torque trails speed; means in rad/s and N·m."""
+def check_direction(lines: tuple[Line, ...], mean_speed: float, mean_torque: float) -> None:
+    """Raise Refused if at every one of the excited lines torque trails speed; means in rad/s and N·m."""
     if not lines:
-        return None
+        return
     if _copied(lines):
-        return Refusal(
+        raise Refused(
             "the torque is a copy of the speed: their ratio is the same at every line",
             "check which columns hold speed and torque",
         )
@@ -31,16 +31,16 @@ def refuse_direction(lines: tuple[Line, ...], mean_speed: float, mean_torque: fl
         # what one period's scatter makes of it
         noise = np.sqrt((line.s_tt * np.abs(line.speed) ** 2 + line.s_ww * np.abs(line.torque) ** 2) / line.periods)
         if np.any(cross >= 0.0):
-            return None
+            return
         clearest = max(clearest, float(np.max(-cross / noise)))
     if clearest < _CLEAR:
-        return None
+        return
     if mean_speed * mean_torque < 0.0:
-        return Refusal(
+        raise Refused(
             "the torque opposes every acceleration, and the mean speed too: its sign is the wrong way round",
             "count torque positive that drives the speed positive",
         )
-    return Refusal(
+    raise Refused(
         "the torque trails the speed at every line, as for a negative inertia: speed and torque stand in each other's "
         "place, or one of them has the wrong sign",
         "check which column is which, and the sign of the torque",

@@ -19,6 +19,17 @@ def good_samples(recording: Recording) -> BoolArray:
     return good
 
 
+def log_warnings(recording: Recording) -> tuple[str, ...]:
+    """What the log itself says of its samples: that they are not all, and that some brought nothing new."""
+    found = []
+    if not recording.complete:
+        found.append("the log ended before the run did: partial data")
+    stale = float((~recording.fresh).mean())
+    if stale > 0.01:
+        found.append(f"{stale:.1%} of the samples were stale and left out")
+    return tuple(found)
+
+
 def left_out_warnings(recording: Recording) -> tuple[str, ...]:
     """A sentence for each kind of fault that samples were left out for; stale ones, which were flagged, apart."""
     said = []

@@ -9,13 +9,11 @@ import math
 
 import numpy as np
 
-from tdhil.identify.faults.clipped import LIMIT_SHARE, refuse_limited
-from tdhil.identify.faults.declared import refuse_declared
-from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.faults.clipped import LIMIT_SHARE, check_limited
+from tdhil.identify.faults.declared import check_declared
+from tdhil.identify.identification import Refused
 from tdhil.identify.samples import Samples, excited_window
-from tdhil.record.recording import FloatArray, Recording
-
-__all__ = ["Refusal", "refuse_motion", "refuse_samples"]
+from tdhil.record.recording import Excitation, FloatArray, Recording
 
 _LEAST_SAMPLES = 64
 _STALE_SHARE = 0.5
@@ -25,80 +23,71 @@ _MOTIONLESS = 2.0       # steps of a signal within which it hasn't changed
 _TINY = 1e-12           # of a signal's size, or of its unit: below it is the arithmetic's own
 
 
-def refuse_samples(recording: Recording) -> Refusal | None:
-    """Shapes, time stamps, numbers and freshness: what must hold before samples can be used at all."""
+def check_samples(recording: Recording) -> None:
+    """Raise Refused unless the samples can be used at all: shapes, time stamps, numbers and freshness."""
     count = int(np.size(recording.time_s))
     others = (recording.speed_rad_s, recording.torque_nm, recording.fresh, recording.limited)
     if any(np.shape(other) != (count,) for other in others) or np.ndim(recording.time_s) != 1:
-        return Refusal("the signals differ in length", "record time, speed and torque of the same samples")
+        raise Refused("the signals differ in length", "record time, speed and torque of the same samples")
     if count < _LEAST_SAMPLES:
-        return Refusal(f"{count} samples are too few to identify anything", "record whole periods of the excitation")
+        raise Refused(f"{count} samples are too few to identify anything", "record whole periods of the excitation")
     signals = (recording.time_s, recording.speed_rad_s, recording.torque_nm)
     flags = (recording.fresh, recording.limited)
     if any(signal.dtype.kind not in "fiu" for signal in signals) or any(flag.dtype.kind != "b" for flag in flags):
-        return Refusal("the signals are not numbers", "look for a decoding fault")
+        raise Refused("the signals are not numbers", "look for a decoding fault")
     time = recording.time_s
     if not np.all(np.isfinite(time)) or np.any(time[1:] <= time[:-1]):
-        return Refusal("the time stamps do not rise throughout", "repair the clock or the order of the samples")
+        raise Refused("the time stamps do not rise throughout", "repair the clock or the order of the samples")
     if float(time[-1]) - float(time[0]) > _LONGEST_S:
-        return Refusal(
+        raise Refused(
             f"the time spans {float(time[-1]) - float(time[0]):.3g} s, more than a week",
             "check the unit of the time stamps",
         )
     if not np.isfinite(recording.torque_offset_nm):
-        return Refusal("the torque offset is not a number", "measure the torque at standstill again")
+        raise Refused("the torque offset is not a number", "measure the torque at standstill again")
     fresh = recording.fresh
     finite = np.isfinite(recording.speed_rad_s)
     finite &= np.isfinite(recording.torque_nm)
     fresh_count = int(np.count_nonzero(fresh))
     bad = 1.0 - np.count_nonzero(finite & fresh) / fresh_count if fresh_count else 0.0
     if bad > LIMIT_SHARE:
-        return Refusal(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault")
+        raise Refused(f"{bad:.0%} of the samples are not numbers", "look for a decoding or wiring fault")
     stale = 1.0 - fresh_count / count
     if stale > 1.0 - _STALE_SHARE:
-        return Refusal(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus")
+        raise Refused(f"{stale:.0%} of the samples brought nothing new", "lower the cycle rate or repair the bus")
     for name, signal in (("speed", recording.speed_rad_s), ("torque", recording.torque_nm)):
         largest = max(abs(float(np.max(signal, where=finite, initial=0.0))),
                       abs(float(np.min(signal, where=finite, initial=0.0))))
         if largest > _HUGE:
-            return Refusal(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault")
-    return _refuse_known(recording)
+            raise Refused(f"the {name} reaches {largest:.2g}, which no machine does", "look for a decoding fault")
+    _check_known(recording)
 
 
-def _refuse_known(recording: Recording) -> Refusal | None:
-    """What the recording says besides its samples."""
+def _check_known(recording: Recording) -> None:
+    """Raise Refused for what the recording says besides its samples."""
     prior = recording.lag_prior
     lags = [lag for lag in (prior.speed_lag_s, prior.torque_lag_s) if lag is not None]
     sizes = (prior.speed_lag_sd_s, prior.torque_lag_sd_s, prior.skew_sd_s, recording.speed_resolution_rad_s,
              recording.torque_resolution_nm, recording.torque_scale_rel_sd, *lags)
     limit = recording.torque_limit_nm
-    if all(math.isfinite(size) and size >= 0.0 for size in sizes) and (limit is None or not math.isnan(limit)):
-        return None
-    return Refusal(
-        "a resolution, lag, limit or standard deviation that goes with the recording is no usable number",
-        "check how the recording was made",
-    )
-
-
-def refuse_motion(recording: Recording, samples: Samples) -> Refusal | None:
-    """No excitation, no motion, or motion that a limit shaped."""
-    excitation = recording.excitation
-    if excitation is None or not excitation.segments:
-        return Refusal(
-            "there was no periodic excitation, so acceleration, friction and lags can't be told apart",
-            "run a multisine about two mean speeds",
+    if not all(math.isfinite(size) and size >= 0.0 for size in sizes) or (limit is not None and math.isnan(limit)):
+        raise Refused(
+            "a resolution, lag, limit or standard deviation that goes with the recording is no usable number",
+            "check how the recording was made",
         )
-    wrong = refuse_declared(excitation, samples)
-    if wrong is not None:
-        return wrong
+
+
+def check_motion(recording: Recording, excitation: Excitation, samples: Samples) -> None:
+    """Raise Refused for no motion, or motion that a limit shaped."""
+    check_declared(excitation, samples)
     windows = [excited_window(segment) for segment in excitation.segments]
     parts = [(segment, part) for segment, window in zip(excitation.segments, windows, strict=True)
              if len(part := samples.between(*window))]
     if not _moved([part.speed_rad_s for _, part in parts], recording.speed_resolution_rad_s):
-        return Refusal("the speed did not change", "excite with more amplitude, and check that the shaft can turn")
+        raise Refused("the speed did not change", "excite with more amplitude, and check that the shaft can turn")
     if not _moved([part.torque_nm for _, part in parts], recording.torque_resolution_nm):
-        return Refusal("the torque did not change", "excite with more amplitude, and check the torque signal")
-    return refuse_limited(recording, windows, parts, excitation.kind)
+        raise Refused("the torque did not change", "excite with more amplitude, and check the torque signal")
+    check_limited(recording, windows, parts, excitation.kind)
 
 
 def _moved(parts: list[FloatArray], quantum: float) -> bool:

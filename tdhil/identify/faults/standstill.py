@@ -6,7 +6,7 @@ that the levels and the lines are read with, and a jump of friction has lines of
 
 import numpy as np
 
-from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.identification import Refused
 from tdhil.identify.samples import Samples
 from tdhil.record.recording import Segment
 
@@ -15,8 +15,8 @@ _STEPS = 2.0
 _LEAST_SHARE = 0.02     # of the samples
 
 
-def refuse_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> Refusal | None:
-    """A refusal if the speed was at zero, or behind it, for more than a share of a segment that turned otherwise."""
+def check_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> None:
+    """Raise Refused if the speed was at zero, or behind it, for more than a share of a segment that turned."""
     for segment, part in parts:
         if len(part) == 0:
             continue
@@ -28,13 +28,12 @@ def refuse_standstill(parts: list[tuple[Segment, Samples]], quantum: float) -> R
         at_rest = np.count_nonzero(speed <= near) - np.count_nonzero(speed < -near)
         where = f"about {segment.offset_rad_s:.3g} rad/s"
         if at_rest > _LEAST_SHARE * len(part):
-            return Refusal(
+            raise Refused(
                 f"stick-slip: the shaft stood still for {at_rest / len(part):.1%} of the excitation {where}",
                 "turn faster on the mean, or excite with less amplitude, so that the shaft never stops",
             )
         if behind > _LEAST_SHARE * len(part):
-            return Refusal(
+            raise Refused(
                 f"the shaft turned backwards for {behind / len(part):.1%} of the excitation {where}",
                 "turn faster on the mean, or excite with less amplitude, for friction jumps at zero speed",
             )
-    return None

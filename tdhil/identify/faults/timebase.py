@@ -14,7 +14,7 @@ turning counts as scatter besides.
 
 import numpy as np
 
-from tdhil.identify.faults.refusal import Refusal
+from tdhil.identify.identification import Refused
 from tdhil.identify.lines.spectrum import ComplexArray, PeriodLines
 from tdhil.identify.samples import Stretch
 from tdhil.record.recording import FloatArray
@@ -30,13 +30,13 @@ _FLOOR = 1e-12          # relative: scatter that is the arithmetic's
 _CLEAR_LINE = 3.0       # a line that doesn't stand out of its turned scatter says nothing about turning
 
 
-def refuse_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) -> Refusal | None:
-    """A refusal that names the period that the data have."""
+def check_period(stretches: tuple[Stretch, ...], fits: tuple[PeriodLines, ...]) -> None:
+    """Raise Refused, with the period that the data have, where it is another than was declared."""
     found = wrong_period(stretches, fits)
     if found is None or abs(found) <= _HARMLESS:
-        return None
+        return
     declared = stretches[0].segment.period_s
-    return Refusal(
+    raise Refused(
         f"the motion repeats every {declared * (1.0 + found):.6g} s, not every {declared:g} s as declared: the time "
         f"base or the declared period is wrong by {abs(found):.2%}",
         "declare the period and the lines as they were run, and check the rate of the time stamps",

@@ -8,7 +8,7 @@ same frequency says the same again: it helps the scatter, not the count.
 The parameters are those of the rigid model.
 """
 
-from tdhil.identify.faults.quality import Refusal
+from tdhil.identify.identification import Refusal
 from tdhil.identify.lines.friction import ViscousTie
 from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.reports import AVERAGE, SKEW, SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE
@@ -56,6 +56,13 @@ def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | N
     if known < UNKNOWNS and len(priors) == 2:
         return (*priors, GaussianPrior(_AT(SKEW), 0.0, max(sd_s, _LEAST_SD_S)))
     return priors
+
+
+def known_of(
+    prior: LagPrior, lines: int, tie: ViscousTie | None
+) -> tuple[tuple[GaussianPrior, ...], dict[int, float]]:
+    """What is known of a rigid shaft's reports beforehand: the priors, and what is held."""
+    return with_skew(lag_priors(prior), lines, tie, prior.skew_sd_s), known_structure(prior)
 
 
 def refuse_count(lines: int, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:

@@ -1,21 +1,30 @@
-"""The rigid model fitted to the lines of a recording: values, intervals, and what they rest on."""
+"""The rigid model fitted to the lines of a recording: values, intervals, what they rest on, and what to say of it."""
 
 import math
 from dataclasses import dataclass, replace
 
-from tdhil.identify.identification import BudgetLine, Estimate, ResidualTest
+from tdhil.identify.case import Case, Finding, Words
+from tdhil.identify.identification import BudgetLine, Estimate, Refusal, ResidualTest
 from tdhil.identify.lines import reports
 from tdhil.identify.lines.budget import budget_of
 from tdhil.identify.lines.fit import Held, rigid_rivals, rigid_starts
 from tdhil.identify.lines.friction import Levels, ViscousTie, coulomb_level
 from tdhil.identify.lines.interval import estimate, first_order_estimate
 from tdhil.identify.lines.likelihood import Likelihood
+from tdhil.identify.lines.line_points import fitted_points
 from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.profile import standard_deviation, student_quantile
-from tdhil.identify.lines.residual import rejects, residual_of
+from tdhil.identify.lines.residual import REJECT_P, rejects, residual_of
 from tdhil.identify.lines.shaft import INERTIA, VISCOUS
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.lines.structure import Fitted, fit_model
+from tdhil.record.recording import LagPrior
+
+RIGID = "rigid+lags"
+_OPEN = Refusal(
+    "the data leave the inertia open: it can't be told from the lags of the reported signals",
+    "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
+)
 
 
 @dataclass(frozen=True)
@@ -110,6 +119,71 @@ def _coulomb(levels: Levels, fitted: Fitted, confidence: float) -> Estimate | No
     return Estimate(value, value - half, value + half) if math.isfinite(half) else None
 
 
-def turned(estimate: Estimate, value: float) -> Estimate:
+def rigid_finding(
+    result: RigidResult | None, case: Case, what: str = "a rigid shaft seen through reporting lags"
+) -> Finding | Refusal:
+    """What a rigid shaft is found to be; the refusal where its inertia stays open. ``what``: it, for the reader."""
+    if result is None or not (rejects(result.residual) or result.inertia.bounded):
+        return _OPEN
+    as_paper = case.options.model == "paper"
+    lines = fitted_points(result.fitted, case.options.confidence)
+    bare = Finding("paper" if as_paper else RIGID, _words(result, as_paper, what), result.residual, lines=lines,
+                   warnings=_caveats(result, as_paper))
+    if bare.rejected:
+        return bare
+    found = replace(bare, inertia=result.inertia, conditions=_conditions(result, case), viscous_nm_s_rad=result.viscous,
+                    coulomb_nm=result.coulomb, budget=result.budget)
+    if as_paper:
+        inertia = result.inertia if case.paper is None else _turned(
+            result.inertia, case.paper.stepped.inertia_kg_m2
+        )
+        return replace(found, inertia=inertia, conditions=("no reporting lags",))
+    return replace(found, speed_lag_s=result.speed_lag_s, torque_lag_s=result.torque_lag_s, skew_s=result.skew_s)
+
+
+def _turned(estimate: Estimate, value: float) -> Estimate:
     """The same interval stretched to hold another value too."""
     return replace(estimate, value=value, low=min(estimate.low, value), high=max(estimate.high, value))
+
+
+def _words(result: RigidResult, as_paper: bool, what: str) -> Words:
+    tied = result.fitted.problem.tie is not None
+    return Words(
+        "the paper's model, without lags," if as_paper else what,
+        if_rejected="identify with the rigid model, which includes reporting lags" if as_paper else
+        "look for a compliant load, play, or friction that changes with speed or time; try lower lines",
+        if_wide="excite with more amplitude or for longer" + ("" if tied else ", and about two mean speeds"),
+        spread="repeatability",
+    )
+
+
+def _conditions(result: RigidResult, case: Case) -> tuple[str, ...]:
+    problem = result.fitted.problem
+    skew = problem.model.at(reports.SKEW)
+    exact = [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in problem.priors if p.index == skew]
+    return (*of_reports(case.recording.lag_prior), *exact)
+
+
+def of_reports(prior: LagPrior) -> list[str]:
+    """What an inertia is conditional on, of the reports."""
+    stated = [
+        name for name, lag in (("speed", prior.speed_lag_s), ("torque", prior.torque_lag_s)) if lag is not None
+    ]
+    found = []
+    if stated:
+        by = f" by {prior.source}" if prior.source else ""
+        found.append(f"reporting lags as stated{by}, first order: {', '.join(stated)}")
+    if len(stated) < 2:
+        found.append("unstated reporting filters: two poles, a moving average and a delay at most")
+    return found
+
+
+def _caveats(result: RigidResult, as_paper: bool) -> tuple[str, ...]:
+    found = []
+    if result.fitted.problem.tie is None:
+        found.append("only one mean speed: viscous friction rests on the lines, not on levels")
+    if not as_paper and not result.first_order:
+        found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
+    if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
+        found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
+    return tuple(found)

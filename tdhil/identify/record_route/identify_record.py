@@ -4,48 +4,59 @@
 seen through smooth windows at the frequencies that stand clear of the noise?  4. Is that a number?
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from tdhil.identify.faults.left_out import left_out_warnings
-from tdhil.identify.faults.quality import Refusal
-from tdhil.identify.identification import Identification, PaperEstimate
+from tdhil.identify.case import Case, Finding, Words
+from tdhil.identify.faults.left_out import left_out_warnings, log_warnings
+from tdhil.identify.identification import Estimate, Refused
 from tdhil.identify.lines.identifiable import lag_priors
 from tdhil.identify.lines.model import GaussianPrior
+from tdhil.identify.lines.reports import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.identify.options import Options
 from tdhil.identify.record_route.bins import joined, measure, windows
-from tdhil.identify.record_route.conclusion import conclude_record, is_open
 from tdhil.identify.record_route.equation import SKEW, SPEED_LAG, TORQUE_LAG
-from tdhil.identify.record_route.motion import refuse_open, refuse_signals
+from tdhil.identify.record_route.motion import check_signals, refuse_open
 from tdhil.identify.record_route.solve import Solved, solve
 from tdhil.identify.record_route.stretches import Run, runs, thinned
 from tdhil.identify.samples import Samples
-from tdhil.identify.verdict import refused
+from tdhil.identify.torque_scale import torque_scale_line
 from tdhil.record.recording import Recording
 
+MODEL = "rigid+lags (time domain)"
 _HIDDEN_S = 2.5        # before a stop, the reported speed may outlive the motion by so long
 _LEAST_SKEW_SD_S = 1e-4
-_UNTESTED = Refusal(
-    "the paper's method takes the reported signals as they are; without periodic excitation nothing tests that",
-    "identify with the rigid model, which includes reporting lags",
-)
+_WIDE = {
+    "noise": "change the speed more often or by more, or record for longer",
+    "friction model": "run at more speeds, so that friction is told from them",
+}
 
 
-def identify_record(
-    recording: Recording, samples: Samples, options: Options, paper: PaperEstimate | None
-) -> Identification:
-    """Identify from a record without periodic excitation; refuses with reason and advice, never raises on bad data."""
-    warnings = _warnings(recording)
-    refusal = refuse_signals(recording, samples) if options.model != "paper" else _UNTESTED
-    if refusal is not None:
-        return refused(refusal, paper, 0, len(samples), warnings)
-    few = thinned(samples)
-    found = _runs(few, recording)
-    solved = _solved(recording, few, found, options)
-    if solved is None or is_open(solved.inertia):
-        return refused(refuse_open(few, found), paper, 0, len(samples), warnings)
+def recorded(case: Case) -> Case:
+    """The case with what is wrong with its record but leaves a number that stands."""
+    recording = case.recording
+    warnings = (*log_warnings(recording), *left_out_warnings(recording))
+    # Pulses and coasting of our own have calm between them, which a foreign trace need not have.
+    return replace(case, warnings=warnings, sound=recording.excitation is not None)
+
+
+def identify_record(case: Case) -> Finding:
+    """What a record without periodic excitation tells of a rigid shaft. Raises Refused where it leaves J open."""
+    if case.options.model == "paper":
+        raise Refused(
+            "the paper's method takes the reported signals as they are; without periodic excitation nothing tests that",
+            "identify with the rigid model, which includes reporting lags",
+        )
+    check_signals(case.recording, case.samples)
+    few = thinned(case.samples)
+    found = _runs(few, case.recording)
+    solved = _solved(case.recording, few, found, case.options)
+    if solved is None or _is_open(solved.inertia):
+        refuse_open(few, found)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
-    used = min(len(samples), round(inside * len(samples)))
-    return conclude_record(solved, recording, options, paper, used, warnings)
+    used = min(case.samples_used, round(inside * case.samples_used))
+    return replace(_finding(solved, case), samples_used=used)
 
 
 def _runs(samples: Samples, recording: Recording) -> tuple[Run, ...]:
@@ -76,18 +87,63 @@ def _solved(recording: Recording, samples: Samples, found: tuple[Run, ...], opti
             solved = solve(bins, placed, priors, span, options.confidence)
         except (np.linalg.LinAlgError, FloatingPointError, ValueError, OverflowError):
             solved = None
-        if solved is not None and not is_open(solved.inertia):
+        if solved is not None and not _is_open(solved.inertia):
             return solved
     return solved
 
 
-def _warnings(recording: Recording) -> tuple[str, ...]:
+def _is_open(inertia: Estimate) -> bool:
+    """Does the interval say nothing worth a number?"""
+    return not inertia.bounded or inertia.low <= 0.0
+
+
+def _finding(solved: Solved, case: Case) -> Finding:
+    most = max(solved.budget, key=lambda line: line.half_width_kg_m2).source if solved.budget else ""
+    words = Words(
+        "a rigid shaft seen through reporting lags",
+        "look for a compliant load, play, or friction that changes with speed or time; try slower motion",
+        _WIDE.get(
+            most, "state the filters of the drive's reported speed and torque with their uncertainty, or set them equal"
+        ),
+        "explains the record",
+        digits=2,
+    )
+    bare = Finding(MODEL, words, solved.residual, warnings=_caveats(solved))
+    if bare.rejected:
+        return bare
+    scale = torque_scale_line(solved.inertia.value, case.recording.torque_scale_rel_sd, case.options.confidence)
+    return replace(
+        bare,
+        inertia=solved.inertia,
+        conditions=_conditions(case.recording),
+        viscous_nm_s_rad=solved.viscous,
+        coulomb_nm=solved.coulomb,
+        speed_lag_s=_told(solved.speed_lag_s, LAG_BOUND_S),
+        torque_lag_s=_told(solved.torque_lag_s, LAG_BOUND_S),
+        skew_s=_told(solved.skew_s, SKEW_BOUND_S),
+        budget=(*solved.budget, scale),
+    )
+
+
+def _told(estimate: Estimate, bound: float) -> Estimate | None:
+    """None for a lag that the record leaves open up to the bound."""
+    return None if max(abs(estimate.low), abs(estimate.high)) >= bound * (1.0 - 1e-6) else estimate
+
+
+def _conditions(recording: Recording) -> tuple[str, ...]:
+    conditions = []
+    prior = recording.lag_prior
+    if lag_priors(prior):
+        conditions.append(f"reporting lags as stated{f' by {prior.source}' if prior.source else ''}")
+    if prior.speed_lag_s is None or prior.torque_lag_s is None:
+        conditions.append(f"reporting lags below {LAG_BOUND_S:g} s")
+    return tuple(conditions)
+
+
+def _caveats(solved: Solved) -> tuple[str, ...]:
     found = []
-    if not recording.complete:
-        found.append("the log ended before the run did: partial data")
-    stale = float((~recording.fresh).mean())
-    if stale > 0.01:
-        found.append(f"{stale:.1%} of the samples were stale and left out")
-    return (*found, *left_out_warnings(recording))
-
-
+    if solved.bent:
+        found.append("friction is no straight line over speed: a part that grows with its square was fitted too")
+    if solved.shaped:
+        found.append("one-pole filters do not fit the reported signals; their structure was fitted too")
+    return tuple(found)

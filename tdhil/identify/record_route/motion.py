@@ -1,8 +1,10 @@
 """What kind of motion a record holds, in words: a refusal should name what is missing, not only that something is."""
 
+from typing import NoReturn
+
 import numpy as np
 
-from tdhil.identify.faults.quality import Refusal
+from tdhil.identify.identification import Refused
 from tdhil.identify.record_route.stretches import Run
 from tdhil.identify.samples import Samples
 from tdhil.record.recording import FloatArray, Recording
@@ -23,54 +25,53 @@ ADVICE = (
 )
 
 
-def refuse_signals(recording: Recording, samples: Samples) -> Refusal | None:
-    """Nothing moves, nothing pushes, or a limit shaped what is seen."""
+def check_signals(recording: Recording, samples: Samples) -> None:
+    """Raise Refused where nothing moves, nothing pushes, or a limit shaped what is seen."""
     speed, torque = samples.speed_rad_s, samples.torque_nm
     if np.ptp(speed) <= 2.0 * recording.speed_resolution_rad_s or np.ptp(speed) == 0.0:
-        return Refusal("the speed did not change", ADVICE)
+        raise Refused("the speed did not change", ADVICE)
     if np.ptp(torque) <= 2.0 * recording.torque_resolution_nm or np.ptp(torque) == 0.0:
-        return Refusal("the torque did not change: a shaft that coasts shows how inertia and friction relate, not "
+        raise Refused("the torque did not change: a shaft that coasts shows how inertia and friction relate, not "
                        "how large they are", "record the torque, and a motion that the drive's torque causes")
     advice = "use less amplitude, or more torque if the machine allows it"
     flagged = float(np.mean(recording.limited))
     if flagged > _LIMIT_SHARE:
-        return Refusal(f"the drive was at an internal limit for {flagged:.1%} of the record", advice)
+        raise Refused(f"the drive was at an internal limit for {flagged:.1%} of the record", advice)
     limit = recording.torque_limit_nm
     if limit is not None and limit > 0.0:
         at_limit = float(np.mean(np.abs(torque + recording.torque_offset_nm) >= _AT_LIMIT * limit))
         if at_limit > _LIMIT_SHARE:
-            return Refusal(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice)
+            raise Refused(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice)
     for name, signal, quantum in (("torque", torque, recording.torque_resolution_nm),
                                   ("speed", speed, recording.speed_resolution_rad_s)):
         share = _cut_off(signal, quantum)
         if share is not None:
-            return Refusal(f"the {name} is cut off flat for {share:.1%} of the record", advice)
-    return None
+            raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice)
 
 
-def refuse_open(samples: Samples, found: tuple[Run, ...]) -> Refusal:
-    """The inertia is open: say which motion it was, and which would do."""
+def refuse_open(samples: Samples, found: tuple[Run, ...]) -> NoReturn:
+    """Raise Refused, the inertia being open: with which motion it was, and which would do."""
     if not found:
-        return Refusal("the shaft never turned one way long enough without holes in the record", ADVICE)
+        raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE)
     speed = _blocks(samples.speed_rad_s)
     torque = _blocks(samples.torque_nm)
     middle = float(np.max(np.abs(speed)))
     if np.ptp(speed) <= _STEADY_SHARE * middle:
-        return Refusal("the speed was constant: torque at one speed is friction, and tells nothing of the inertia",
+        raise Refused("the speed was constant: torque at one speed is friction, and tells nothing of the inertia",
                        ADVICE)
     scatter = float(np.median(np.abs(np.diff(samples.torque_nm)))) + 1e-300
     moving = np.abs(speed) > _STEADY_SHARE * middle
     span = float(np.ptp(torque))
     if span <= 5.0 * scatter or np.mean(np.abs(torque[moving]) <= _IDLE_SHARE * span + scatter) > 0.5:
-        return Refusal("for most of the motion no torque was reported: a shaft that coasts shows how inertia and "
+        raise Refused("for most of the motion no torque was reported: a shaft that coasts shows how inertia and "
                        "friction relate, not how large they are",
                        f"add motion that the drive's torque causes: {ADVICE}")
     rates = np.diff(speed)
     fast = rates[np.abs(rates) > 0.25 * float(np.max(np.abs(rates)))]
     if np.count_nonzero(np.diff(np.sign(fast))) < _TURNS:
-        return Refusal("one change of speed leaves inertia, friction and the lags of the reported signals open: they "
+        raise Refused("one change of speed leaves inertia, friction and the lags of the reported signals open: they "
                        "explain each other", ADVICE)
-    return Refusal("torque and speed don't tell the inertia apart from friction, the lags of the reported signals and "
+    raise Refused("torque and speed don't tell the inertia apart from friction, the lags of the reported signals and "
                    "the noise", ADVICE)
 
 

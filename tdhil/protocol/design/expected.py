@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.identify.lines.friction import Levels, tie_viscous
-from tdhil.identify.lines.identifiable import known_structure, lag_priors, refuse_count, with_skew
+from tdhil.identify.lines.identifiable import known_of, refuse_count
 from tdhil.identify.lines.rigid_result import RigidResult, fit_rigid
 from tdhil.identify.lines.spectrum import Line
 from tdhil.protocol.design.noise import RIGID
@@ -47,11 +47,11 @@ def fit(evidence: Evidence, confidence: float) -> Fitted | None:
     """The estimator's own fit; None where it would refuse."""
     tie = tie_viscous(evidence.levels)
     lines = tuple(line for line in evidence.lines if line.excited and line.nu >= LEAST_NU)
-    priors = with_skew(lag_priors(evidence.prior), len(lines), tie, evidence.prior.skew_sd_s)
+    priors, held = known_of(evidence.prior, len(lines), tie)
     if not lines or refuse_count(len(lines), tie, priors) is not None:
         return None
     try:
-        found = fit_rigid(lines, evidence.levels, tie, priors, known_structure(evidence.prior), confidence)
+        found = fit_rigid(lines, evidence.levels, tie, priors, held, confidence)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
     return _fitted(found)
