@@ -150,9 +150,11 @@ def tail_time(trace: Path) -> float:
     return next((float(line.split(",")[0]) for line in reversed(lines[1:-1])), 0.0)
 
 
-def wait_for(what: str, done: Callable[[], bool], alive: subprocess.Popen | None = None) -> bool:
+def wait_for(
+    what: str, done: Callable[[], bool], alive: subprocess.Popen | None = None, hangs_s: float = HANGS_S
+) -> bool:
     """Poll until done; False if ``alive`` ended before. A hang is an error."""
-    end = time.monotonic() + HANGS_S
+    end = time.monotonic() + hangs_s
     while not done():
         if alive is not None and alive.poll() is not None:
             return done()
