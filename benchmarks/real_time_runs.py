@@ -170,7 +170,9 @@ def beside(hogs: int) -> Iterator[None]:
 def in_guest(options: argparse.Namespace) -> int:
     """Directly, where this kernel has the interfaces."""
     seconds = SECONDS_A_RUN * (options.runs // options.lanes + 1)
-    guest = [ROOT / "tests" / "vcan" / "run_in_guest.sh", "-n", options.lanes, "-t", seconds, "--"]
+    # Three Pythons with numpy in a lane: the run, what it plans with, and the drive.
+    memory_mb = 1024 * (1 + options.lanes)
+    guest = [ROOT / "tests" / "vcan" / "run_in_guest.sh", "-n", options.lanes, "-m", memory_mb, "-t", seconds, "--"]
     command = [str(part) for part in (*guest, sys.executable, __file__, *sys.argv[1:])]
     return subprocess.run(command, check=False).returncode
 
