@@ -59,6 +59,7 @@ CASES = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.row}-{case.fault}")
 def test_row(case, rehearse, tmp_path):
     rig = tmp_path / "warm.yaml"

@@ -130,6 +130,7 @@ def bench(tmp_path):
         yield Bench(tmp_path, stack)
 
 
+@pytest.mark.heavy
 def test_a_killed_host(bench, seen):
     bench.start(bench.port)
     at_s = bench.wait_until_turning()
@@ -139,7 +140,10 @@ def test_a_killed_host(bench, seen):
     seen(4, "SIGKILL over Modbus TCP: the drive's time-out stops the shaft", standstill_s)
 
 
-@pytest.mark.parametrize("fault", ["reset", "half-open"])
+@pytest.mark.parametrize("fault", [
+    pytest.param("reset", marks=pytest.mark.long),        # test_modbus_scripted resets one too
+    pytest.param("half-open", marks=pytest.mark.heavy),
+])
 def test_a_connection_that_dies(bench, fault, seen):
     with Relay(bench.port) as relay:
         bench.start(relay.port)

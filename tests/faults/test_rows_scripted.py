@@ -89,6 +89,7 @@ def test_row(case, rehearse, seen):
 SOONEST = {"setup": "setup+3s", "torque": "torque+2s", "hold": "hold+2s", "acquire": "acquire+2s"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fault", "stage"), [*product(["bus-dead", "emcy", "heartbeat-lost", "sto"], SOONEST)])
 def test_the_other_stages(fault, stage, rehearse):
     run = rehearse("--fault", f"{fault}@{SOONEST[stage]}")

@@ -141,6 +141,7 @@ def test_the_paper_s_model_is_not_helped():
     assert said.verdict is Verdict.MODEL_REJECTED
 
 
+@pytest.mark.heavy
 def test_on_a_rig_with_stribeck_friction_the_interval_covers():
     runs = run_stages(Stages(Rig(), periods=8, static=25.0, stribeck_speed=2.0), list(range(12)), rate_hz=100.0)
     said = [identify(run) for run in runs]

@@ -8,6 +8,8 @@ from shaft_bench import Rig, recordings
 
 from tdhil.identify import Options, Verdict, identify
 
+pytestmark = pytest.mark.one_worker
+
 SEEDS = list(range(24))
 
 
@@ -46,9 +48,12 @@ TRUTHS = {
     "torque through two poles": {"speed_poles": (0.1,), "torque_poles": (0.25, 0.25)},
     "the long lag on torque": {"speed_poles": (0.1,), "torque_poles": (0.4,)},
 }
+LONG = ("two poles", "matched", "two long poles", "three poles", "torque through two poles")
 
 
-@pytest.mark.parametrize("name", list(TRUTHS))
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in TRUTHS
+])
 def test_covers_other_reporting_filters(default_run, name):
     _, motion, _, shaft = default_run
     truth = replace(Rig(), **TRUTHS[name])

@@ -17,6 +17,8 @@ from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import stretches, usable_samples
 from tdhil.record.recording import Recording
 
+pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
+
 KNOWN = Inertia(104.0, 0.3, Delay(0.25, 0.02, True))
 STRIBECK = Params(friction="stribeck", static_nm=100.0, stribeck_speed_rad_s=3.0)
 SPEEDS = (2.0, 3.0, 4.5, 6.0, 8.0)

@@ -19,6 +19,8 @@ from hopeless_shaft import INERTIA, Trouble, simulate
 from tdhil.cli import main
 from tdhil.identify import Options, Verdict, identify
 
+pytestmark = pytest.mark.one_worker
+
 REFUSED = (Verdict.NOT_IDENTIFIABLE, Verdict.MODEL_REJECTED)
 EACH = 3
 CASES = [(one, number) for one in FAMILIES for number in range(20 if one.name == "two_faults" else EACH)]
@@ -50,7 +52,13 @@ def test_there_are_enough():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("one", "number"), CASES, ids=[f"{one.name}-{number}" for one, number in CASES])
+@pytest.mark.parametrize(("one", "number"), [
+    pytest.param(
+        one, number, id=f"{one.name}-{number}",
+        marks=pytest.mark.long if str(number)[0] in ("1" if one.name == "two_faults" else "12") else (),
+    )
+    for one, number in CASES
+])
 def test_never_a_number_without_a_warning(records, one, number):
     found = identify(records[one.name, number], Options(confidence=0.999))
     said = " ".join((found.reason, found.advice, *found.warnings))

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from tdhil.identify import Verdict, identify
 
+pytestmark = pytest.mark.one_worker
+
 few = settings(max_examples=5, deadline=None, derandomize=True, phases=[Phase.generate])   # no minutes of shrinking
 
 
@@ -47,6 +49,7 @@ def test_rotation_may_be_either_way(plain):
     assert found.coulomb_nm.value == pytest.approx(plain.coulomb_nm.value, rel=1e-4)
 
 
+@pytest.mark.heavy
 @settings(few, max_examples=8)
 @given(
     # J/B stays clear of what a lag may be (2 s): below, a lag and the shaft can change places, and J is refused

@@ -16,6 +16,8 @@ from tdhil.record.recording import LagPrior
 from tdhil.study import coverage_plants
 from tdhil.study.coverage_simulator import simulate as simulate_plan
 
+pytestmark = pytest.mark.one_worker
+
 
 def found(recording, **options):
     return identify(replace(recording, excitation=None), Options(**options))

@@ -22,6 +22,8 @@ from tdhil.identify.samples import Samples, stretches, usable_samples
 from tdhil.protocol.excitation import ExcitationWish
 from tdhil.record.recording import Recording
 
+pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
+
 TRUE = 104.0
 
 

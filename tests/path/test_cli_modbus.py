@@ -13,6 +13,8 @@ from path_runs import QUICK, TOO_MUCH, identify, process, tdhil
 from profiles.library import load_modbus_profile, load_profile, profile_path
 from tdhil.record.reader import read_frames, read_run
 
+pytestmark = pytest.mark.one_worker
+
 WRITING = {5, 6, 15, 16, 22, 23}
 """Function codes that write (Modbus Application Protocol V1.1b3, section 6)."""
 RIG = """\

@@ -13,7 +13,12 @@ RATE_HZ = 100
 # Speed mode is the paper's. At 1 Hz the simulated drive's speed loop (K_p/J = 2.9 rad/s) leaves less than half of the
 # amplitude that the torque limit allows, and the noise of the reported speed (6 % of the variance of α) then takes as
 # much off the slope: in torque mode, without that loop, the motion is twice as large.
-TONES = [(0.1, "speed", 107.0), (0.3, "speed", 118.0), (0.5, "speed", 137.0), (1.0, "torque", 186.0)]
+TONES = [
+    (0.1, "speed", 107.0),
+    pytest.param(0.3, "speed", 118.0, marks=pytest.mark.long),
+    pytest.param(0.5, "speed", 137.0, marks=pytest.mark.long),
+    (1.0, "torque", 186.0),
+]
 
 
 @pytest.mark.parametrize(("frequency_hz", "mode", "slope"), TONES)
@@ -31,7 +36,9 @@ def test_the_paper_s_method_gives_the_paper_s_slopes(tmp_path, frequency_hz, mod
     assert 60.0 <= document["samples_used"] / RATE_HZ <= 120.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [
+    pytest.param(1, marks=pytest.mark.heavy), *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3)),
+])
 def test_the_default_excitation_finds_the_inertia(tmp_path, seed):
     done = identify(tmp_path, "--simulate", "--seed", seed)
     assert done.code == 0, done.err
@@ -44,7 +51,9 @@ def test_the_default_excitation_finds_the_inertia(tmp_path, seed):
     assert document["paper"]["inertia_kg_m2"] > 1.04 * INERTIA
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [
+    pytest.param(1, marks=pytest.mark.heavy), pytest.param(2, marks=pytest.mark.long),
+])
 def test_a_rig_whose_friction_bends_over_speed_is_identified(tmp_path, seed):
     """Stribeck's bell reaches well into the speed window: straight friction is contradicted, the inertia found."""
     plant = tmp_path / "plant.yaml"

@@ -14,13 +14,17 @@ def embedded(folder, *arguments):
 
 
 class TestFiveStages(FiveStages):
-    @pytest.fixture(params=["virtual", "socketcand"])
+    @pytest.fixture(params=["virtual", pytest.param("socketcand", marks=pytest.mark.heavy)])
     def bus(self, request):
         return {"virtual": embedded, "socketcand": over_a_peer}[request.param]
 
     @pytest.fixture
     def interrupted_bus(self):
         return interrupted
+
+    @pytest.mark.heavy
+    def test_ctrl_c_in_the_torque_stage_stops_the_shaft(self, interrupted_bus, tmp_path):
+        super().test_ctrl_c_in_the_torque_stage_stops_the_shaft(interrupted_bus, tmp_path)
 
 
 WHERE_AND_WHEN = dict.fromkeys(("log", "date", "connection"), "")

@@ -40,6 +40,13 @@ UNTOLD = {
 }
 CAUGHT = [(name, wrong) for name in NAMES for wrong in WRONGS if (name, wrong) not in UNTOLD]
 
+ALWAYS = ("generic/modbus", "abb/acs880-classic")
+
+
+def some_always(cases):
+    """The cases of two profiles at every run, of the others with --long."""
+    return [pytest.param(*case, marks=() if case[0] in ALWAYS else pytest.mark.long) for case in cases]
+
 
 def wired(monkeypatch, *wrongs):
     drive = partial(embedded.EmbeddedModbusDrive, wrongs=tuple(map(parse, wrongs)))
@@ -52,7 +59,7 @@ def ran(tmp_path, name):
     return done, Shaft.read(trace)
 
 
-@pytest.mark.parametrize(("name", "wrong"), CAUGHT)
+@pytest.mark.parametrize(("name", "wrong"), some_always(CAUGHT))
 def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
     wired(monkeypatch, wrong)
     done, shaft = ran(tmp_path, name)
@@ -63,6 +70,7 @@ def test_refused_before_the_shaft_moves(name, wrong, monkeypatch, tmp_path):
     shaft.assert_enabled(False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "sign"])
 def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch, tmp_path):
     wired(monkeypatch, "sign")
@@ -74,6 +82,7 @@ def test_a_sign_that_no_register_tells_ends_in_the_sign_probe(name, monkeypatch,
     shaft.assert_at_rest()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "unsigned"])
 def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, monkeypatch, tmp_path):
     """All drives with a torque mode, whatever preflight sees: test_braking_probe. Without one there is no torque to
@@ -91,6 +100,7 @@ def test_a_missing_sign_that_no_register_tells_ends_in_the_braking_probe(name, m
     shaft.assert_at_rest()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name, wrong in UNTOLD if wrong == "scale_10"])
 def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_path):
     """Tenfold counts: a command is a tenth of what is meant, so the shaft is slower than asked, never faster."""
@@ -102,7 +112,7 @@ def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_p
     assert np.max(np.abs(shaft.speed_rad_s[-100:])) < 0.001
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", some_always((name,) for name in NAMES))
 def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     from drivers.clock import SteppedClock
     from drivers.drive import Limits

@@ -149,7 +149,10 @@ def prompt(tmp_path, drive, rig):
         yield terminal
 
 
-@pytest.mark.parametrize("answer", ["move", "MOVE it", ""])
+@pytest.mark.parametrize("answer", [
+    pytest.param("move", marks=pytest.mark.heavy), pytest.param("MOVE it", marks=pytest.mark.long),
+    pytest.param("", marks=pytest.mark.heavy),
+])
 def test_a_wrong_word_moves_nothing(prompt, drive, answer):
     prompt.type(answer + "\n")
     assert prompt.finish() == 4

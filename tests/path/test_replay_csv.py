@@ -13,6 +13,8 @@ from path_runs import identify, tdhil
 from tdhil.record.csv_excitation import load_excitation
 from tdhil.record.reader import read_run
 
+pytestmark = pytest.mark.one_worker
+
 RPM = 2.0 * math.pi / 60.0
 DOC = Path(__file__).parents[2] / "docs" / "csv.md"
 

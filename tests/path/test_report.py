@@ -6,6 +6,8 @@ from hashlib import sha256
 import pytest
 from path_runs import QUICK, identify, tdhil
 
+pytestmark = pytest.mark.one_worker
+
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 

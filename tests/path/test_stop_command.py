@@ -91,6 +91,7 @@ def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
     assert drive.shaft.state[-1] == "quick stop active"
 
 
+@pytest.mark.heavy
 def test_while_a_run_of_ours_is_under_way(tmp_path):
     """Two masters, three processes: the run sees its drive taken from it, and ends by its own stop."""
     rig = tmp_path / "rig.yaml"        # a slow cycle and a long watchdog bear a loaded machine
@@ -167,7 +168,9 @@ HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
 
 @pytest.mark.parametrize("dead", ["closed Modbus port", "silent Modbus host", "closed hub", "hub that says nothing",
                                   "no serial device"])
-@pytest.mark.parametrize("as_json", [(), ("--json",)], ids=["text", "json"])
+@pytest.mark.parametrize("as_json", [
+    pytest.param((), id="text"), pytest.param(("--json",), id="json", marks=pytest.mark.heavy),
+])
 def test_where_nobody_is_reached(dead, as_json, no_bus_of_the_user):
     """Whatever stands between here and the drive: 8 and the sentence, never a mere connection error."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
@@ -211,6 +214,7 @@ def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
     assert drive.shaft.state[-1] == "quick stop active"
 
 
+@pytest.mark.heavy
 def test_a_stepped_drive_whose_host_has_died_is_stopped_too(tmp_path):
     with peer(tmp_path, *REAL_TIME, "--stepped") as drive, host(
         tmp_path, *drive.options, "--stepped", *QUICK, "--periods", 40

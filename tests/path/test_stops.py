@@ -53,8 +53,20 @@ def aborted_stage(log):
     return [stage.name for stage in read_run(log).stages if stage.outcome == "aborted"]
 
 
+ALWAYS, HEAVY = (), pytest.mark.heavy
+SELDOM = {
+    ("SIGINT", "setup"): ALWAYS, ("SIGINT", "acquire"): ALWAYS, ("SIGINT twice", "acquire"): ALWAYS,
+    ("SIGINT", "speed"): HEAVY, ("SIGINT", "torque"): HEAVY, ("SIGTERM", "speed"): HEAVY,
+}
+"""What a signal and a stage are marked with; those that aren't here are long."""
+
+
 @pytest.mark.parametrize(
-    ("how", "stage"), [*product(["SIGINT", "SIGTERM", "SIGINT twice"], STAGES), ("SIGHUP", "speed")]
+    ("how", "stage"), [
+        *(pytest.param(how, stage, marks=SELDOM.get((how, stage), pytest.mark.long))
+          for how, stage in product(["SIGINT", "SIGTERM", "SIGINT twice"], STAGES)),
+        ("SIGHUP", "speed"),
+    ],
 )
 def test_a_signal_in_each_stage(tmp_path, how, stage):
     number = signal.Signals[how.split()[0]]
@@ -115,7 +127,7 @@ def test_ctrl_c_in_real_time(tmp_path):
     assert read_run(done.log).complete
 
 
-@pytest.mark.parametrize("stage", ["speed", "hold", "acquire"])
+@pytest.mark.parametrize("stage", ["speed", pytest.param("hold", marks=pytest.mark.long), "acquire"])
 def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
     with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
         tmp_path, *drive.options, "--stepped", *LONG
@@ -160,6 +172,7 @@ def assert_stopped_by_watchdog(shaft):
     assert shaft.state[-1] == "quick stop active"        # held, until somebody comes
 
 
+@pytest.mark.heavy
 def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
     with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
         tmp_path, *drive.options, "--stepped", *QUICK, "--periods", 7
@@ -185,6 +198,7 @@ def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
     assert again.document == document
 
 
+@pytest.mark.long       # tests/faults/test_rows_process.py freezes one too
 def test_a_frozen_host_is_no_watchdog_either(tmp_path):
     """SIGSTOP: the connection stays open, nothing comes. On waking nothing stale may set the shaft in motion."""
     with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
@@ -208,7 +222,9 @@ def test_a_frozen_host_is_no_watchdog_either(tmp_path):
 # -- a mistake of ours, in each stage ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", [
+    pytest.param(stage, marks=pytest.mark.long if stage in ("torque", "hold") else ()) for stage in STAGES
+])
 def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
     def begin(self, name, expected_s, plain=LiveDisplay.stage_started):
         self.under_way, self.cycles = name, 0
@@ -274,6 +290,7 @@ def test_what_follows_the_shaft_is_in_order(tmp_path):
     shaft.assert_stopped_within_settings()
 
 
+@pytest.mark.heavy
 def test_a_dead_simulator_ends_the_host(tmp_path):
     """The other way round: the drive's side of the bus disappears."""
     with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:

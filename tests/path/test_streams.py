@@ -138,7 +138,7 @@ def test_an_unknown_model_in_a_log():
         conclude(None, {"identify": {"model": "magic"}}, "run.mcap")      # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("fault", [(), ("--fault", "sto@hold+1s")])
+@pytest.mark.parametrize("fault", [(), pytest.param(("--fault", "sto@hold+1s"), marks=pytest.mark.heavy)])
 def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
     """Later there may be no descriptor left to load it with, or no disk."""
     script = f"""

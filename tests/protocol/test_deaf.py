@@ -37,7 +37,7 @@ class Endless:
 
 
 @pytest.mark.parametrize(("trouble", "kind"), [("Ctrl-C", Interrupted), ("guard", LimitHit)])
-@pytest.mark.parametrize("wait", ["the plan", "--tolerance"])
+@pytest.mark.parametrize("wait", ["the plan", pytest.param("--tolerance", marks=pytest.mark.heavy)])
 def test_the_stop_does_not_wait_for_arithmetic(world, monkeypatch, wait, trouble, kind):
     here = world()
     endless, seen = Endless(here.drive), []

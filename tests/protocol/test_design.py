@@ -77,6 +77,7 @@ def test_the_noise_is_measured_at_steady_speed():
 # -- the choice ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["servo", "heavy"])
 def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
     plant = PLANTS[name]
@@ -96,6 +97,7 @@ def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
         assert np.abs(torque).max() <= 0.85 * limits.torque_limit_nm * (1.0 + 1e-6)
 
 
+@pytest.mark.heavy
 def test_it_repeats_and_says_what_the_estimator_would():
     first, again = (choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95) for _ in range(2))
     assert first == again
@@ -106,6 +108,7 @@ def test_it_repeats_and_says_what_the_estimator_would():
     assert expected_half_width(first.plan, theta, quieter, KNOWN.prior, 0.95) < 0.6 * first.half_width
 
 
+@pytest.mark.heavy
 def test_stated_lags_tighten_what_is_expected_and_move_the_lines():
     stated = Knowledge(KNOWN.noise, LagPrior(0.02, 0.002, 0.01, 0.001, "rig.yaml"))
     chosen = choose(LIMITS, GUESS, ExcitationWish(), stated, 0.95)

@@ -90,6 +90,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.heavy
 def test_ctrl_c_on_a_terminal(tmp_path):
     """The whole command in a terminal of its own, which sends Ctrl-C to the workers too."""
     command = [sys.executable, "-c", ONE_BY_ONE, "study", "coverage", "--json", "--out", str(tmp_path / "out"),

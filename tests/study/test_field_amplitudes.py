@@ -9,10 +9,14 @@ from tdhil.study.field_loop import best_kp, gain
 from tdhil.study.field_settings import SimulatedRig
 from tdhil.study.field_tones import ToneSweep
 
+pytestmark = [pytest.mark.heavy, pytest.mark.one_worker]
+
 STUDIES = {"figure20": KpSweep, "figure21": KiSweep, "figure23": ToneSweep}
 
 
-@pytest.fixture(scope="module", params=list(STUDIES))
+@pytest.fixture(scope="module", params=[
+    pytest.param("figure20", marks=pytest.mark.long), pytest.param("figure21", marks=pytest.mark.long), "figure23",
+])
 def swept(request):
     return ran(request.param)
 

@@ -6,6 +6,8 @@ from tdhil.commands.field_bench import SimulatedFieldBench
 from tdhil.study.field_loops import LoopScatter
 from tdhil.study.field_settings import LoopPair, ScatterSettings
 
+pytestmark = [pytest.mark.long, pytest.mark.one_worker]
+
 
 @pytest.fixture(scope="module")
 def outcome():

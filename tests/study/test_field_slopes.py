@@ -6,6 +6,8 @@ from tdhil.commands.field_bench import SimulatedFieldBench
 from tdhil.study.field_settings import SlopeSettings
 from tdhil.study.field_slopes import FieldSlopes
 
+pytestmark = pytest.mark.one_worker
+
 PUBLISHED = {0.1: 105.379, 0.3: 116.557, 0.5: 135.622, 1.0: 185.757}
 INERTIA = 104.0
 

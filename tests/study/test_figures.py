@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from simulated_runs import STUDIES, run
 
+pytestmark = pytest.mark.one_worker
+
 
 @pytest.fixture(scope="module")
 def outcomes():

@@ -12,6 +12,8 @@ from tdhil.study.tables import Table6Settings, Table7Settings, published_for
 from tdhil.study.tables_bias import closed_form_inertia
 from tdhil.study.tables_design import run_design
 
+pytestmark = pytest.mark.one_worker
+
 L9_RUNS = [898.36, 898.30, 898.15, 892.95, 892.88, 891.03, 885.96, 885.24, 885.52]
 L16_RUNS = [
     878.63, 884.83, 889.58, 889.33, 890.63, 894.55, 889.36, 892.94, 899.82, 897.38, 891.97, 891.15, 894.99, 889.09,
