@@ -13,9 +13,9 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "faults"))
+sys.path.insert(0, str(ROOT))
 
-from rows import ROWS  # noqa: E402
+from tests.faults.rows import ROWS  # noqa: E402
 
 HEAD = """# The faults, and what a run does about each
 

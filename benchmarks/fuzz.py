@@ -20,10 +20,10 @@ from pathlib import Path
 from random import Random
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fuzz")]
+sys.path[:0] = [str(ROOT)]
 
-from mutate import mutated  # noqa: E402
-from parsers import PARSERS, Parser, try_one  # noqa: E402
+from tests.fuzz.mutate import mutated  # noqa: E402
+from tests.fuzz.parsers import PARSERS, Parser, try_one  # noqa: E402
 
 LONGEST_S = 10
 MEMORY_BYTES = 3 * 2**30               # of address space, with numpy, scipy and matplotlib's libraries in it

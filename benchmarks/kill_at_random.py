@@ -31,9 +31,9 @@ from pathlib import Path
 from random import Random
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "path")]
+sys.path[:0] = [str(ROOT)]
 
-from path_runs import (  # noqa: E402
+from tests.path.path_runs import (  # noqa: E402
     INERTIA,
     PLAIN,
     QUICK_STOP_RAD_S2,

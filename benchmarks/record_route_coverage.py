@@ -18,14 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "identify"))
-
-from record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tdhil.identify.identification import Identification
 from tdhil.identify.identify import identify
 from tdhil.identify.options import Options
 from tdhil.record.recording import LagPrior, Recording
+from tests.identify.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
 GROUP = 20
 OTHERS = (

@@ -23,14 +23,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "identify"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from compliant_bench import Noise, Pipe, TwoMass, run
 
 from tdhil.identify import Identification, Options, identify
 from tdhil.identify.options import Model
 from tdhil.record.recording import LagPrior, Recording
+from tests.identify.compliant_bench import Noise, Pipe, TwoMass, run
 
 PLANTS = {"two-mass": (TwoMass(), 4), "string": (Pipe(), 8)}      # with the periods to settle
 LAGS_S, LAG_REL_SD = (0.40, 0.15), 0.01

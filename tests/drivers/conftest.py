@@ -1,18 +1,14 @@
 import sys
 import time
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))     # for the helpers: tests are imported by path, not as a package
 
 
 @pytest.fixture
 def fake_time(monkeypatch):
     """Fake time in every file of the driver that looks at the clock; nothing outside it notices."""
-    from scripted_drive import FakeTime
-
     import drivers.cia402.drive  # noqa: F401  (all of its files are then loaded)
+    from tests.drivers.scripted_drive import FakeTime
 
     fake = FakeTime()
     for name, module in list(sys.modules.items()):
@@ -24,7 +20,7 @@ def fake_time(monkeypatch):
 @pytest.fixture
 def wire(fake_time):
     """A fake bus with nobody on it."""
-    from scripted_drive import ScriptedBus
+    from tests.drivers.scripted_drive import ScriptedBus
 
     return ScriptedBus(fake_time)
 
@@ -32,7 +28,7 @@ def wire(fake_time):
 @pytest.fixture
 def peer(wire):
     """A scripted drive on the fake bus."""
-    from scripted_drive import ScriptedDrive
+    from tests.drivers.scripted_drive import ScriptedDrive
 
     return ScriptedDrive(wire)
 
@@ -45,31 +41,31 @@ def profile():
 
 
 def _canopen():
-    from drive_benches import CanopenBench
+    from tests.drivers.drive_benches import CanopenBench
 
     return CanopenBench
 
 
 def _modbus():
-    from modbus_bench import ModbusBench
+    from tests.drivers.modbus_bench import ModbusBench
 
     return ModbusBench
 
 
 def _epos4():
-    from profile_benches import Epos4Bench
+    from tests.drivers.profile_benches import Epos4Bench
 
     return Epos4Bench
 
 
 def _s120():
-    from profile_benches import S120Bench
+    from tests.drivers.profile_benches import S120Bench
 
     return S120Bench
 
 
 def _abb():
-    from profile_benches import AbbBench
+    from tests.drivers.profile_benches import AbbBench
 
     return AbbBench
 
@@ -94,6 +90,6 @@ def make_bench(request):
 @pytest.fixture
 def run(make_bench):
     """A run on a quiet rig."""
-    from drive_benches import Run
+    from tests.drivers.drive_benches import Run
 
     return Run(make_bench())

@@ -5,7 +5,7 @@ Neither codec is used. What it misdoes is set on it by the test.
 
 import struct
 
-from power_machine import PowerMachine
+from tests.drivers.power_machine import PowerMachine
 
 MARKER, MARKER_BLOCK = b"tdhil simulated drive", 0xFDE8
 CONTROL, SPEED_SETPOINT, TORQUE_SETPOINT, MODE = 0, 1, 3, 4

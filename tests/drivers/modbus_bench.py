@@ -5,8 +5,6 @@ Registers and formats are typed here by hand from the map in profiles/generic/mo
 
 import struct
 
-from drive_benches import LIMITS, RPM
-
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.modbus.drive import ModbusDrive
@@ -15,6 +13,7 @@ from profiles.library import load_modbus_profile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.timing import LineTiming
 from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tests.drivers.drive_benches import LIMITS, RPM
 
 
 class ModbusBench:

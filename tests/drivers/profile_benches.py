@@ -2,9 +2,8 @@
 
 import struct
 
-from drive_benches import RPM, CanopenBench
-
 from drivers.drive import Mode, PowerState, RawFrame
+from tests.drivers.drive_benches import RPM, CanopenBench
 
 REMOTE = 1 << 30
 """Set in the identifier of a remote frame, as SocketCAN does; the drive's answer has the same one without it."""

@@ -7,7 +7,8 @@ import struct
 from collections.abc import Callable
 
 import can
-from power_machine import PowerMachine
+
+from tests.drivers.power_machine import PowerMachine
 
 MARKER = b"tdhil simulated drive"
 SDO_HEAD = struct.Struct("<BHB")

@@ -2,7 +2,6 @@
 
 import can
 import pytest
-from scripted_drive import ScriptedDrive, u
 
 from drivers import bare_stop
 from drivers.bare_stop import Ended
@@ -15,6 +14,7 @@ from profiles.library import load_canopen_profile
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from sim_bus.plant import Params
 from sim_bus.simulator import EmbeddedSimulator
+from tests.drivers.scripted_drive import ScriptedDrive, u
 
 
 @pytest.fixture(scope="module")

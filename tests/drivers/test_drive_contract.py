@@ -5,11 +5,11 @@ import math
 import time
 
 import pytest
-from drive_benches import Run
 
 from drivers.drive import Command, Counters, Mode, Outcome, PowerState
 from drivers.errors import CommandRejected, PreflightRefused, TdhilError
 from sim_bus.params import RigParams
+from tests.drivers.drive_benches import Run
 
 SPEED_GAIN = 300.0                                 # of its speed loop, N·m·s/rad
 VISCOUS, COULOMB, INERTIA = 8.0, 60.0, 104.0       # the simulated rig

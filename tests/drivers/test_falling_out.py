@@ -1,11 +1,11 @@
 """A drive that leaves operation by itself is not enabled again by itself, whichever way it left."""
 
 import pytest
-from power_machine import ENABLED, FAULT, OFF, READY
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
+from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY
 
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 TURN = Command(Mode.SPEED, 1.0, 0.0)

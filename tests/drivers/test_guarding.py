@@ -4,16 +4,16 @@ from itertools import pairwise
 
 import can
 import pytest
-from drive_benches import Run
 from hypothesis import given
 from hypothesis import strategies as st
-from profile_benches import S120Bench
 
 from drivers.cia402.guarding import Guarding
 from drivers.cia402.watch import Watch
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault
+from tests.drivers.drive_benches import Run
+from tests.drivers.profile_benches import S120Bench
 
 ANSWER = 0x701
 

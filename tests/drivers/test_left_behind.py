@@ -3,13 +3,13 @@
 import json
 
 import pytest
-from scripted_drive import ScriptedDrive, u
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import PreflightRefused
 from drivers.left_behind import LeftBehind, read
+from tests.drivers.scripted_drive import ScriptedDrive, u
 
 ALL = frozenset({"torque", "speed", "quick-stop"})
 LIMITS = Limits(10.0, 300.0, 2.0, 0.4, accept_wider=ALL)

@@ -4,14 +4,14 @@ import math
 import struct
 
 import pytest
-from drive_benches import CanopenBench, Run
-from modbus_bank import CONTROL
-from power_machine import ENABLED, STOPPING
-from test_modbus_drive import Run as BankRun
 
 from drivers.cia402 import link
 from drivers.drive import Looking, PowerState
 from drivers.errors import CommunicationLost, DriveFault
+from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.modbus_bank import CONTROL
+from tests.drivers.power_machine import ENABLED, STOPPING
+from tests.drivers.test_modbus_drive import Run as BankRun
 
 STATUS, SPEED = b"\x40\x41\x60\x00", b"\x40\x6c\x60\x00"      # SDO upload of 6041h and 606Ch (CiA 301)
 

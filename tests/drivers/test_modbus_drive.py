@@ -4,8 +4,6 @@ import itertools
 import json
 
 import pytest
-from modbus_bank import CONTROL, MODE, Bank, high_and_low
-from power_machine import OFF, STOPPING
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
@@ -15,6 +13,8 @@ from drivers.modbus.embedded import EmbeddedLink
 from drivers.modbus.errors import CycleRefused, LinkLost, NoisyReply
 from profiles.library import load_modbus_profile
 from profiles.modbus_schema import ModbusProfile
+from tests.drivers.modbus_bank import CONTROL, MODE, Bank, high_and_low
+from tests.drivers.power_machine import OFF, STOPPING
 
 LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
 GENERIC = load_modbus_profile("generic/modbus")

@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import pytest
-from modbus_bank import STATUS, Bank
-from test_modbus_preflight import LIMITS, drive_on, of
 
 from drivers.drive import Command, Mode, Outcome, PowerState
 from drivers.errors import LimitHit
 from profiles.library import load_modbus_profile
+from tests.drivers.modbus_bank import STATUS, Bank
+from tests.drivers.test_modbus_preflight import LIMITS, drive_on, of
 
 GENERIC = load_modbus_profile("generic/modbus")
 CELSIUS = {"title": "motor", "register": {"address": 54}, "per_lsb": 0.1, "source": "own", "confidence": "verified"}

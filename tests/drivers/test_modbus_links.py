@@ -9,7 +9,6 @@ import threading
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from modbus_peers import CLOSE, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
 
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, PreflightRefused
@@ -18,6 +17,7 @@ from drivers.modbus.errors import BadReply, LinkLost, NoReply
 from drivers.modbus.rtu import RtuLink
 from drivers.modbus.serial_port import permission_command, refusal
 from drivers.modbus.tcp import MOST_RENEWED, TcpLink
+from tests.drivers.modbus_peers import CLOSE, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
 
 ASK = bytes.fromhex("03 0010 0002")
 GOOD = bytes.fromhex("03 04 0250 04d2")

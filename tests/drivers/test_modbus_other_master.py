@@ -3,12 +3,12 @@
 import struct
 
 import pytest
-from modbus_bank import CONTROL, MODE, SPEED_SETPOINT, TIME_OUT, TORQUE_SETPOINT, Bank
-from test_modbus_preflight import LIMITS, changed, drive_on
 
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
 from profiles.library import load_modbus_profile
+from tests.drivers.modbus_bank import CONTROL, MODE, SPEED_SETPOINT, TIME_OUT, TORQUE_SETPOINT, Bank
+from tests.drivers.test_modbus_preflight import LIMITS, changed, drive_on
 
 GENERIC = load_modbus_profile("generic/modbus")
 RATE_HZ = 20.0

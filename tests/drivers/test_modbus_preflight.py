@@ -4,7 +4,6 @@ import dataclasses
 import json
 
 import pytest
-from modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, Outcome
@@ -13,6 +12,7 @@ from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus_schema import ModbusProfile
+from tests.drivers.modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
 LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
 

@@ -3,12 +3,23 @@
 import itertools
 
 import pytest
-from power_machine import ENABLED, FAULT, OFF, ON, REACTION, READY, STATUS_PATTERNS, STOPPING, PowerMachine, matches
 
 from drivers.drive import Mode, PowerState
 from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
 from profiles.library import load_modbus_profile
 from profiles.modbus_schema import Bits
+from tests.drivers.power_machine import (
+    ENABLED,
+    FAULT,
+    OFF,
+    ON,
+    REACTION,
+    READY,
+    STATUS_PATTERNS,
+    STOPPING,
+    PowerMachine,
+    matches,
+)
 
 CONTROL = load_modbus_profile("generic/modbus").control
 POWER = {

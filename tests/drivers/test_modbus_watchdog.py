@@ -5,14 +5,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from modbus_bank import TIME_OUT, Bank
-from test_modbus_preflight import LIMITS, changed, drive_on
 
 from drivers.clock import SteppedClock
 from drivers.drive import Outcome
 from drivers.modbus.arming import COUNT_S
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile
+from tests.drivers.modbus_bank import TIME_OUT, Bank
+from tests.drivers.test_modbus_preflight import LIMITS, changed, drive_on
 
 GENERIC = load_modbus_profile("generic/modbus")
 FLAG = "--accept-shared-watchdog"

@@ -7,9 +7,6 @@ import json
 from dataclasses import replace
 
 import pytest
-from drive_benches import Run
-from modbus_bank import CONTROL, TIME_OUT, Bank
-from profile_benches import S120Bench
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
@@ -18,6 +15,9 @@ from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus_schema import ModbusProfile
+from tests.drivers.drive_benches import Run
+from tests.drivers.modbus_bank import CONTROL, TIME_OUT, Bank
+from tests.drivers.profile_benches import S120Bench
 
 LIMITS = Limits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_no_watchdog=True,

@@ -4,10 +4,10 @@ import itertools
 import math
 
 import pytest
-from drive_benches import CanopenBench, Run
-from modbus_bench import ModbusBench
 
 from drivers.drive import Mode, Positioned
+from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.modbus_bench import ModbusBench
 
 
 @pytest.fixture(params=[CanopenBench, ModbusBench])

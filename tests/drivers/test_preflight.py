@@ -3,13 +3,13 @@
 import dataclasses
 
 import pytest
-from power_machine import ENABLED, FAULT, OFF, STOPPING
-from scripted_drive import ScriptedDrive, u
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
+from tests.drivers.power_machine import ENABLED, FAULT, OFF, STOPPING
+from tests.drivers.scripted_drive import ScriptedDrive, u
 
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 ROWS = [

@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from drive_benches import CanopenBench, Run
-from profile_benches import AbbBench, Epos4Bench, S120Bench
 
 from drivers.cia402.bare_stop import Cia402Target
 from drivers.cia402.parameters import fulfils, wanted_text
@@ -12,6 +10,8 @@ from drivers.drive import Mode, Outcome
 from profiles.library import load_canopen_profile
 from profiles.requirement import Require
 from profiles.schema import CanopenProfile
+from tests.drivers.drive_benches import CanopenBench, Run
+from tests.drivers.profile_benches import AbbBench, Epos4Bench, S120Bench
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def wide_profile(kind):
 
 @pytest.mark.parametrize("kind", ["i32", "f32"])
 def test_torque_of_32_bits(make, monkeypatch, kind):
-    import drive_benches
+    from tests.drivers import drive_benches
 
     monkeypatch.setattr(drive_benches, "load_canopen_profile", lambda name: wide_profile(kind))
     run = Run(make(S120Bench))

@@ -92,7 +92,7 @@ def turned(peer, wire, profile, wall_of):
 
 
 def test_a_wall_clock_that_is_set_changes_no_sample(fake_time, profile):
-    from scripted_drive import FakeTime, ScriptedBus, ScriptedDrive
+    from tests.drivers.scripted_drive import FakeTime, ScriptedBus, ScriptedDrive
 
     found = []
     for jump_s in (0.0, -3600.0):

@@ -1,7 +1,10 @@
 """The pure state machine, against the standard's tables typed a second time (power_machine)."""
 
 import pytest
-from power_machine import (
+
+from drivers.cia402.state import State, Wish, controlword_towards, decode, power_state
+from drivers.drive import PowerState
+from tests.drivers.power_machine import (
     ENABLED,
     FAULT,
     NOT_READY,
@@ -14,9 +17,6 @@ from power_machine import (
     PowerMachine,
     matches,
 )
-
-from drivers.cia402.state import State, Wish, controlword_towards, decode, power_state
-from drivers.drive import PowerState
 
 NEAR = {Wish.OFF: {OFF}, Wish.ENABLED: {ENABLED}, Wish.QUICK_STOP: {STOPPING, OFF}}
 

@@ -3,12 +3,12 @@
 import itertools
 
 import pytest
-from scripted_drive import u
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
+from tests.drivers.scripted_drive import u
 
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 

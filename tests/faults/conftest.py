@@ -1,17 +1,10 @@
-import sys
-from pathlib import Path
-
 import pytest
-
-# For helpers of this room and of others: tests are imported by path, not as a package.
-for room in ("protocol", "path", "faults"):
-    sys.path.insert(0, str(Path(__file__).parents[1] / room))
 
 
 @pytest.fixture
 def seen(request):
     """Keeps what a test saw of a row, for `benchmarks/fault_table.py`: ``seen(row, said, standstill_s, log)``."""
-    from seen import Seen
+    from tests.faults.seen import Seen
 
     return Seen(request.node.nodeid)
 
@@ -31,6 +24,6 @@ def no_bus_of_the_user(monkeypatch, tmp_path):
 @pytest.fixture
 def rehearse(no_bus_of_the_user, tmp_path):
     """`tdhil identify --simulate` in this process: ``rehearse(*arguments)``, see `rehearsal`."""
-    from rehearsal import run
+    from tests.faults.rehearsal import run
 
     return lambda *arguments: run(tmp_path, *arguments)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from path_runs import QUICK_STOP_RAD_S2, SETTLING_S, Finished, Shaft, identify, tdhil
 
 from tdhil.record.reader import read_run
 from tdhil.report.live import LiveDisplay
+from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, Finished, Shaft, identify, tdhil
 
 HELD = {"operation enabled", "quick stop active", "fault reaction active"}
 TURNING_RAD_S = 0.02

@@ -4,8 +4,8 @@ R refuse before the shaft has moved · QS the stop sequence · WD the drive's ow
 mark what was degraded. The code is that of the cause, and 8 wherever the host could not see the shaft at rest.
 """
 
-from row import HERE, Row
-from rows_beyond import BEYOND
+from tests.faults.row import HERE, Row
+from tests.faults.rows_beyond import BEYOND
 
 SCRIPTED, ADAPTER, HOST, PROCESS, MODBUS = (
     f"{HERE}test_rows_scripted.py::test_row", f"{HERE}test_rows_adapter.py::", f"{HERE}test_rows_host.py::",

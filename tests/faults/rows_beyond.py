@@ -1,6 +1,6 @@
 """What was found beyond the fifty by trying it on the rig floor, numbered on from 51, a section a room."""
 
-from row import HERE, Row
+from tests.faults.row import HERE, Row
 
 LATE: dict[int, Row] = {
     51: Row("adapter or host late: the answers of many SYNCs come in a burst", "counted as late; nobody else is blamed",

@@ -8,7 +8,6 @@ import signal
 from dataclasses import dataclass, replace
 
 import pytest
-from fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
 
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
@@ -17,6 +16,7 @@ from tdhil.protocol.bench import Bench
 from tdhil.protocol.settings import ExcitationRequest
 from tdhil.protocol.task import STAGES
 from tdhil.record.errors import LogError
+from tests.protocol.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
 
 IN_STAGE = 60
 """Cycles into a stage at which its fault begins."""

@@ -3,10 +3,10 @@
 import random
 
 import pytest
-from rehearsal import at, run
 
 from drivers.modbus.embedded import EmbeddedLink
 from drivers.modbus.errors import NoisyReply
+from tests.faults.rehearsal import at, run
 
 
 class Noise:

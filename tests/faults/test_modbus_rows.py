@@ -3,10 +3,10 @@
 from functools import partial
 
 import pytest
-from rehearsal import at, run
 
 from sim_bus.modbus import embedded
 from sim_bus.modbus.wrongs import parse
+from tests.faults.rehearsal import at, run
 
 MODBUS = ("--drive", "modbus")
 WATCHDOG_S = 0.5

@@ -12,9 +12,9 @@ import sys
 from dataclasses import dataclass
 
 import pytest
-from path_runs import Shaft, process, tdhil, wait_for
 
 from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON
+from tests.path.path_runs import Shaft, process, tdhil, wait_for
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault

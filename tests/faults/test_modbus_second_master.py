@@ -7,13 +7,13 @@ import subprocess
 import sys
 
 import pytest
-from path_runs import REAL, Shaft, identify, process
-from rehearsal import at, run
 
 from profiles.library import load_modbus_profile, profile_path
 from sim_bus.modbus import embedded
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
+from tests.faults.rehearsal import at, run
+from tests.path.path_runs import REAL, Shaft, identify, process
 
 BY_NAME = "--accept-shared-watchdog"
 RIG = (

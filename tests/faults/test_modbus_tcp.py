@@ -15,7 +15,8 @@ import sys
 import threading
 
 import pytest
-from path_runs import SETTLING_S, Shaft, process, wait_for
+
+from tests.path.path_runs import SETTLING_S, Shaft, process, wait_for
 
 WATCHDOG_S = 2.0
 """Long, since in real time a busy machine must not be taken for a fault."""

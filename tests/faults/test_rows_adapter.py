@@ -5,8 +5,9 @@ The simulated drive's watchdog must bring the shaft to rest once nothing reaches
 
 import can
 import pytest
-from adapter import Adapter
-from rehearsal import at
+
+from tests.faults.adapter import Adapter
+from tests.faults.rehearsal import at
 
 BUS_OFF, CONTROLLER, TX_PASSIVE = 0x40, 0x04, 0x20      # linux/can/error.h
 WATCHDOG_S = 0.6

@@ -5,8 +5,6 @@ import signal
 from itertools import product
 
 import pytest
-from path_runs import tdhil
-from rehearsal import at
 
 from drivers.drive import PowerState
 from sim_bus.simulator import EmbeddedSimulator
@@ -16,6 +14,8 @@ from tdhil.record.errors import LogBroken
 from tdhil.record.reader import read_run
 from tdhil.record.run_log import RunLog
 from tdhil.report.live import LiveDisplay
+from tests.faults.rehearsal import at
+from tests.path.path_runs import tdhil
 
 NOTICED_AT_ONCE_S = 0.1
 SPEEDS = ("speed", 15.0)

@@ -4,9 +4,9 @@ By name: the run is as safe as ever in all that the host can do, and nobody is t
 """
 
 import pytest
-from path_runs import tdhil
 
 from tdhil.record.reader import read_run
+from tests.path.path_runs import tdhil
 
 NOT_ARMED = ("--fault", "watchdog-not-armed")
 BY_NAME = "--accept-no-watchdog"

@@ -8,9 +8,20 @@ import signal
 from pathlib import Path
 
 import pytest
-from path_runs import PLAIN, QUICK_STOP_RAD_S2, SETTLING_S, WATCHDOG_S, Shaft, host, peer, tail_time, tdhil, wait_for
 
 from tdhil.record.reader import read_run
+from tests.path.path_runs import (
+    PLAIN,
+    QUICK_STOP_RAD_S2,
+    SETTLING_S,
+    WATCHDOG_S,
+    Shaft,
+    host,
+    peer,
+    tail_time,
+    tdhil,
+    wait_for,
+)
 
 CYCLE_S = 0.04
 SOURCES = ("drivers", "tdhil")

@@ -11,7 +11,6 @@ from importlib.resources import files
 
 import can
 import pytest
-from fake_drive import FakeDisplay, FakeLog
 
 from drivers.cia402.drive import Cia402Drive
 from drivers.clock import SteppedClock
@@ -27,6 +26,7 @@ from tdhil.protocol import speed_look
 from tdhil.protocol.runner import Runner
 from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
 from tdhil.protocol.task import Task
+from tests.protocol.fake_drive import FakeDisplay, FakeLog
 
 LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,

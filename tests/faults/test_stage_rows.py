@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
-from rehearsal import at
 
 from tdhil.record.pump import Pump
 from tdhil.record.reader import read_run
+from tests.faults.rehearsal import at
 
 RIG = """
 load: string

@@ -4,7 +4,8 @@ import re
 from pathlib import Path
 
 import pytest
-from rows import FIFTY, ROWS
+
+from tests.faults.rows import FIFTY, ROWS
 
 ROOT = Path(__file__).parents[2]
 TABLE = ROOT / "docs" / "faults.md"

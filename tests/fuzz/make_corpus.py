@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "record"), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT)]
 
 STUDIES = {
     "slopes": "study: figure9\nsettings:\n  seed: 3\n",
@@ -54,10 +54,8 @@ def can_scripts() -> dict[str, bytes]:
 
 
 def modbus_scripts() -> dict[str, bytes]:
-    sys.path.insert(0, str(ROOT / "tests" / "drivers"))
-    import replies
-
     from drivers.modbus.rtu import FramerRTU
+    from tests.fuzz import replies
 
     found = {}
     known = replies.modbus_requests()
@@ -72,8 +70,8 @@ def modbus_scripts() -> dict[str, bytes]:
 
 
 def main() -> None:
-    from log_runs import make_run
-    from parsers import CORPUS
+    from tests.fuzz.parsers import CORPUS
+    from tests.record.log_runs import make_run
 
     def put(parser: str, name: str, data: bytes) -> None:
         path = CORPUS / parser / name

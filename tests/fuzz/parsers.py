@@ -3,7 +3,6 @@
 An input passes when the parser gives something or raises a `TdhilError` that names the place, one line a problem.
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,12 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-import mutate
-import replies
-
 from drivers.errors import TdhilError
+from tests.fuzz import mutate, replies
 
 HERE = Path(__file__).parent
 CORPUS = HERE / "corpus"

@@ -8,13 +8,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import mutate
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from parsers import CSV_WORDS, PARSERS, YAML_WORDS, check_refusal, try_one
 
 from drivers.errors import TdhilError
+from tests.fuzz import mutate
+from tests.fuzz.parsers import CSV_WORDS, PARSERS, YAML_WORDS, check_refusal, try_one
 
 ROOT = Path(__file__).parents[2]
 FRESH = {"can": 40, "eds": 40, "mcap": 40, "profile": 40}

@@ -1,9 +1,4 @@
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))     # for shaft_bench: tests are imported by path, not as a package
 
 SEEDS = list(range(24))
 
@@ -11,8 +6,8 @@ SEEDS = list(range(24))
 @pytest.fixture(scope="session")
 def default_run():
     """The default plan on the field-like rig, 24 seeds at once: rig, motion, plan, what truly happened."""
-    from planned_motions import planned
-    from shaft_bench import Rig, turn_shaft
+    from tests.identify.planned_motions import planned
+    from tests.identify.shaft_bench import Rig, turn_shaft
 
     motion, plan = planned()
     rig = Rig()
@@ -21,7 +16,7 @@ def default_run():
 
 @pytest.fixture(scope="session")
 def one_recording(default_run):
-    from shaft_bench import recordings
+    from tests.identify.shaft_bench import recordings
 
     rig, motion, _, shaft = default_run
     return recordings(rig, motion, shaft, SEEDS[:1])[0]

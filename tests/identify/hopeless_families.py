@@ -1,9 +1,9 @@
 """Ways in which a record can be hopeless, faulty or malformed, by name: each spoils a sound one with a seed."""
 
-from hopeless_family import families
-from hopeless_motions import MOTIONS
-from hopeless_signals import SIGNALS
-from hopeless_times import TIMES
+from tests.identify.hopeless_family import families
+from tests.identify.hopeless_motions import MOTIONS
+from tests.identify.hopeless_signals import SIGNALS
+from tests.identify.hopeless_times import TIMES
 
 SEVERAL, family, _ = families()
 SINGLE = [*SIGNALS, *TIMES, *MOTIONS]

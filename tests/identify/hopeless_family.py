@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from hopeless_shaft import LEAD_S, PERIOD_S, PERIODS, Trouble
+
+from tests.identify.hopeless_shaft import LEAD_S, PERIOD_S, PERIODS, Trouble
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from hopeless_family import declaring, families, taken
-from hopeless_shaft import LEAD_S, LINES, PERIOD_S, Trouble
+
+from tests.identify.hopeless_family import declaring, families, taken
+from tests.identify.hopeless_shaft import LEAD_S, LINES, PERIOD_S, Trouble
 
 MOTIONS, family, shaft = families()
 

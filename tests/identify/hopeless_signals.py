@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from hopeless_family import families
-from hopeless_shaft import Trouble
+
+from tests.identify.hopeless_family import families
+from tests.identify.hopeless_shaft import Trouble
 
 SIGNALS, family, shaft = families()
 

@@ -2,9 +2,8 @@
 
 import math
 
-from shaft_bench import Motion
-
 from tdhil.protocol.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
+from tests.identify.shaft_bench import Motion
 
 LIMITS = MachineLimits(0.5, 10.0, 400.0)
 

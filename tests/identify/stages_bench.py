@@ -10,9 +10,9 @@ from functools import cache
 
 import numpy as np
 from scipy.signal import lfilter
-from shaft_bench import DT, Motion, Rig, Shaft, recordings
 
 from tdhil.record.recording import Level, Segment
+from tests.identify.shaft_bench import DT, Motion, Rig, Shaft, recordings
 
 LINES, AMPLITUDES = (0.1, 0.2, 0.3, 0.4), (1.45, 0.8, 0.22, 0.22)
 PHASES = (0.97, 5.08, 6.05, 0.74)

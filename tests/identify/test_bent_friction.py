@@ -4,11 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic import LINES, closed_form
 from hypothesis import given
 from hypothesis import strategies as st
-from shaft_bench import Rig
-from stages_bench import Stages, run_stages
 
 from tdhil.identify import Options, identify
 from tdhil.identify.bent.bends import Bend, bends
@@ -20,6 +17,9 @@ from tdhil.identify.lines import reports
 from tdhil.identify.lines.likelihood import Likelihood, Load
 from tdhil.identify.lines.model import Model
 from tdhil.identify.lines.spectrum import Line
+from tests.identify.analytic import LINES, closed_form
+from tests.identify.shaft_bench import Rig
+from tests.identify.stages_bench import Stages, run_stages
 
 PHI = st.tuples(
     st.floats(0.0, 1.0), st.floats(0.0, 0.5), st.floats(0.0, 1.0), st.floats(0.0, 0.5), st.floats(-0.5, 0.5),

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from shaft_bench import Rig, recordings
 
 from tdhil.identify import Options, Verdict, identify
+from tests.identify.shaft_bench import Rig, recordings
 
 pytestmark = pytest.mark.one_worker
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.stats import binom
-from stages_bench import usual_runs
 
 from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
@@ -16,6 +15,7 @@ from tdhil.identify.lines.friction import Levels, measure_levels
 from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import stretches, usable_samples
 from tdhil.record.recording import Recording
+from tests.identify.stages_bench import usual_runs
 
 pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
 

@@ -13,11 +13,11 @@ import zlib
 import numpy as np
 import pytest
 import yaml
-from hopeless_families import FAMILIES
-from hopeless_shaft import INERTIA, Trouble, simulate
 
 from tdhil.cli import main
 from tdhil.identify import Options, Verdict, identify
+from tests.identify.hopeless_families import FAMILIES
+from tests.identify.hopeless_shaft import INERTIA, Trouble, simulate
 
 pytestmark = pytest.mark.one_worker
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from test_two_mass import synthetic
 
 from tdhil.identify.lines import reports
 from tdhil.identify.lines.fit import box, minimise, rough_inertia_of
 from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.identify.lines.model import Model
+from tests.identify.test_two_mass import synthetic
 
 AT = Model().at
 AVERAGE_S = 0.645

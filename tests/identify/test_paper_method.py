@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from analytic import closed_form
-from planned_motions import planned
-from shaft_bench import Rig, simulate
 
 from tdhil.identify import Verdict, identify
 from tdhil.protocol.excitation import ExcitationWish
 from tdhil.record.recording import LagPrior
+from tests.identify.analytic import closed_form
+from tests.identify.planned_motions import planned
+from tests.identify.shaft_bench import Rig, simulate
 
 
 def slope(hertz, inertia=104.0, viscous=8.0, speed_lag=0.40, torque_lag=0.15):

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic import closed_form
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from tdhil.identify import Verdict, identify
+from tests.identify.analytic import closed_form
 
 pytestmark = pytest.mark.one_worker
 

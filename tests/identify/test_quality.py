@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic import closed_form
 
 from tdhil.identify.faults.clipped import flat_share
 from tdhil.identify.faults.frozen import frozen
@@ -14,6 +13,7 @@ from tdhil.identify.faults.undeclared import undeclared_warning
 from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.lines.warming import warming_of
 from tdhil.identify.samples import stretches, usable_samples
+from tests.identify.analytic import closed_form
 
 
 def wave(seed, quantum, noise, flat=False):

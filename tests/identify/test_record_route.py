@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
 from tdhil.identify import Options, Verdict, identify
 from tdhil.identify.record_route.bins import joined, measure, windows
@@ -15,6 +14,7 @@ from tdhil.identify.samples import usable_samples
 from tdhil.record.recording import LagPrior
 from tdhil.study import coverage_plants
 from tdhil.study.coverage_simulator import simulate as simulate_plan
+from tests.identify.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
 pytestmark = pytest.mark.one_worker
 

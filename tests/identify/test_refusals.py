@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from analytic import closed_form
 
 from tdhil.identify import Verdict, identify
+from tests.identify.analytic import closed_form
 
 
 def with_signals(recording, **signals):

@@ -6,11 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planned_motions import planned
 from scipy.signal import lfilter
 from scipy.stats import binom
-from shaft_bench import Rig, simulate
-from stages_bench import Stages, run_stages, usual_runs
 
 from tdhil.identify import Compliant, Estimate, Options
 from tdhil.identify.beside.momentum_rows import through
@@ -21,6 +18,9 @@ from tdhil.identify.lines.spectrum import period_lines
 from tdhil.identify.samples import Samples, stretches, usable_samples
 from tdhil.protocol.excitation import ExcitationWish
 from tdhil.record.recording import Recording
+from tests.identify.planned_motions import planned
+from tests.identify.shaft_bench import Rig, simulate
+from tests.identify.stages_bench import Stages, run_stages, usual_runs
 
 pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
 

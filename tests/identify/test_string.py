@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compliant_bench import LINES, Noise, Pipe, TwoMass, run
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from test_two_mass import KNOWN, MILD, S, parameters, synthetic
 
 from tdhil.identify import Verdict, identify
 from tdhil.identify.compliant.fit import chance_gain, fit_compliant, too_slow
@@ -18,6 +16,8 @@ from tdhil.identify.lines.fit import box, lowest, minimise, rough_inertia_of
 from tdhil.identify.lines.likelihood import Likelihood
 from tdhil.identify.lines.model import Model
 from tdhil.record.recording import LagPrior
+from tests.identify.compliant_bench import LINES, Noise, Pipe, TwoMass, run
+from tests.identify.test_two_mass import KNOWN, MILD, S, parameters, synthetic
 
 few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.generate])
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compliant_bench import LINES, Noise, TwoMass, run
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -21,6 +20,7 @@ from tdhil.identify.lines.rigid_result import fit_rigid
 from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.options import MODELS
 from tdhil.record.recording import LagPrior
+from tests.identify.compliant_bench import LINES, Noise, TwoMass, run
 
 S = 2j * np.pi * np.array(LINES)
 MILD = Noise(load_nm=55.0, sensor_rad_s=0.025)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from path_runs import HANGS_S, INERTIA, QUICK, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
-
 from tdhil.record.reader import read_frames, read_run, read_samples
+from tests.path.path_runs import HANGS_S, INERTIA, QUICK, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
 
 SEED = 1
 PERIODS = 3
@@ -82,7 +81,7 @@ def interrupted(folder, *, on=()) -> AbstractContextManager[tuple[Peer, Host]]:
     """Host and simulated drive, each in a process of its own."""
     from contextlib import contextmanager
 
-    from path_runs import host
+    from tests.path.path_runs import host
 
     @contextmanager
     def both():

@@ -6,13 +6,13 @@ the braking probe is the first that can tell.
 
 import numpy as np
 import pytest
-from path_runs import Shaft, identify
 
 from profiles.library import load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile
 from sim_bus.application_objects import ApplicationObjects
 from sim_bus.control import Controller
 from sim_bus.modbus.slots import Map
+from tests.path.path_runs import Shaft, identify
 
 PROFILES = {name: load_profile(name) for name in profile_names()}
 VENDORS = [name for name, one in PROFILES.items() if isinstance(one, ModbusProfile) and one.modes.torque]

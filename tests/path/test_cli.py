@@ -6,11 +6,11 @@ import sys
 
 import can
 import pytest
-from path_runs import QUICK, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
 from sim_bus.params import RigParams
 from sim_bus.simulator import EmbeddedSimulator
 from tdhil.record.reader import read_run, read_samples
+from tests.path.path_runs import QUICK, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
 SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
 KEYS = {

@@ -8,10 +8,10 @@ import termios
 from types import SimpleNamespace
 
 import pytest
-from path_runs import QUICK, TOO_MUCH, identify, process, tdhil
 
 from profiles.library import load_modbus_profile, load_profile, profile_path
 from tdhil.record.reader import read_frames, read_run
+from tests.path.path_runs import QUICK, TOO_MUCH, identify, process, tdhil
 
 pytestmark = pytest.mark.one_worker
 

@@ -5,8 +5,6 @@ import json
 import math
 
 import pytest
-from path_runs import tdhil
-from watched_bus import WatchedBus
 
 from sim_bus.modbus import embedded
 from sim_bus.modbus.wrongs import Wrong
@@ -15,6 +13,8 @@ from sim_bus.simulator import EmbeddedSimulator
 from tdhil import bus_open
 from tdhil.commands.doctor_can import link_findings
 from tdhil.commands.doctor_host import disk_finding, jitter_finding, library_findings, naps, timer_finding
+from tests.path.path_runs import tdhil
+from tests.path.watched_bus import WatchedBus
 
 GRADES = {"ok", "note", "bad"}
 

@@ -5,7 +5,8 @@ T = J α + b on a single tone, then gives J (1 + ω² τ_w τ_T)/(1 + ω² τ_T�
 """
 
 import pytest
-from path_runs import identify
+
+from tests.path.path_runs import identify
 
 INERTIA = 104.0
 RATE_HZ = 100

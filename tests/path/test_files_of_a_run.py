@@ -6,7 +6,6 @@ import threading
 from pathlib import Path
 
 import pytest
-from path_runs import identify, tdhil
 
 from sim_bus.trace import HEADER, NotATrace, Trace
 from tdhil.commands.log_file import LogPlace, is_live
@@ -15,6 +14,7 @@ from tdhil.record.container import MAGIC
 from tdhil.record.reader import read_run
 from tdhil.record.recording import Stage
 from tdhil.record.writer import RunWriter
+from tests.path.path_runs import identify, tdhil
 
 REFUSED = ("--simulate", "--seed", 1, "--fault", "wrong-identity", "--profile", "maxon/epos4")
 

@@ -1,10 +1,10 @@
 """The five stages over a virtual bus in one process, and over two processes through the socketcand hub."""
 
 import pytest
-from five_stages import SEED, FiveStages, interrupted, over_a_peer
-from path_runs import QUICK, Shaft, identify
 
 from tdhil.record.reader import read_samples
+from tests.path.five_stages import SEED, FiveStages, interrupted, over_a_peer
+from tests.path.path_runs import QUICK, Shaft, identify
 
 
 def embedded(folder, *arguments):

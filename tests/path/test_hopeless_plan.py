@@ -1,11 +1,11 @@
 """What no shaft could do is refused before the drive is touched; what this one can't do, in its own words."""
 
 import pytest
-from path_runs import tdhil
 
 from tdhil.commands.dry_run import refuse_hopeless
 from tdhil.options import resolve
 from tdhil.rig import load_rig
+from tests.path.path_runs import tdhil
 
 QUICK = ("--seed", 1)
 

@@ -1,14 +1,10 @@
 """SIGKILL at a few of the fifty random moments; all of them: `python benchmarks/kill_at_random.py`."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-from kill_at_random import plan_of, row, trial
+from benchmarks.kill_at_random import plan_of, row, trial
 
 
 @pytest.mark.heavy

@@ -4,10 +4,10 @@ One seed here; twenty, and how often the interval covers: `benchmarks/every_prof
 """
 
 import pytest
-from path_runs import Shaft, identify
 
 from profiles.library import load_profile, profile_names
 from tdhil.commands.connection import can_torque
+from tests.path.path_runs import Shaft, identify
 
 TRUE_KG_M2 = 104.0
 # generic/cia402 is what tests/path/test_five_stages.py runs; EPOS4 takes four times as long as any other.

@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from path_runs import Shaft, identify
 
 from drivers.errors import PreflightRefused
 from profiles.library import load_modbus_profile, load_profile, profile_names
@@ -19,6 +18,7 @@ from sim_bus.modbus import embedded, slots
 from sim_bus.modbus.wrongs import parse
 from tdhil.commands.unverified import accepted_lines, require_accepted
 from tdhil.record.reader import read_frames
+from tests.path.path_runs import Shaft, identify
 
 NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]
 WRONGS = ("word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied")

@@ -1,12 +1,12 @@
 """`tdhil profiles`: the table, a page for a person at the drive, and a file that is wrong."""
 
 import pytest
-from path_runs import tdhil
 
 from drivers.errors import PreflightRefused
 from profiles.library import load_profile, profile_names, profile_path
 from profiles.modbus_schema import ModbusProfile
 from tdhil.commands.unverified import require_accepted
+from tests.path.path_runs import tdhil
 
 
 def test_the_table_has_every_profile_that_ships():

@@ -10,7 +10,8 @@ import sys
 import time
 
 import pytest
-from path_runs import REAL, Terminal, host, identify, peer, tail_time, wait_for
+
+from tests.path.path_runs import REAL, Terminal, host, identify, peer, tail_time, wait_for
 
 WATCHDOG_S = 2.0
 ACCEPTED = "accept_unverified: [likely]\n"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from path_runs import identify, tdhil
 
 from tdhil.record.csv_excitation import load_excitation
 from tdhil.record.reader import read_run
+from tests.path.path_runs import identify, tdhil
 
 pytestmark = pytest.mark.one_worker
 

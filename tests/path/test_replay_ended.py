@@ -3,7 +3,8 @@
 import shutil
 
 import pytest
-from path_runs import QUICK, identify, tdhil
+
+from tests.path.path_runs import QUICK, identify, tdhil
 
 CANOPEN = ("--simulate", *QUICK, "--seed", 7)
 MODBUS = ("--drive", "modbus", "--simulate", "--seed", 7)

@@ -4,7 +4,8 @@ from datetime import datetime
 from hashlib import sha256
 
 import pytest
-from path_runs import QUICK, identify, tdhil
+
+from tests.path.path_runs import QUICK, identify, tdhil
 
 pytestmark = pytest.mark.one_worker
 

@@ -6,9 +6,6 @@ import time
 
 import can
 import pytest
-from path_runs import tdhil
-from scan_lines_scripted import Answering, Garbled, Silent
-from watched_bus import WatchedBus
 
 from drivers.errors import PreflightRefused
 from profiles.library import load_canopen_profile, load_profile, profile_names
@@ -22,6 +19,9 @@ from tdhil.commands.scan_found import FoundDrive
 from tdhil.commands.scan_modbus import parse_identification, parse_units
 from tdhil.commands.scan_rig import starter
 from tdhil.rig import load_rig, require_limits
+from tests.path.path_runs import tdhil
+from tests.path.scan_lines_scripted import Answering, Garbled, Silent
+from tests.path.watched_bus import WatchedBus
 
 LIMITS = {
     "speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0, "time_s": 900.0, "quick_stop_rad_s2": 2.0,

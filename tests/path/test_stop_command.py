@@ -6,7 +6,8 @@ import sys
 
 import can
 import pytest
-from path_runs import QUICK, host, peer, process, tdhil, wait_for
+
+from tests.path.path_runs import QUICK, host, peer, process, tdhil, wait_for
 
 NODE = 1
 SENTENCE = "STOP NOT CONFIRMED: use the hard-wired emergency stop now"

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import pytest
-from path_runs import HELD, Shaft, identify
+
+from tests.path.path_runs import HELD, Shaft, identify
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 RIG = """

@@ -10,7 +10,10 @@ import signal
 from itertools import pairwise, product
 
 import pytest
-from path_runs import (
+
+from tdhil.record.reader import read_run
+from tdhil.report.live import LiveDisplay
+from tests.path.path_runs import (
     INERTIA,
     INTERRUPTING,
     PLAIN,
@@ -29,9 +32,6 @@ from path_runs import (
     tdhil,
     wait_for,
 )
-
-from tdhil.record.reader import read_run
-from tdhil.report.live import LiveDisplay
 
 CYCLE_S = 0.02
 LONG = (*QUICK, "--periods", 40)      # no stage 5 ends before the signal is there

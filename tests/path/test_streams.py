@@ -8,12 +8,12 @@ import subprocess
 import sys
 
 import pytest
-from path_runs import QUICK, clean_environment
 
 from tdhil.cli import main
 from tdhil.commands.conclude import conclude
 from tdhil.errors import UsageError
 from tdhil.record.reader import read_run
+from tests.path.path_runs import QUICK, clean_environment
 
 FULL = "/dev/full"
 

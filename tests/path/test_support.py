@@ -7,7 +7,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from path_runs import tdhil
 
 from drivers.errors import PreflightRefused
 from profiles.library import profile_names
@@ -18,6 +17,7 @@ from tdhil.record.reader import read_run
 from tdhil.record.recording import Stage
 from tdhil.record.writer import RunWriter
 from tdhil.rig import load_rig, require_limits
+from tests.path.path_runs import tdhil
 
 USER, HOST = "janedoe", "drilling-laptop-7"
 HOMES = "/ho" "me"      # written so that no path of a home stands in the tree

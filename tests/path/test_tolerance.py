@@ -1,11 +1,11 @@
 """`--tolerance`, `--max-time` and `--dry-run` as their users meet them."""
 
 import pytest
-from path_runs import QUICK, Shaft, identify, tdhil
 
 from profiles.quantities import TIME
 from tdhil.commands.quantities import amount, share
 from tdhil.record.reader import read_run
+from tests.path.path_runs import QUICK, Shaft, identify, tdhil
 
 
 def half_width(document):

@@ -10,7 +10,8 @@ import sys
 
 import numpy as np
 import pytest
-from path_runs import QUICK, clean_environment, identify
+
+from tests.path.path_runs import QUICK, clean_environment, identify
 
 OTHER = {"x86_64": "Prescott", "AMD64": "Prescott", "aarch64": "ARMV8", "arm64": "ARMV8"}
 """The oldest kernels that OpenBLAS brings for a kind of processor."""

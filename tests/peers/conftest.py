@@ -10,12 +10,9 @@ Without node or that folder the tests are skipped and say so; TDHIL_REQUIRE_PEER
 
 import os
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "path")]     # tests are imported by path
 
 HOW = ("run them with: npm install --prefix DIR canopen@6.2.1 && TDHIL_NPM_CANOPEN=DIR python -m pytest tests/peers")
 

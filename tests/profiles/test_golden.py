@@ -1,15 +1,9 @@
 """Golden exchanges against two readings of each profile: the driver's codec, and the simulated drive."""
 
 import math
-import sys
 from functools import cache
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))     # for the helper: tests are imported by path, not as a package
-
-from golden import Exchange, Golden, Means, load, names, pdu
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Mode
@@ -29,6 +23,7 @@ from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.parameters import reporting_lag_s
 from sim_bus.modbus.timing import LineTiming
 from sim_bus.params import FAITHFUL, QUIET, RigParams
+from tests.profiles.golden import Exchange, Golden, Means, load, names, pdu
 
 NAMES = names()
 CASES = [

@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 
-from fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
-
 from drivers.drive import Command, Mode, PowerState, Sample
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.guard import Guard
 from tdhil.protocol.settings import ControlAssumptions
+from tests.protocol.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
 
 REST = Command(Mode.SPEED, 0.0, 0.0)
 REVERSIBLE = replace(LIMITS, allow_reverse=True)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from fake_drive import FakeDisplay
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState, Preflight, Sample
@@ -23,6 +22,7 @@ from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopReques
 from tdhil.protocol.task import RunOutcome, Task
 from tdhil.record.builder import RecordingBuilder
 from tdhil.record.recording import Recording
+from tests.protocol.fake_drive import FakeDisplay
 
 RIG_LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,

@@ -1,9 +1,8 @@
 """What a stop asks of the fake drive, and the times that it keeps to there."""
 
-from fake_drive import PERIOD_S
-
 from tdhil.protocol.settings import ControlAssumptions
 from tdhil.protocol.stop import SILENT_CYCLES, SILENT_S
+from tests.protocol.fake_drive import PERIOD_S
 
 SILENT = max(SILENT_CYCLES, round(SILENT_S / PERIOD_S))
 LAG_S = ControlAssumptions().largest_speed_lag_s

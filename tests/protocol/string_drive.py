@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from fake_drive import LIMITS, FakeDrive, World
-
 from drivers.drive import Command, Mode, PowerState
 from tdhil.protocol.stop import StopSequence
+from tests.protocol.fake_drive import LIMITS, FakeDrive, World
 
 STRING = replace(LIMITS, load="string", torque_ramp_nm_s=20.0)
 RESIDUAL_NM = 8.0                     # 2 % of 400 N·m; five quanta of 1 N·m are less

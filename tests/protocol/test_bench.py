@@ -5,11 +5,11 @@ import threading
 import time
 
 import pytest
-from fake_drive import FakeDrive
 
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed
 from tdhil.errors import ExitCode, Interrupted, exit_code
+from tests.protocol.fake_drive import FakeDrive
 
 REST = Command(Mode.SPEED, 0.0, 0.0)
 

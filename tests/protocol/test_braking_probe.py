@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 
 import pytest
-from fake_drive import LIMITS, FakeDrive
-from line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import PreflightRefused
 from tdhil.errors import ExitCode, exit_code
 from tdhil.protocol.braking_probe import NOT_YET
 from tdhil.protocol.settings import ExcitationRequest
+from tests.protocol.fake_drive import LIMITS, FakeDrive
+from tests.protocol.line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
 MISREAD = {
     "unsigned": lambda torque: torque if torque >= 0.0 else 400.0,        # a large number, held by the torque limit

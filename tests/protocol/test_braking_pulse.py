@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from fake_drive import LIMITS
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,6 +11,7 @@ from tdhil.protocol.braking_pulse import Before, NoPulse, Pulse, plan_pulse
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.guard import Guard
 from tdhil.protocol.settings import ControlAssumptions
+from tests.protocol.fake_drive import LIMITS
 
 USUAL = RigGuess(104.0, 8.0, 60.0)
 PERIODS = [0.004, 0.02, 0.1]

@@ -3,11 +3,11 @@
 import signal
 
 import pytest
-from fake_drive import FakeDrive
 
 from drivers.drive import Command, Mode, Paced
 from tdhil.errors import Interrupted
 from tdhil.protocol.choose_rate import CYCLES, WARM_UP, choose_rate
+from tests.protocol.fake_drive import FakeDrive
 
 REST = Command(Mode.SPEED, 0.0, 0.0)
 RATES = (250.0, 200.0, 125.0, 100.0, 50.0, 25.0)

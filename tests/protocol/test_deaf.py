@@ -10,13 +10,13 @@ import sys
 import threading
 
 import pytest
-from run_outcomes import assert_at_rest
 
 from drivers.drive import Command, Counters, Mode
 from drivers.errors import CommunicationLost, LimitHit
 from tdhil.errors import Interrupted
 from tdhil.protocol import enough, plan_stage
 from tdhil.protocol.settings import ExcitationRequest
+from tests.protocol.run_outcomes import assert_at_rest
 
 IN_VAIN_S = 20.0
 CYCLES = 5                       # of the wait, before the trouble

@@ -1,14 +1,10 @@
 """Stage 5 that goes on until it is enough: what is run, what is announced, what is decided, and how it ends early."""
 
 import signal
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import tdhil.protocol.enough as enough_room
 from drivers.drive import Command, Mode
@@ -170,7 +166,7 @@ def test_the_periods_that_fit_leave_room_for_one_extension():
 
 
 def test_a_run_on_the_simulated_inverter_covers_and_is_as_tight_as_asked():
-    from tolerance_coverage import run
+    from benchmarks.tolerance_coverage import run
 
     found = run(3, 0.03)
     assert found.covers

@@ -4,14 +4,14 @@ import math
 from dataclasses import replace
 
 import pytest
-from fake_drive import LIMITS, NAN, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
-from guarded import MODEL, REST, REVERSIBLE, guard, sample
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, TdhilError
 from tdhil.protocol.guard import Guard
+from tests.protocol.fake_drive import LIMITS, NAN, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
+from tests.protocol.guarded import MODEL, REST, REVERSIBLE, guard, sample
 
 INF = math.inf
 

@@ -4,8 +4,6 @@ import math
 from dataclasses import replace
 
 import pytest
-from fake_drive import LIMITS, SPEED_RESOLUTION, TORQUE_RESOLUTION, FakeDrive
-from guarded import sample
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +11,8 @@ from drivers.drive import Command, Mode, PowerState
 from drivers.errors import LimitHit, ModeNotConfirmed
 from tdhil.errors import ExitCode, exit_code
 from tdhil.protocol.guard import FOLLOW_S, FOLLOW_STRING_S, MODE_CYCLES, MODE_LOST_S, MODE_SWITCH_S, Guard
+from tests.protocol.fake_drive import LIMITS, SPEED_RESOLUTION, TORQUE_RESOLUTION, FakeDrive
+from tests.protocol.guarded import sample
 
 PERIODS = st.sampled_from([0.004, 0.02, 0.1, 0.25])
 STRING = replace(LIMITS, load="string", torque_ramp_nm_s=20.0)

@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from fake_drive import LIMITS, SPEED_RESOLUTION, TORQUE_RESOLUTION
-from guarded import MODEL, REVERSIBLE, guard, sample
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,6 +11,8 @@ from drivers.errors import LimitHit
 from tdhil.protocol.excitation import RigGuess
 from tdhil.protocol.guard import Guard
 from tdhil.protocol.settings import ControlAssumptions
+from tests.protocol.fake_drive import LIMITS, SPEED_RESOLUTION, TORQUE_RESOLUTION
+from tests.protocol.guarded import MODEL, REVERSIBLE, guard, sample
 
 
 @pytest.mark.parametrize(

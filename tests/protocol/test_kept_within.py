@@ -4,7 +4,6 @@ A setpoint that the guard rejects is a mistake of this program, and ends the run
 """
 
 import pytest
-from fake_drive import LIMITS, FakeDrive
 
 from drivers.drive import Mode
 from tdhil.protocol.control import MeanSpeedControl
@@ -15,6 +14,7 @@ from tdhil.protocol.settings import ControlAssumptions
 from tdhil.protocol.stage_acquire import Follower
 from tdhil.protocol.stage_hold import run_hold
 from tdhil.protocol.stage_swing import run_swings
+from tests.protocol.fake_drive import LIMITS, FakeDrive
 
 ROOM = Room(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
 

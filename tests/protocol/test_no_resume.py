@@ -5,12 +5,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from fake_drive import World
 
 from drivers.drive import PowerState
 from drivers.errors import DriveFault
 from tdhil.cli import build_parser
 from tdhil.protocol.task import STAGES
+from tests.protocol.fake_drive import World
 
 ROOT = Path(__file__).parents[2]
 
@@ -50,9 +50,9 @@ def test_no_option_of_a_run_takes_up_an_older_one():
 
 def test_what_reads_a_log_of_an_aborted_run_has_no_drive_at_hand(tmp_path):
     script = (
-        "import sys; sys.path.insert(0, 'tests/record')\n"
+        "import sys\n"
         "from pathlib import Path\n"
-        "from log_runs import make_run\n"
+        "from tests.record.log_runs import make_run\n"
         "path = Path(sys.argv[1]); make_run(path, 200)\n"
         "path.write_bytes(path.read_bytes()[:-3000])\n"
         "from tdhil.cli import main\n"

@@ -3,14 +3,14 @@
 import signal
 
 import pytest
-from fake_drive import FakeDrive, lost
-from run_outcomes import EACH_STAGE, after, assert_at_rest, outcomes, up_to
 
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.protocol.settings import ExcitationRequest
 from tdhil.record.errors import LogError
+from tests.protocol.fake_drive import FakeDrive, lost
+from tests.protocol.run_outcomes import EACH_STAGE, after, assert_at_rest, outcomes, up_to
 
 
 @EACH_STAGE

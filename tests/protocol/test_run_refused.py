@@ -4,13 +4,13 @@ import signal
 from dataclasses import replace
 
 import pytest
-from fake_drive import LIMITS, FakeDrive, refused_check
-from run_outcomes import assert_at_rest, outcomes
 
 from drivers.drive import PowerState
 from drivers.errors import LimitHit, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.protocol.settings import ExcitationRequest
+from tests.protocol.fake_drive import LIMITS, FakeDrive, refused_check
+from tests.protocol.run_outcomes import assert_at_rest, outcomes
 
 
 def assert_nothing_moved(here, result):

@@ -3,14 +3,14 @@
 from dataclasses import replace
 
 import pytest
-from fake_drive import LIMITS, FakeDrive
-from run_outcomes import assert_at_rest, outcomes, up_to
 
 from drivers.drive import Mode
 from drivers.errors import LimitHit, ModeNotConfirmed, PreflightRefused
 from tdhil.errors import ExitCode, exit_code
 from tdhil.protocol.settings import ExcitationRequest
 from tdhil.protocol.task import STAGES
+from tests.protocol.fake_drive import LIMITS, FakeDrive
+from tests.protocol.run_outcomes import assert_at_rest, outcomes, up_to
 
 
 def test_a_run_goes_through_its_five_stages_and_stops(world):

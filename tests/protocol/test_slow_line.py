@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from line_drive import COARSE, RIG_LIMITS, Line, LineDrive, run_line
 
 from drivers.drive import Mode
 from sim_bus.params import ReportingParams, RigParams
@@ -13,6 +12,7 @@ from tdhil.identify.identification import Verdict
 from tdhil.identify.options import Options
 from tdhil.protocol.settings import ControlAssumptions, ExcitationRequest
 from tdhil.record.builder import FACTS
+from tests.protocol.line_drive import COARSE, RIG_LIMITS, Line, LineDrive, run_line
 
 TRUE_KG_M2 = 104.0
 SPEED_ONLY = frozenset({Mode.SPEED})

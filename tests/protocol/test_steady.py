@@ -1,11 +1,11 @@
 """When a speed counts as steady, and what is read off it."""
 
 import pytest
-from fake_drive import FakeDrive
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import CommunicationLost, LimitHit
 from tdhil.protocol.steady import steady_level, trace, wait_until_steady
+from tests.protocol.fake_drive import FakeDrive
 
 
 def sample(time_s, speed, torque, fresh=True):

@@ -1,13 +1,13 @@
 """The stop sequence: its order, and that a turning shaft is never disabled."""
 
 import pytest
-from fake_drive import FakeDrive
-from stop_calls import LAG_S, asked
 
 from drivers.drive import Command, Mode, PowerState
 from drivers.errors import CommunicationLost, StopNotConfirmed
 from tdhil.errors import ExitCode, exit_code
 from tdhil.protocol.stop import StopReport, not_confirmed
+from tests.protocol.fake_drive import FakeDrive
+from tests.protocol.stop_calls import LAG_S, asked
 
 MODES = pytest.mark.parametrize("mode", Mode)
 

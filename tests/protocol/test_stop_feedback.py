@@ -1,12 +1,12 @@
 """The stop sequence where feedback fails for a while, for good, or says nothing that is a speed."""
 
 import pytest
-from fake_drive import PERIOD_S, FakeDrive, lost
-from stop_calls import LAG_S, SILENT, asked
 
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost
 from tdhil.protocol.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S
+from tests.protocol.fake_drive import PERIOD_S, FakeDrive, lost
+from tests.protocol.stop_calls import LAG_S, SILENT, asked
 
 
 @pytest.mark.parametrize("first", [0, 1, 60, 200])

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import pytest
-from fake_drive import PERIOD_S, FakeDrive
-from string_drive import StringDrive, StringWorld
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost
 from tdhil.protocol.settings import ControlAssumptions
+from tests.protocol.fake_drive import PERIOD_S, FakeDrive
+from tests.protocol.string_drive import StringDrive, StringWorld
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
 

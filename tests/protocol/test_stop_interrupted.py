@@ -1,10 +1,10 @@
 """The stop sequence where something is raised on the way, in a call or between two."""
 
 import pytest
-from fake_drive import lost
-from stop_calls import asked
 
 from tdhil.protocol.stop import MOST_INTERRUPTIONS
+from tests.protocol.fake_drive import lost
+from tests.protocol.stop_calls import asked
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3), MemoryError()])

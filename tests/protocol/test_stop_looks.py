@@ -3,13 +3,13 @@
 from dataclasses import dataclass, replace
 
 import pytest
-from fake_drive import LIMITS, PERIOD_S, FakeDrive
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
 from tdhil.protocol.settings import ControlAssumptions
 from tdhil.protocol.stop import REST_AFTER_S, SILENT_S, UNMOVED_S
 from tdhil.protocol.stop_looks import AFTER_S, EVERY_S, SLOWING_S, Looks, Slowing
+from tests.protocol.fake_drive import LIMITS, PERIOD_S, FakeDrive
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
 

@@ -1,8 +1,9 @@
 """How long the stop sequence waits for a shaft to come to rest."""
 
 import pytest
-from fake_drive import PERIOD_S, FakeDrive
-from stop_calls import LAG_S
+
+from tests.protocol.fake_drive import PERIOD_S, FakeDrive
+from tests.protocol.stop_calls import LAG_S
 
 
 def test_a_heavy_shaft_at_its_torque_limit_is_waited_for(world):

@@ -4,10 +4,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from string_drive import RESIDUAL_NM, STRING, StringWorld
 
 from drivers.drive import Check, Identity, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
@@ -16,6 +14,8 @@ from tdhil.protocol.settings import ExcitationRequest
 from tdhil.protocol.stop import MODE_S
 from tdhil.protocol.stop_patience import BLOCK_S, LONGEST_S, Patience
 from tdhil.protocol.string_rules import refuse_with_string
+from tests.protocol.fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
+from tests.protocol.string_drive import RESIDUAL_NM, STRING, StringWorld
 
 LIMITS = LetGoLimits(torque_nm=400.0, speed_rad_s=10.0, ramp_nm_s=20.0, torque_resolution_nm=1.0)
 

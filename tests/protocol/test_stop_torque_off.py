@@ -1,11 +1,11 @@
 """What the stop sequence sees of a shaft once its torque is off."""
 
 import pytest
-from fake_drive import PERIOD_S
-from stop_calls import LAG_S, SILENT
 
 from drivers.drive import PowerState
 from tdhil.protocol.stop import REST_AFTER_S
+from tests.protocol.fake_drive import PERIOD_S
+from tests.protocol.stop_calls import LAG_S, SILENT
 
 
 def when_off(drive, speeds):

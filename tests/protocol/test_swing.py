@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
 from drivers.drive import Mode
 from drivers.errors import PreflightRefused
@@ -19,6 +18,7 @@ from tdhil.protocol.excitation.swing import CALM_S, TOTAL_S, coasting_s
 from tdhil.protocol.planning import plan_acquisition
 from tdhil.protocol.settings import ExcitationRequest
 from tdhil.record.recording import LagPrior
+from tests.protocol.line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 0.86)

@@ -12,7 +12,6 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from log_runs import make_run
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import Writer
@@ -20,6 +19,7 @@ from mcap.writer import Writer
 from tdhil.record.container import LIBRARY, MAGIC
 from tdhil.record.errors import LogError
 from tdhil.record.reader import read_frames, read_run, read_samples
+from tests.record.log_runs import make_run
 
 QUIET = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import can
 import pytest
-from log_runs import FACTS, PERIOD_S, fill, make_run
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -18,6 +17,7 @@ from tdhil.record.channels import CHANNELS, CLASSES
 from tdhil.record.event import Event
 from tdhil.record.reader import read_frames, read_run, read_samples
 from tdhil.record.writer import RunWriter
+from tests.record.log_runs import FACTS, PERIOD_S, fill, make_run
 
 EPOCH_NS = 1_780_000_000_000_000_000
 LAYOUT = Path(__file__).parents[2] / "examples" / "foxglove_layout.json"

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from log_runs import CONFIGURATION, LEVELS
 
 from tdhil.record.reader import read_run
+from tests.record.log_runs import CONFIGURATION, LEVELS
 
 REAL_TIME = """
 import random, sys, time
 from pathlib import Path
-sys.path.insert(0, "tests/record")
-from log_runs import CONFIGURATION, LEVELS, frames, sample
+from tests.record.log_runs import CONFIGURATION, LEVELS, frames, sample
 from tdhil.record.writer import RunWriter
 
 writer, rng = RunWriter(Path(sys.argv[1]), epoch_ns=0, block=False), random.Random(1)

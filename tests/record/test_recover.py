@@ -7,7 +7,6 @@ import random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from log_runs import CONFIGURATION, STAGES, make_run, same
 from mcap.reader import make_reader
 
 from tdhil.cli import main
@@ -16,6 +15,7 @@ from tdhil.record.errors import LogError
 from tdhil.record.event import RECOVERED
 from tdhil.record.reader import read_frames, read_run, read_samples
 from tdhil.record.salvage import examine, write_copy
+from tests.record.log_runs import CONFIGURATION, STAGES, make_run, same
 
 SOME = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from test_wire import SAMPLES
 
 from drivers.drive import Command, Mode
 from tdhil.record.builder import FACTS as FACT_NAMES
@@ -23,6 +21,8 @@ from tdhil.record.event import Event
 from tdhil.record.reader import read_frames, read_run, read_samples
 from tdhil.record.recording import LagPrior, Recording
 from tdhil.record.writer import RunWriter
+from tests.record.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
+from tests.record.test_wire import SAMPLES
 
 
 def test_a_run_comes_back_as_it_was(tmp_path):

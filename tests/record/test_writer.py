@@ -7,7 +7,6 @@ import threading
 import time
 
 import pytest
-from log_runs import RESULT, fill, frames, make_run, sample
 from mcap.reader import make_reader
 
 from drivers.drive import Command, Mode
@@ -20,6 +19,7 @@ from tdhil.record.reader import read_run, read_samples
 from tdhil.record.recording import Stage
 from tdhil.record.run_log import RunLog
 from tdhil.record.writer import RunWriter
+from tests.record.log_runs import RESULT, fill, frames, make_run, sample
 
 
 class Disk(io.FileIO):

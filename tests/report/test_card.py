@@ -5,12 +5,12 @@ import re
 from dataclasses import replace
 
 import pytest
-from findings import bare, full, open_sided, recording
 from rich.console import Console
 
 from tdhil.report.card import print_card
 from tdhil.report.document import result_document
 from tdhil.report.numbers import percent, plus_minus, with_interval
+from tests.report.findings import bare, full, open_sided, recording
 
 
 def shown(found, width=80, **changes):

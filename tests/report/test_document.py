@@ -3,9 +3,9 @@
 import json
 
 import pytest
-from findings import bare, full, open_sided, recording
 
 from tdhil.report.document import result_document
+from tests.report.findings import bare, full, open_sided, recording
 
 
 @pytest.mark.parametrize("make", [full, bare, open_sided])

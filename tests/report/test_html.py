@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from findings import RUN, bare, full, open_sided, recording
 
 from tdhil.errors import UsageError
 from tdhil.report.content import report_of
 from tdhil.report.document import result_document
 from tdhil.report.html import check_report_path, report_page, sha256_of, write_report
 from tdhil.report.picture_run import envelope
+from tests.report.findings import RUN, bare, full, open_sided, recording
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
@@ -165,9 +165,9 @@ def test_no_descriptor_left_for_the_report_is_said_plainly(tmp_path, name):
     pytest.importorskip("resource")
     script = f"""
 import resource, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
 from pathlib import Path
-from findings import RUN, full, recording
+from tests.report.findings import RUN, full, recording
 from tdhil.errors import UsageError
 from tdhil.report import html, page, pictures
 from tdhil.report.document import result_document

@@ -8,11 +8,11 @@ import subprocess
 from dataclasses import replace
 
 import pytest
-from findings import RUN, around, bare, full, open_sided, recording
 
 from tdhil.identify import FrictionPoint
 from tdhil.report.content import report_of
 from tdhil.report.document import result_document
+from tests.report.findings import RUN, around, bare, full, open_sided, recording
 
 pytest.importorskip("matplotlib")
 

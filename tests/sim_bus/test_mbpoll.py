@@ -8,22 +8,18 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import QUIET_RIG
 
 from profiles.library import load_modbus_profile
 from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import Server
+from tests.sim_bus.modbus_host import QUIET_RIG
 
 WHY = "no mbpoll on this machine: no independent host has read the simulated drive; apt-get install mbpoll"
 LINES = ("tcp", "rtu")

@@ -1,21 +1,17 @@
 """The register bank of the simulated drive: functions, exceptions, types, scales, and what parameters do."""
 
 import struct
-import sys
 from math import pi
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import GENERIC, QUIET_RIG, GenericHost, Host, Refusal, drive
-
 from profiles.errors import TdhilError
 from profiles.modbus_schema import ModbusProfile
 from sim_bus.modbus.number import Layout
 from sim_bus.params import DriveParams, ReportingParams, RigParams
+from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, Host, Refusal, drive
 
 FORMATS = {"u16": "H", "i16": "h", "u32": "I", "i32": "i"}
 SOURCE = {"source": "for this test", "confidence": "verified"}

@@ -1,7 +1,6 @@
 """The embedded drive over its registers: moves, switches, stops, is watched, repeats."""
 
 import struct
-import sys
 from itertools import pairwise
 from math import pi
 from pathlib import Path
@@ -10,13 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
-
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus_schema import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
+from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
 
 RPM = 2 * pi / 60
 

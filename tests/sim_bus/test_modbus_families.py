@@ -1,17 +1,12 @@
 """Walks through the states of each family, with words and bits typed from the documents, not from a profile."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import QUIET_RIG
 
 from sim_bus.cia402_application import Application, Mode
 from sim_bus.inverter import Inverter
 from sim_bus.modbus.families import FAMILIES, Wiring
+from tests.sim_bus.modbus_host import QUIET_RIG
 
 STEP_S = 0.002
 

@@ -3,21 +3,16 @@
 import os
 import socket
 import struct
-import sys
 import termios
 import threading
 import time
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
 
 from profiles.marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
 from sim_bus.command import main
@@ -28,6 +23,7 @@ from sim_bus.modbus.framing import crc
 from sim_bus.modbus.lines import RtuListener, TcpListener
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import Server
+from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
 
 READ = struct.pack(">BHH", 3, 42, 2)
 PATTERN = bytes.fromhex("030412345678")

@@ -1,10 +1,6 @@
 """A simulated Modbus drive whose host has left in motion: its watchdog stops the shaft, and the trace shows it."""
 
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import GenericHost, drive
+from tests.sim_bus.modbus_host import GenericHost, drive
 
 
 def test_it_runs_on_until_its_watchdog_has_stopped_the_shaft() -> None:

@@ -1,15 +1,11 @@
 """The line's timing, held to the rates that serial lines with drives carry."""
 
 import struct
-import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import Host, drive
-
 from sim_bus.modbus.timing import LineTiming
+from tests.sim_bus.modbus_host import Host, drive
 
 TURN_AROUND_S = 0.010
 READ = struct.pack(">BHH", 3, 16, 4)

@@ -1,17 +1,13 @@
 """What each scripted wrong does to the registers of generic/modbus; by hand, against the same drive without it."""
 
 import struct
-import sys
 from math import pi
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))     # for modbus_host: tests are imported by path, not as a package
-from modbus_host import GenericHost, drive
-
 from profiles.errors import TdhilError
 from sim_bus.modbus.wrongs import KINDS, Wrong, parse
+from tests.sim_bus.modbus_host import GenericHost, drive
 
 
 def host(*wrongs: str) -> GenericHost:

@@ -5,7 +5,8 @@ import sys
 
 import numpy as np
 import pytest
-from simulated_runs import STUDIES, run
+
+from tests.study.simulated_runs import STUDIES, run
 
 pytestmark = pytest.mark.one_worker
 

@@ -1,12 +1,12 @@
 """Settings from files and --set, and every refusal in one line (exit code 2)."""
 
 import pytest
-from simulated_runs import STUDIES
 
 from profiles.data_model import DataModel
 from profiles.errors import DataFileError
 from tdhil.errors import ExitCode, UsageError, exit_code
 from tdhil.study.settings_files import load_study_file, with_assignments
+from tests.study.simulated_runs import STUDIES
 
 GOOD = """\
 study: table7

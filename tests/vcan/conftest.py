@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,9 +16,6 @@ from typing import NoReturn
 
 import can
 import pytest
-
-# For the helpers, here and in the rooms whose tests run here too: tests are imported by path, not as a package.
-sys.path[:0] = [str(Path(__file__).parents[1] / room) for room in ("vcan", "path", "drivers")]
 
 ARPHRD_CAN = 280  # linux/if_arp.h
 IFF_UP = 1  # linux/if.h
@@ -100,7 +96,7 @@ def tool() -> Callable[[str], str]:
 @pytest.fixture
 def ip() -> str:
     """ip(8), where links may be changed: in the guest we are root, elsewhere perhaps not."""
-    from vcan_runs import root_s_ip
+    from tests.vcan.vcan_runs import root_s_ip
 
     command = root_s_ip()
     if command is None:

@@ -13,9 +13,10 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from candump_log import HOSTS, SYNC, TPDO1, enables, watching
-from path_runs import tdhil
-from vcan_runs import assert_safe, run, run_into, simulated
+
+from tests.path.path_runs import tdhil
+from tests.vcan.candump_log import HOSTS, SYNC, TPDO1, enables, watching
+from tests.vcan.vcan_runs import assert_safe, run, run_into, simulated
 
 
 @pytest.fixture(autouse=True)

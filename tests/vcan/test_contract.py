@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from drive_benches import Run
-from test_drive_contract import *  # noqa: F403
-from test_drive_contract import other_mode
-from vcan_bench import VcanBench
 
 from sim_bus.params import RigParams
+from tests.drivers.drive_benches import Run
+from tests.drivers.test_drive_contract import *  # noqa: F403
+from tests.drivers.test_drive_contract import other_mode
+from tests.vcan.vcan_bench import VcanBench
 
 
 @pytest.fixture

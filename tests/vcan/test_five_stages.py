@@ -13,10 +13,10 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 
 import pytest
-from candump_log import DRIVES, HOSTS, SYNC, TPDO1, watching
-from five_stages import FiveStages, interrupted, over_a_peer
 
 from tdhil.record.reader import read_frames
+from tests.path.five_stages import FiveStages, interrupted, over_a_peer
+from tests.vcan.candump_log import DRIVES, HOSTS, SYNC, TPDO1, watching
 
 RATE_HZ = 50.0         # a guest takes milliseconds for a cycle; the plant's time is the same at any rate
 MOSTLY = 0.99

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
-from vcan_runs import root_s_ip, run
 
 from tdhil.protocol import stage_speed
 from tdhil.record.reader import read_run
+from tests.path.path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
+from tests.vcan.vcan_runs import root_s_ip, run
 
 pytestmark = pytest.mark.real_time
 RUNS = 10

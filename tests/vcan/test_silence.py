@@ -12,11 +12,11 @@ import statistics
 import time
 
 import pytest
-from candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
-from path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
-from vcan_runs import TURNING_RAD_S, assert_safe, simulated
 
 from tdhil.record.reader import read_frames
+from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
+from tests.vcan.candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
+from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated
 
 RATE_HZ, WATCHDOG_S = 20.0, 2.0
 RIG = f"""\

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import can
-from path_runs import HANGS_S, INERTIA, TORQUE_NM, Finished, Shaft, identify, wait_for
 
 from sim_bus.params import RigParams
 from sim_bus.simulator import Simulator
+from tests.path.path_runs import HANGS_S, INERTIA, TORQUE_NM, Finished, Shaft, identify, wait_for
 
 RATE_HZ = 25.0
 """A guest takes milliseconds for a cycle; plant time is the same at any rate."""
