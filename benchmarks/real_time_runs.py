@@ -2,7 +2,12 @@
 
 `tdhil identify` with its defaults chooses the rate; the simulated drive is a process of its own. Without a vcan of its
 own kernel the runs take place in the guest of tests/vcan/run_in_guest.sh, and the hog, a busy loop, beside it. A run
-takes two minutes, so several lanes go side by side, each on an interface of its own: a heavier load, not a lighter one.
+takes two minutes; ``--lanes`` go side by side, each on an interface of its own. That is another question: a guest has
+one processor, and what one lane plans or starts keeps it busy for the others.
+
+On a machine that has other work to do, give the guest weight (its /proc/PID/autogroup, where the kernel has that),
+never a real-time class: under SCHED_FIFO a guest gets no timer tick while one of its processes computes, and all of it
+stands still for more than a second.
 
 A line a run: lane, seed, exit code, rate, cycles, missed, late, J with its interval; then what all of them show. Exit 1
 where a run ended for lateness (code 5), or 1 % of all cycles or more were missed.
@@ -137,7 +142,7 @@ def here(options: argparse.Namespace) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Whole runs in real time on a vcan, beside a hog.")
     parser.add_argument("--runs", type=int, default=100, metavar="N", help="in all (default 100)")
-    parser.add_argument("--lanes", type=int, default=3, metavar="N", help="side by side (default 3)")
+    parser.add_argument("--lanes", type=int, default=1, metavar="N", help="side by side (default 1)")
     parser.add_argument("--hogs", type=int, default=1, metavar="N", help="busy loops beside them (default 1)")
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the first simulated drive")
     parser.add_argument("--lane", metavar="VCAN", help=argparse.SUPPRESS)
@@ -160,7 +165,7 @@ def beside(hogs: int) -> Iterator[None]:
     """So many busy loops."""
     with ExitStack() as stack:
         for _ in range(hogs):
-            # Ordinary, also where the runs go before all else (chrt -f), on a machine that has other work to do.
+            # Ordinary, whatever the runs are.
             hog = subprocess.Popen([sys.executable, "-c", HOG], preexec_fn=ordinary)  # noqa: PLW1509
             stack.callback(hog.wait)
             stack.callback(hog.kill)
