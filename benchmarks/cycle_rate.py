@@ -27,17 +27,17 @@ from typing import Any
 import can
 from can.interfaces.virtual import VirtualBus
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, FrameTap, Limits, Mode, PowerState, Preflight
 from profiles.library import load_canopen_profile
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
-from sim_bus.simulator import EmbeddedSimulator
-from tdhil.protocol.bench import Bench
-from tdhil.protocol.guard import Guard
-from tdhil.protocol.settings import MachineLimits, StopRequest
-from tdhil.record.run_log import RunLog
-from tdhil.record.writer import RunWriter
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.run_log import RunLog
+from tdhil.run.control_loop import Bench
+from tdhil.run.guard import Guard
+from tdhil.run.settings import MachineLimits, StopRequest
 
 RATE_HZ = 250.0
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)

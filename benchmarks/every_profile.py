@@ -24,7 +24,7 @@ from statistics import fmean, median
 from typing import Any
 
 from profiles.library import load_profile, profile_names
-from tdhil.cli import main as tdhil
+from tdhil.cli.main import main as tdhil
 
 TRUE_KG_M2 = 104.0
 GOOD = ("valid", "valid_wide")

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tdhil.identify import Options, identify
-from tdhil.record.recording import Excitation, Recording, Segment
+from tdhil.estimation import Options, identify
+from tdhil.recording.recording import Excitation, Recording, Segment
 
 MOST_FITS, MOST_RECORDS = 20.0, 3.0
 PERIOD_S, OFFSETS = 20.0, (2.2, 5.0)

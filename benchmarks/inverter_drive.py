@@ -15,8 +15,8 @@ from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState,
 from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from sim_bus.reporting import RPM
-from tdhil.record.builder import RecordingBuilder
-from tdhil.record.recording import Excitation, Level, Ramp, Recording, Stage
+from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
 
 
 class InverterDrive:

@@ -23,18 +23,18 @@ from drivers.drive import Command, Preflight, Sample
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.timing import LineTiming
 from sim_bus.params import RigParams
-from tdhil.identify import identify
+from tdhil.estimation import identify
 from tdhil.identify.options import Options
-from tdhil.protocol.runner import Runner
-from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.protocol.task import Task
-from tdhil.record.recording import Recording, Stage
-from tdhil.record.run_log import RunLog
-from tdhil.record.writer import RunWriter
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.recording import Recording, Stage
+from tdhil.recording.run_log import RunLog
+from tdhil.run.runner import Runner
+from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.run.task import Task
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(

@@ -88,14 +88,14 @@ SUBJECTS = {
     "modbus/arming": _driver("modbus/arming", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/limits": _driver("modbus/limits", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
     "modbus/bare_stop": _driver("modbus/bare_stop", "test_modbus_bare_stop.py"),
-    "writer": Subject("tdhil/record/writer.py", ("record/test_writer.py", "record/test_round_trip.py")),
-    "pump": Subject("tdhil/record/pump.py", ("record/test_writer.py", "record/test_round_trip.py")),
-    "backlog": Subject("tdhil/record/backlog.py", ("record/test_writer.py",)),
-    "container": Subject("tdhil/record/container.py", ("record/test_writer.py", "record/test_round_trip.py")),
+    "writer": Subject("tdhil/recording/log_writer.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
+    "pump": Subject("tdhil/record/pump.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
+    "backlog": Subject("tdhil/record/backlog.py", ("recording/test_writer.py",)),
+    "container": Subject("tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
     "identify": Subject(
-        "tdhil/commands/identify.py", ("tdhil/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
+        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
     ),
-    "stop_signals": Subject("tdhil/commands/stop_signals.py", ("tdhil/test_identify_end.py",)),
+    "stop_signals": Subject("tdhil/commands/stop_signals.py", ("cli/test_identify_end.py",)),
 }
 NAMED: tuple[tuple[str, str, str], ...] = (
     ("cia402/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
@@ -247,13 +247,13 @@ def preload() -> None:
 
     import drivers.drive
     import tdhil.errors
-    import tdhil.identify
-    import tdhil.protocol.design
-    import tdhil.protocol.excitation
-    import tdhil.record.run_log
+    import tdhil.estimation
+    import tdhil.recording.run_log
+    import tdhil.run.design
+    import tdhil.run.excitation
 
-    assert all((hypothesis, numpy, pytest, scipy.optimize, drivers.drive, tdhil.errors, tdhil.identify,
-                tdhil.protocol.design, tdhil.protocol.excitation, tdhil.record.run_log))
+    assert all((hypothesis, numpy, pytest, scipy.optimize, drivers.drive, tdhil.errors, tdhil.estimation,
+                tdhil.run.design, tdhil.run.excitation, tdhil.recording.run_log))
 
 
 def forget(module: str) -> None:

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import can
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, Limits, Mode
 from drivers.ticks import quantile
 from profiles.library import load_canopen_profile
-from tdhil.commands.real_time import real_time_priority
-from tdhil.record.run_log import RunLog
-from tdhil.record.writer import RunWriter
+from tdhil.cli.real_time import real_time_priority
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.run_log import RunLog
 
 RATE_HZ = 250.0
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=5.0)

@@ -37,8 +37,8 @@ SECONDS_A_RUN = 240
 
 def lane(interface: str, runs: int, first_seed: int, more: list[str]) -> None:
     """One run after the other on one interface, each against a new simulator; a JSON line each on stdout."""
-    from tdhil.cli import main as tdhil
-    from tdhil.record.reader import read_run
+    from tdhil.cli.main import main as tdhil
+    from tdhil.recording.log_reader import read_run
 
     out = sys.stdout
     for seed in range(first_seed, first_seed + runs):

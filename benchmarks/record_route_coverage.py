@@ -3,7 +3,7 @@
     python benchmarks/record_route_coverage.py [--seeds 200] [--first 0] [--only field] [--lag-prior]
 
 Six kinds of record on three plants, then plants whose filters are not the model's: two poles, moving averages, a pure
-delay. The simulator (tests/identify/record_bench.py) shares no code with the estimator. Per row: runs that gave a
+delay. The simulator (tests/estimation/record_bench.py) shares no code with the estimator. Per row: runs that gave a
 number, misses with the lower 99 % bound of their rate, bias, scatter, median half-width, and the bias of least squares
 of torque on [α, ω, 1] at the raw rate and over 0.1 s.
 """
@@ -20,11 +20,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tdhil.identify.identification import Identification
-from tdhil.identify.identify import identify
+from tdhil.estimation.identify import identify
+from tdhil.estimation.result import Identification
 from tdhil.identify.options import Options
-from tdhil.record.recording import LagPrior, Recording
-from tests.identify.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
+from tdhil.recording.recording import LagPrior, Recording
+from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 
 GROUP = 20
 OTHERS = (

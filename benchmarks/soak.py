@@ -177,7 +177,7 @@ def options(bus: str, rng: Random) -> list[str]:
 
 
 def one_run(bus: str, number: int, seed: int, course: Course, folder: Path) -> Done:
-    from tdhil.cli import main
+    from tdhil.cli.main import main
 
     rng = Random(f"{seed} {bus} {number}")
     drawn = options(bus, rng)

@@ -11,8 +11,8 @@ import argparse
 import sys
 import time
 
-from tdhil.study.loop import simulate
-from tdhil.study.registry import simulated_studies
+from tdhil.studies.paper.loop import simulate
+from tdhil.studies.registry import simulated_studies
 from tdhil.study.settings import LoopSettings
 
 RUNS = (1, 2, 4, 8, 16, 32, 64, 128, 256)

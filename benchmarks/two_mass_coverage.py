@@ -3,7 +3,7 @@
     python benchmarks/two_mass_coverage.py [--seeds 200] [--plant two-mass|string] [--lags known|estimated|both]
                                            [--model auto|two-mass|string] [--noise 1.0] [--first 1]
 
-The plants and their time series are of tests/identify/compliant_bench.py, which shares no code with the estimator:
+The plants and their time series are of tests/estimation/compliant_bench.py, which shares no code with the estimator:
 1500 and 374 kg·m², k 473 N·m/rad, c 23.2 N·m·s/rad (or 2300 m of drill pipe between the two), 240 s, 11 lines from 0.05
 to 0.9 Hz, reporting lags 0.40 and 0.15 s, a noise that puts the Cramér-Rao bounds where the notes have them. Every
 recording goes through `identify`. ``--noise`` scales the noise; lags known: stated to 1 % (1 sd), and as
@@ -27,10 +27,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
-from tdhil.identify import Identification, Options, identify
+from tdhil.estimation import Identification, Options, identify
 from tdhil.identify.options import Model
-from tdhil.record.recording import LagPrior, Recording
-from tests.identify.compliant_bench import Noise, Pipe, TwoMass, run
+from tdhil.recording.recording import LagPrior, Recording
+from tests.estimation.compliant_bench import Noise, Pipe, TwoMass, run
 
 PLANTS = {"two-mass": (TwoMass(), 4), "string": (Pipe(), 8)}      # with the periods to settle
 LAGS_S, LAG_REL_SD = (0.40, 0.15), 0.01

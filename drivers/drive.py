@@ -98,7 +98,7 @@ class Limits:
     quick_stop_rad_s2: float
     watchdog_s: float
     accept_no_watchdog: bool = False   # by the operator, by name: a drive whose watchdog is off and stays off
-    accept_wider: frozenset[str] = frozenset()     # of `drivers.wider.NAMES`: own limits that may be made wider
+    accept_wider: frozenset[str] = frozenset()     # of `drivers.own_limits.NAMES`: own limits that may be made wider
     accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
     temperature_c: float | None = None     # °C; above it the run is stopped, where the drive tells a temperature
 
@@ -149,7 +149,7 @@ class Preflight:
     filters: ReportingFilters = ReportingFilters()
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
     kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
-    kept_speed_rad_s: float | None = None        # (`drivers.wider`)
+    kept_speed_rad_s: float | None = None        # (`drivers.own_limits`)
     quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows
     fed_by_any_client: bool = False    # requests of any other client keep the watchdog from acting, as far as is known
 

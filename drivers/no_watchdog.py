@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from drivers.drive import Check, Outcome
-from drivers.table import Table
+from drivers.preflight import Table
 
 FLAG = "--accept-no-watchdog"
 SHARED_FLAG = "--accept-shared-watchdog"

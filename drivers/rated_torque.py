@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.table import Table
+from drivers.preflight import Table
 
 
 def agreed_rated_torque(table: Table, from_drive_nm: float | None, rig_nm: float | None, where: str) -> float | None:

@@ -1,6 +1,6 @@
 """Settings of a CANopen drive beyond CiA 402's own objects: read, required, written, or used as a scale.
 
-The words are those of `profiles.modbus_schema.Parameter`. A value in its unit is
+The words are those of `profiles.modbus.Parameter`. A value in its unit is
 
     raw x per_lsb [x value of the parameter named in ``times``]        scale: linear
     2^raw                                                              scale: power_of_two
@@ -10,8 +10,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.data_model import DataModel, Finding, refuse_if
 from profiles.entry import Entry, Positive
+from profiles.model import DataModel, Finding, refuse_if
 from profiles.requirement import Require
 
 Index = Annotated[int, Field(ge=0x0001, le=0xFFFF)]

@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from profiles.canopen_parameter import Index, Name, ObjectAt, ObjectType, SubIndex
-from profiles.data_model import Finding, refuse_if
 from profiles.entry import Entry, Positive
+from profiles.model import Finding, refuse_if
 
 U32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 I16 = Annotated[int, Field(ge=-0x8000, le=0x7FFF)]

@@ -10,11 +10,11 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from profiles.canopen import CanopenProfile
 from profiles.eds_reader import EdsFile, EdsObject
 from profiles.entry import Confidence
 from profiles.errors import DataFileError, Problem
-from profiles.schema import CanopenProfile
-from profiles.strict_yaml import parse_model
+from profiles.yaml_loader import parse_model
 
 SPEED_MODES, TORQUE_MODES = (9, 3), (10, 4)
 """Of 6060h, those that this program knows, the preferred one first."""

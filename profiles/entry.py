@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from profiles.data_model import DataModel
+from profiles.model import DataModel
 
 Confidence = Literal["verified", "likely", "unverified"]
 """verified: read in the manufacturer's document or file · likely: a consistent second-hand source · unverified."""

@@ -7,11 +7,11 @@ from typing import Literal
 
 from pydantic import ConfigDict
 
-from profiles.data_model import DataModel
+from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError, Problem
-from profiles.modbus_schema import ModbusProfile
-from profiles.schema import CanopenProfile
-from profiles.strict_yaml import load_model
+from profiles.modbus import ModbusProfile
+from profiles.model import DataModel
+from profiles.yaml_loader import load_model
 
 Profile = CanopenProfile | ModbusProfile
 

@@ -4,7 +4,7 @@ from typing import Self
 
 from pydantic import model_validator
 
-from profiles.data_model import DataModel, refuse_if
+from profiles.model import DataModel, refuse_if
 
 
 class Require(DataModel):

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from profiles import quantities
-from profiles.data_model import CROSS_FIELD, DataModel, values_of
 from profiles.errors import Problem
+from profiles.model import CROSS_FIELD, DataModel, values_of
 from profiles.yaml_scalars import hint
 from profiles.yaml_tree import Path, Tree
 

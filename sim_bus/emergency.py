@@ -10,7 +10,7 @@ from struct import Struct
 
 from canopen.sdo import SdoAbortedError
 
-from sim_bus.object_store import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
+from sim_bus.canopen.objects import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
 
 GENERIC = 0x01
 COMMUNICATION = 0x10

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from sim_bus.cia402_node import Cia402Node
+    from sim_bus.canopen.node import Cia402Node
 
 Frame = tuple[int, bytes | bytearray]
 Frames = Iterable[Frame]

@@ -15,7 +15,7 @@ from math import inf
 from typing import Generic, Protocol, TypeVar
 
 from profiles.errors import TdhilError
-from profiles.marker import STAGE_NUMBERS
+from profiles.simulator_marker import STAGE_NUMBERS
 
 _NUMBER = r"\d+(?:\.\d+)?"
 _FAULT = re.compile(

@@ -5,7 +5,7 @@ from collections import deque
 
 import can
 
-from sim_bus.hub import Hub
+from sim_bus.canopen.socketcand import Hub
 from sim_bus.socketcand import WireFrame
 
 

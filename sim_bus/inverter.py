@@ -14,9 +14,9 @@ import numpy as np
 from sim_bus.control import Controller, Regulation
 from sim_bus.noise import Disturbance, normals
 from sim_bus.params import RigParams
-from sim_bus.plant import Params as RigidParams
-from sim_bus.plant import State as RigidState
-from sim_bus.plant_kinds import MotorState, build
+from sim_bus.plant.kinds import MotorState, build
+from sim_bus.plant.rigid import Params as RigidParams
+from sim_bus.plant.rigid import State as RigidState
 from sim_bus.reporting import Reporting, lag_gain
 
 

@@ -6,7 +6,7 @@ Worked out in revolutions, apart from the drivers' own scaling, so that one mist
 from dataclasses import dataclass
 from math import pi
 
-from profiles.schema import CanopenProfile
+from profiles.canopen import CanopenProfile
 from sim_bus.params import DriveParams
 
 TURN = 2.0 * pi

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from sim_bus.plant import Params as PlantParams
-from sim_bus.plant_kinds import AnyPlantParams
+from sim_bus.plant.kinds import AnyPlantParams
+from sim_bus.plant.rigid import Params as PlantParams
 from sim_bus.validated import NonNegative, Positive, Validated
 
 
@@ -70,6 +70,6 @@ FAITHFUL = ReportingParams(
 
 def load_rig(path: Path) -> RigParams:
     """Reads ``plant.yaml``; raises `profiles.errors.DataFileError` with every problem and its line."""
-    from profiles.strict_yaml import load_model
+    from profiles.yaml_loader import load_model
 
     return load_model(path, RigParams)

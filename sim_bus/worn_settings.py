@@ -7,10 +7,10 @@ from math import isfinite
 
 from canopen.objectdictionary import datatypes
 
+from profiles.canopen import CanopenProfile
 from profiles.canopen_parameter import Parameter
-from profiles.schema import CanopenProfile
-from sim_bus.cia402_application import Application
-from sim_bus.object_store import ObjectStore, key_of
+from sim_bus.canopen.objects import ObjectStore, key_of
+from sim_bus.cia402 import Application
 from sim_bus.object_units import TURN
 
 DATA_TYPES = {

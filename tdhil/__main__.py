@@ -2,6 +2,6 @@
 
 import sys
 
-from tdhil.cli import main
+from tdhil.cli.main import main
 
 sys.exit(main())

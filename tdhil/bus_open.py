@@ -12,7 +12,7 @@ import subprocess
 from typing import TYPE_CHECKING, Any
 
 from drivers.errors import CommunicationLost, PreflightRefused
-from tdhil.bus_options import BusConfig
+from tdhil.cli.buses.can_bus import BusConfig
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:

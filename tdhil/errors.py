@@ -12,7 +12,7 @@
     ├── LimitHit                    speed left its window; torque or time limit reached          7
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
     ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
-    ├── LogError                    in `tdhil.record.errors`: each brings its own `exit_code`
+    ├── LogError                    in `tdhil.recording.errors`: each brings its own `exit_code`
     │   ├── LogUnopened             no such folder                                               2
     │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
     │   ├── LogRefused              too little space to begin with; nothing moved                4

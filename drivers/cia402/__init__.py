@@ -1,1 +1,1 @@
-"""CiA 402 drives on CANopen: state machine, objects, I/O."""
+"""What is merged into another room next."""

@@ -17,8 +17,8 @@ SYNC as answers do shows that an older one was lost; should that one come yet, i
 from collections import deque
 from collections.abc import Callable
 
-from drivers.cia402.shape import Shape
-from profiles.marker import CYCLES_END, LAST_CYCLE_OVER
+from drivers.canopen.pdo import Shape
+from profiles.simulator_marker import CYCLES_END, LAST_CYCLE_OVER
 
 _NO_WORD = b""
 ANSWER_WITHIN_S = 0.5
@@ -125,7 +125,7 @@ class Feedback:
         self._join(True, status)
 
     def on_cycle_end(self, data: bytes) -> None:
-        """Of a simulated peer with scripted faults, in stepped time (`profiles.marker.CYCLE_ID`)."""
+        """Of a simulated peer with scripted faults, in stepped time (`profiles.simulator_marker.CYCLE_ID`)."""
         self._ends_cycles = data != LAST_CYCLE_OVER
         self.over = data != CYCLES_END
 

@@ -4,10 +4,10 @@ import math
 import struct
 from collections.abc import Callable
 
-from drivers.cia402.sdo import Objects, name
+from drivers.canopen.sdo import Objects, name
 from drivers.drive import ReportingFilters
 from drivers.errors import ObjectRefused
-from profiles.schema import CanopenProfile, ReportingFilter
+from profiles.canopen import CanopenProfile, ReportingFilter
 
 _FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i8": "<b", "i16": "<h", "i32": "<i", "f32": "<f"}
 

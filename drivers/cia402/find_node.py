@@ -1,10 +1,10 @@
 """Who is at a node-ID: found, read out (CiA 301: 1000h, 1018h, 1008h), and refused where it is in doubt."""
 
-from drivers.cia402.preflight import refuse_if_driven
-from drivers.cia402.sdo import Objects, name
+from drivers.canopen.preflight import refuse_if_driven
+from drivers.canopen.sdo import Objects, name
 from drivers.drive import Identity
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
-from profiles.marker import MARKER_INDEX, MARKER_TEXT
+from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
 from profiles.visible import visible
 
 DOUBLED_ANSWERS = 3

@@ -12,7 +12,7 @@ which knows what it may be and how long it may fail to come.
 
 from collections.abc import Callable
 
-from drivers.cia402.watch import BOOT_UP, Watch
+from drivers.canopen.supervision import BOOT_UP, Watch
 
 
 class Guarding:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from drivers.cia402.sdo import Objects, name
+from drivers.canopen.sdo import Objects, name
 from drivers.cia402.values import decode_value
 from drivers.errors import ObjectRefused
-from drivers.table import Table
+from drivers.preflight import Table
+from profiles.canopen import CanopenProfile
 from profiles.canopen_parameter import Parameter
 from profiles.requirement import Require
-from profiles.schema import CanopenProfile
 
 _UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s", "hz": " Hz"}
 

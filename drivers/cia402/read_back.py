@@ -18,8 +18,8 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.cia402.sdo import name
-from drivers.cia402.watch import Watch
+from drivers.canopen.sdo import name
+from drivers.canopen.supervision import Watch
 
 EVERY_S = 1.0
 ANSWER_S = 0.5

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 
+from drivers.canopen.state_machine import INTERNAL_LIMIT, SPEED_ZERO, TARGET_REACHED, State, decode, power_state
 from drivers.cia402.objects import Units
-from drivers.cia402.state import INTERNAL_LIMIT, SPEED_ZERO, TARGET_REACHED, State, decode, power_state
 from drivers.drive import Mode, PowerState, Sample
 
 _PROFILE_VELOCITY = 3

@@ -3,11 +3,11 @@
 Sent by whoever calls, and by nothing else: neither a thread nor the kernel, which would outlive a frozen loop.
 """
 
+from drivers.canopen.bus import CanLink
+from drivers.canopen.supervision import OPERATIONAL, Watch
 from drivers.cia402.guarding import Guarding
-from drivers.cia402.link import CanLink
-from drivers.cia402.watch import OPERATIONAL, Watch
 from drivers.clock import Clock
-from profiles.schema import CanopenProfile
+from profiles.canopen import CanopenProfile
 
 HEARTBEAT_S = 0.1
 """Both ways; the host's comes faster where the watchdog is shorter than five of them."""

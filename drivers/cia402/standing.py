@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.cia402.link import CanLink
-from drivers.cia402.look import ANSWER_S, WATCHDOG_SHARE
-from drivers.cia402.mapping import DISABLED
+from drivers.canopen.bus import CanLink
+from drivers.canopen.pdo_mapping import DISABLED
+from drivers.canopen.sdo import Objects
+from drivers.canopen.sdo_feedback import ANSWER_S, WATCHDOG_SHARE
+from drivers.canopen.state_machine import State, Wish, controlword_towards
 from drivers.cia402.objects import TARGET_VELOCITY
-from drivers.cia402.sdo import Objects
-from drivers.cia402.state import State, Wish, controlword_towards
 from drivers.errors import CommunicationLost, ObjectRefused
 
 UNDONE_S, UNDONE_CYCLES = 0.3, 5

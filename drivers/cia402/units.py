@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from drivers.canopen.sdo import Objects, name
 from drivers.cia402.objects import RPM, Units
 from drivers.cia402.parameters import Settings
-from drivers.cia402.sdo import Objects, name
 from drivers.cia402.values import decode_value
 from drivers.errors import ObjectRefused
+from drivers.preflight import Table
 from drivers.rated_torque import agreed_rated_torque
-from drivers.table import Table
-from profiles.schema import CanopenProfile
+from profiles.canopen import CanopenProfile
 
 SI_UNIT_VELOCITY = 0x60A9
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
-from drivers.modbus import requests
+from drivers.modbus import pdu as requests
+from drivers.modbus.codec import WordOrder, from_words, register_name, to_words
 from drivers.modbus.errors import BUSY, BadReply, NoReply, RegisterRefused
 from drivers.modbus.link import Link
-from drivers.modbus.registers import WordOrder, from_words, register_name, to_words
-from profiles.modbus_schema import Register
+from profiles.modbus import Register
 
 SETTING_TIMEOUT_S = 1.0
 """For a reply before motion: a drive may take its time over a parameter (SINAMICS p2024 allows 1 s)."""

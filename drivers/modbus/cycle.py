@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from drivers.drive import Command, Mode
 from drivers.errors import CommandRejected
+from drivers.modbus.codec import WordOrder, from_words, register_name, to_counts, to_words
 from drivers.modbus.plan import Words
-from drivers.modbus.registers import WordOrder, from_words, register_name, to_counts, to_words
 from drivers.modbus.scales import Scales
-from profiles.modbus_schema import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Register
 
 
 class Setpoints(NamedTuple):

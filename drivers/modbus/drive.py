@@ -30,11 +30,10 @@ from drivers.drive import (
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.modbus import preflight as checks
 from drivers.modbus.access import Access
-from drivers.modbus.arming import arm_watchdog, check_who_feeds, measure_pace
+from drivers.modbus.codec import register_name
 from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
 from drivers.modbus.echoes import check_setpoints, clear_setpoints
 from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
-from drivers.modbus.heat import Heat
 from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped
 from drivers.modbus.limits import own_speed_limits, set_limits
 from drivers.modbus.link import Link, late_replies
@@ -42,16 +41,17 @@ from drivers.modbus.other_master import OtherMaster
 from drivers.modbus.parameters import find_filters
 from drivers.modbus.plan import Transaction, only_reads, plan_cycle
 from drivers.modbus.position import Angle, find_angle
-from drivers.modbus.registers import register_name
 from drivers.modbus.rounds import Round, go_round
 from drivers.modbus.scales import Scales
 from drivers.modbus.stage_marker import tell_stage
 from drivers.modbus.standstill import Standstill
-from drivers.modbus.states import Wish, controlword_towards, decode, power_state, seen
-from drivers.table import Table
+from drivers.modbus.state_machine import Wish, controlword_towards, decode, power_state, seen
+from drivers.modbus.temperature import Heat
+from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
+from drivers.own_limits import SPEED, TORQUE, OwnLimits
+from drivers.preflight import Table
 from drivers.ticks import Ticks
-from drivers.wider import SPEED, TORQUE, OwnLimits
-from profiles.modbus_schema import ModbusProfile, Register, StatusState
+from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost write must not end a run."""

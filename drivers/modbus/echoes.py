@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from drivers.drive import Limits
 from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
-from drivers.modbus.registers import RANGES, register_name, to_counts
+from drivers.modbus.codec import RANGES, register_name, to_counts
 from drivers.modbus.scales import Scales, si_per_count
-from drivers.table import Table
-from profiles.modbus_schema import Echo, ModbusProfile, Signal
+from drivers.preflight import Table
+from profiles.modbus import Echo, ModbusProfile, Signal
 
 SHARES = (0.25, -0.5, 0.75, -1.0 / 3.0)
 """Of the limit: of both signs, none a multiple of another's wrong scale, and each with two different halves."""

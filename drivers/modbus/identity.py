@@ -8,11 +8,11 @@ from typing import NamedTuple
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.access import Access
+from drivers.modbus.codec import register_name
 from drivers.modbus.errors import NoReply, RegisterRefused
-from drivers.modbus.registers import register_name
-from drivers.modbus.states import decode, power_state
-from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_TEXT
-from profiles.modbus_schema import ModbusProfile
+from drivers.modbus.state_machine import decode, power_state
+from profiles.modbus import ModbusProfile
+from profiles.simulator_marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_TEXT
 
 
 class Marker(NamedTuple):

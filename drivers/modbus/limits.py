@@ -1,6 +1,6 @@
 """Limits of rig.yaml written into the drive's own parameters (`set_to`), and read back.
 
-A limit that the drive has tighter stays so, unless the operator takes a wider one by name (`drivers.wider`).
+A limit that the drive has tighter stays so, unless the operator takes a wider one by name (`drivers.own_limits`).
 
 Speed and quick-stop limits are rounded up to a count (too low a limit would act before ours), torque down. A ramp up is
 set as steep as the quick stop and no steeper, for it stays in the drive where a run dies; ramps down are left alone,
@@ -16,12 +16,12 @@ from typing import NamedTuple
 from drivers.drive import Limits
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import Access
+from drivers.modbus.codec import to_counts
 from drivers.modbus.parameters import Parameters, show, where_of
-from drivers.modbus.registers import to_counts
 from drivers.modbus.scales import RPM, per_count
-from drivers.table import Table
-from drivers.wider import QUICK_STOP, SPEED, TORQUE, OwnLimits
-from profiles.modbus_schema import ModbusProfile, Parameter, Register
+from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
+from drivers.preflight import Table
+from profiles.modbus import ModbusProfile, Parameter, Register
 
 _SLACK = 1e-9
 """One part in 10^9: a limit that is a whole number of counts must not lose or gain one to the last bit."""

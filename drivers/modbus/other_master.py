@@ -14,14 +14,14 @@ from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 from drivers.errors import CommunicationLost
-from drivers.modbus import requests
+from drivers.modbus import pdu
 from drivers.modbus.access import Access
+from drivers.modbus.codec import from_words, register_name
 from drivers.modbus.errors import LinkLost, RegisterRefused
 from drivers.modbus.parameters import show
 from drivers.modbus.plan import CyclePlan, Span, spans
-from drivers.modbus.registers import from_words, register_name
 from drivers.modbus.scales import per_count, si_per_count
-from profiles.modbus_schema import ModbusProfile, Parameter, Register, Signal
+from profiles.modbus import ModbusProfile, Parameter, Register, Signal
 
 REMEMBERED_S = 0.5
 EVERY_S, EVERY_TIGHT_S = 0.1, 0.5
@@ -124,9 +124,9 @@ class OtherMaster:
                 self._compare_words(span, found)
 
     def _read(self, span: Span, timeout_s: float) -> tuple[int, ...] | None:
-        function = requests.READ_HOLDING if span.table == "holding" else requests.READ_INPUT
+        function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
         try:
-            return self._access.once(requests.read(function, span.address, span.length), timeout_s).words
+            return self._access.once(pdu.read(function, span.address, span.length), timeout_s).words
         except LinkLost:
             raise
         except (CommunicationLost, RegisterRefused):
@@ -175,9 +175,9 @@ class OtherMaster:
         return parameter.set_to is not None or parameter.require is not None or parameter.name in own
 
     def _readable_spans(self, registers: list[Register]) -> list[Span]:
-        tables = {"holding": requests.READ_HOLDING, "input": requests.READ_INPUT}
+        tables = {"holding": pdu.READ_HOLDING, "input": pdu.READ_INPUT}
         asked = [one for one in registers if one.table == "holding" or tables[one.table] in self._functions]
-        if requests.READ_HOLDING not in self._functions:
+        if pdu.READ_HOLDING not in self._functions:
             asked = [one for one in asked if one.table != "holding"]
         return spans(asked, self._profile.cycle.largest_gap, self._profile.cycle.largest_read)
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from drivers.drive import ReportingFilters
 from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
-from drivers.modbus.registers import RANGES, register_name
+from drivers.modbus.codec import RANGES, register_name
 from drivers.modbus.scales import RPM, per_count, settle
 from drivers.no_watchdog import spare
+from drivers.preflight import Table
 from drivers.rated_torque import agreed_rated_torque
-from drivers.table import Table
-from profiles.modbus_schema import ModbusProfile, Parameter
+from profiles.modbus import ModbusProfile, Parameter
 from profiles.requirement import Require
 
 UNITS = {"rpm": "rpm", "rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "s": "s", "hz": "Hz", "kw": "kW"}

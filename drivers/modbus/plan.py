@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from drivers.errors import PreflightRefused
-from drivers.modbus import requests
-from profiles.modbus_schema import ModbusProfile, Register
+from drivers.modbus import pdu
+from profiles.modbus import ModbusProfile, Register
 
 Words = Mapping[tuple[str, int], int]
 """Registers by (table, address)."""
@@ -45,13 +45,13 @@ class Transaction(NamedTuple):
         words = [] if self.write is None else [image[self.write.address + k] for k in range(self.write.length)]
         if self.write is None:
             assert self.read is not None
-            return requests.read(self.function, self.read.address, self.read.length)
-        if self.function == requests.WRITE_ONE:
-            return requests.write_one(self.write.address, words[0])
-        if self.function == requests.WRITE_MANY:
-            return requests.write_many(self.write.address, words)
+            return pdu.read(self.function, self.read.address, self.read.length)
+        if self.function == pdu.WRITE_ONE:
+            return pdu.write_one(self.write.address, words[0])
+        if self.function == pdu.WRITE_MANY:
+            return pdu.write_many(self.write.address, words)
         assert self.read is not None
-        return requests.read_write(self.read.address, self.read.length, self.write.address, words)
+        return pdu.read_write(self.read.address, self.read.length, self.write.address, words)
 
     def __str__(self) -> str:
         parts = [f"{verb} {span.address}+{span.length}"
@@ -81,9 +81,9 @@ def plan_cycle(profile: ModbusProfile) -> CyclePlan:
     mode_reads = [modes.display.register_] if modes.display is not None else []
     demand = [cycle.torque_demand.register_] if cycle.torque_demand is not None else []
 
-    most_written = min(cycle.largest_write, requests.MOST_WRITTEN)
+    most_written = min(cycle.largest_write, pdu.MOST_WRITTEN)
     if 16 not in cycle.functions:
-        most_written = min(most_written, requests.MOST_WRITTEN_WITH_READ) if 23 in cycle.functions else 1
+        most_written = min(most_written, pdu.MOST_WRITTEN_WITH_READ) if 23 in cycle.functions else 1
 
     def write_spans(registers: Sequence[Register]) -> list[Span]:
         return spans(registers, 0, most_written)
@@ -116,7 +116,7 @@ def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -
     """What these transactions read, without any writing; () where the drive knows no function for that."""
     found = []
     for span in (one.read for one in transactions if one.read is not None and one.read != one.write):
-        function = requests.READ_HOLDING if span.table == "holding" else requests.READ_INPUT
+        function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
         if function not in functions:
             return ()
         found.append(Transaction(function, None, span))
@@ -146,8 +146,8 @@ def spans(registers: Iterable[Register], gap: int, most: int) -> list[Span]:
 
 def _pair(writes: Sequence[Span], reads: Sequence[Span], functions: frozenset[int]) -> tuple[Transaction, ...]:
     """One transaction for a write and a read where function 23 is known; the order of the writes is kept."""
-    pairable = [span for span in reads if span.table == "holding"] if requests.READ_WRITE in functions else []
-    fit = [span.length <= requests.MOST_WRITTEN_WITH_READ for span in writes]
+    pairable = [span for span in reads if span.table == "holding"] if pdu.READ_WRITE in functions else []
+    fit = [span.length <= pdu.MOST_WRITTEN_WITH_READ for span in writes]
     pairs = min(len(writes), len(pairable)) if all(fit) else 0
     alone, paired = writes[: len(writes) - pairs], writes[len(writes) - pairs :]
     # The last pairable reads: those that bring speed and torque then come in the same transactions as the control word.
@@ -156,23 +156,23 @@ def _pair(writes: Sequence[Span], reads: Sequence[Span], functions: frozenset[in
     return (
         *(_write(span, functions) for span in alone),
         *(_read(span, functions) for span in rest),
-        *(Transaction(requests.READ_WRITE, one, other) for one, other in zip(paired, shared, strict=True)),
+        *(Transaction(pdu.READ_WRITE, one, other) for one, other in zip(paired, shared, strict=True)),
     )
 
 
 def _write(span: Span, functions: frozenset[int]) -> Transaction:
-    if span.length == 1 and requests.WRITE_ONE in functions:
-        return Transaction(requests.WRITE_ONE, span, None)
-    if requests.WRITE_MANY in functions:
-        return Transaction(requests.WRITE_MANY, span, None)
-    if requests.READ_WRITE in functions:
+    if span.length == 1 and pdu.WRITE_ONE in functions:
+        return Transaction(pdu.WRITE_ONE, span, None)
+    if pdu.WRITE_MANY in functions:
+        return Transaction(pdu.WRITE_MANY, span, None)
+    if pdu.READ_WRITE in functions:
         # What was written is read along: the function can't go without a read.
-        return Transaction(requests.READ_WRITE, span, span)
+        return Transaction(pdu.READ_WRITE, span, span)
     raise _unable("written", span)
 
 
 def _read(span: Span, functions: frozenset[int]) -> Transaction:
-    function = requests.READ_HOLDING if span.table == "holding" else requests.READ_INPUT
+    function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
     if function not in functions:
         raise _unable("read", span)
     return Transaction(function, None, span)

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, PreflightRefused
-from drivers.modbus import requests
+from drivers.modbus import pdu
 from drivers.modbus.access import Access
+from drivers.modbus.codec import WordOrder, from_words, register_name
 from drivers.modbus.errors import RegisterRefused
-from drivers.modbus.registers import WordOrder, from_words, register_name
-from drivers.table import Table
-from profiles.modbus_schema import ModbusProfile, Position
+from drivers.preflight import Table
+from profiles.modbus import ModbusProfile, Position
 
 _TITLE = "angle of the motor"
 _ASKED = "whether the shaft turns as fast as the drive says is asked of the operator"
@@ -32,10 +32,10 @@ class Angle(NamedTuple):
     def read(self, access: Access, timeout_s: float) -> PositionReading | None:
         """One transaction; None without a good reply."""
         entry, register = self.entry, self.entry.register_
-        function = requests.READ_HOLDING if register.table == "holding" else requests.READ_INPUT
+        function = pdu.READ_HOLDING if register.table == "holding" else pdu.READ_INPUT
         where = register_name(register)
         try:
-            answer = access.once(requests.read(function, register.address, register.count), timeout_s, where)
+            answer = access.once(pdu.read(function, register.address, register.count), timeout_s, where)
         except (CommunicationLost, RegisterRefused):
             return None                # the next cycle tells of a line that is gone
         half_s = 0.5 * (answer.received_s - answer.sent_s)

@@ -10,20 +10,14 @@ from collections.abc import Mapping
 
 from drivers.drive import Mode, Outcome, PowerState
 from drivers.modbus.access import Access
-from drivers.modbus.arming import counts_of, is_off
+from drivers.modbus.codec import from_words, register_name
 from drivers.modbus.cycle import shown_mode
-from drivers.modbus.parameters import (
-    Parameters,
-    check_name_plate,
-    check_required,
-    find_rated_torque,
-    read_parameters,
-)
-from drivers.modbus.registers import from_words, register_name
+from drivers.modbus.parameters import Parameters, check_name_plate, check_required, find_rated_torque, read_parameters
 from drivers.modbus.scales import Scales, find_scales
-from drivers.modbus.states import decode, power_state, seen
-from drivers.table import Table
-from profiles.modbus_schema import ModbusProfile
+from drivers.modbus.state_machine import decode, power_state, seen
+from drivers.modbus.watchdog import counts_of, is_off
+from drivers.preflight import Table
+from profiles.modbus import ModbusProfile
 
 STILL_COUNTS, STILL_SHARE = 5, 0.005
 """What counts as a shaft at rest before motion: so many counts, or this share of the speed limit if that is more."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from drivers.modbus.access import Access, Answer
 from drivers.modbus.errors import BUSY, NoisyReply, RegisterRefused
 from drivers.modbus.plan import Transaction
-from profiles.modbus_schema import Register
+from profiles.modbus import Register
 
 BUSY_TRIES, BUSY_PAUSE_S = 3, 0.002
 """Of a transaction in the cycle that the drive put off with exception 6; then the cycle counts as missed."""

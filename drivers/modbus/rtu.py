@@ -22,7 +22,7 @@ from drivers.clock import Clock
 from drivers.errors import PreflightRefused
 from drivers.modbus.errors import BadReply, LinkLost, NoisyReply, NoReply
 from drivers.modbus.link import Reply
-from drivers.modbus.requests import answers, reply_length
+from drivers.modbus.pdu import answers, reply_length
 from drivers.modbus.serial_port import refusal
 
 CHARACTER_BITS = 11

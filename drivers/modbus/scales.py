@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from profiles.modbus_schema import Echo, ModbusProfile, Parameter, Signal
+from profiles.modbus import Echo, ModbusProfile, Parameter, Signal
 
 RPM = 2.0 * math.pi / 60.0
 """rad/s in one rev/min."""

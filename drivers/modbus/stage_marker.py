@@ -7,7 +7,7 @@ from contextlib import suppress
 from drivers.errors import CommunicationLost
 from drivers.modbus.access import Access
 from drivers.modbus.errors import RegisterRefused
-from profiles.marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
+from profiles.simulator_marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
 
 _LONGEST_S = 0.05
 """For the reply, in the middle of a run: a rehearsal must not cost the run its beat."""

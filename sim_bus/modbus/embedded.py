@@ -11,14 +11,14 @@ from typing import Self
 
 import numpy as np
 
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.fault_script import Scripted
 from sim_bus.modbus.fault_catalogue import wrongs_of
 from sim_bus.modbus.faults import Faults, tells_stage
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.reply import Reply
 from sim_bus.modbus.timing import LineTiming
-from sim_bus.modbus.wrongs import Wrong
+from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
 
 _BROADCAST = 0

@@ -8,13 +8,13 @@ from sim_bus.fault_script import FaultRefused, Moment, Scripted
 from sim_bus.modbus import fault_line as line
 from sim_bus.modbus import fault_machine as machine
 from sim_bus.modbus.fault_hooks import Misbehaviour
-from sim_bus.modbus.wrongs import Wrong, parse
+from sim_bus.modbus.wrong_maps import Wrong, parse
 
 WRONGS = {
     "word-order": "word_order", "scale-10": "scale_10", "address-off-by-one": "address_off_by_one", "sign": "sign",
     "unsigned": "unsigned", "write-not-kept": "write_not_applied", "reads-back-otherwise": "reads_back_something_else",
 }
-"""Faults that are the drive's wiring (`sim_bus.modbus.wrongs`): so from the start, for good."""
+"""Faults that are the drive's wiring (`sim_bus.modbus.wrong_maps`): so from the start, for good."""
 
 ONLY_ON = {"wrong-transaction-id": ("tcp",), "reset": ("tcp",), "half-open": ("tcp",), "bad-crc": ("rtu", "embedded")}
 """Lines on which a fault can be, where that isn't all of tcp, rtu and embedded."""

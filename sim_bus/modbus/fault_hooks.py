@@ -11,7 +11,7 @@ from sim_bus.modbus.reply import Reply
 if TYPE_CHECKING:
     import numpy as np
 
-    from profiles.modbus_schema import ModbusProfile
+    from profiles.modbus import ModbusProfile
     from sim_bus.modbus.machine import Machine
 
 Ask = Callable[[bytes], Reply]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from sim_bus.cia402_application import Mode
+from sim_bus.cia402 import Mode
 from sim_bus.modbus.fault_hooks import Misbehaviour
 from sim_bus.modbus.machine import Machine
 

@@ -1,15 +1,15 @@
 """Scripted misbehaviour of one simulated Modbus drive: what is due begins and ends, requests pass through what goes on.
 
-All of it in plant time. That the host says which stage has begun (`profiles.marker.MARKER_STAGE_REGISTER`) belongs to
-the rehearsal, not to the line: no fault comes between.
+All of it in plant time. That the host says which stage has begun (`profiles.simulator_marker.MARKER_STAGE_REGISTER`)
+belongs to the rehearsal, not to the line: no fault comes between.
 """
 
 from functools import partial
 
 import numpy as np
 
-from profiles.marker import MARKER_STAGE_REGISTER
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
+from profiles.simulator_marker import MARKER_STAGE_REGISTER
 from sim_bus.fault_script import Cast, Scripted
 from sim_bus.modbus.fault_catalogue import make
 from sim_bus.modbus.fault_hooks import Ask, Misbehaviour, Scene

@@ -11,15 +11,15 @@ from typing import Self
 
 import numpy as np
 
-from profiles.modbus_schema import ModbusProfile
-from sim_bus.cia402_application import Application, Mode
+from profiles.modbus import ModbusProfile
+from sim_bus.cia402 import Application, Mode
 from sim_bus.inverter import Inverter
-from sim_bus.modbus.bank import Answer, Bank
-from sim_bus.modbus.families import FAMILIES, Wiring
+from sim_bus.modbus.control_words import FAMILIES, Wiring
 from sim_bus.modbus.parameters import Parameters, reporting_lag_s
+from sim_bus.modbus.registers import Answer, Bank
 from sim_bus.modbus.slots import Map
 from sim_bus.modbus.watchdog import Watchdog
-from sim_bus.modbus.wrongs import Wrong
+from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, Trace
 

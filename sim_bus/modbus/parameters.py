@@ -2,11 +2,11 @@
 
 from math import inf, pi
 
-from profiles.modbus_schema import ModbusProfile, Parameter
-from sim_bus.modbus.number import Layout
+from profiles.modbus import ModbusProfile, Parameter
+from sim_bus.modbus.codec import Layout
 from sim_bus.modbus.requirement import meets
 from sim_bus.modbus.starting import QUICK_STOP_RAD_S2, start
-from sim_bus.modbus.wrongs import Wrong, something_else
+from sim_bus.modbus.wrong_maps import Wrong, something_else
 from sim_bus.params import RigParams
 from sim_bus.reporting import RPM
 

@@ -10,14 +10,14 @@ from functools import partial
 from itertools import pairwise
 from math import floor, pi
 
-from profiles.marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
-from profiles.modbus_schema import Echo, ModbusProfile, Register, Signal, Temperature
-from sim_bus.cia402_application import Application
+from profiles.modbus import Echo, ModbusProfile, Register, Signal, Temperature
+from profiles.simulator_marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
+from sim_bus.cia402 import Application
+from sim_bus.modbus.codec import Layout
+from sim_bus.modbus.control_words import Words
 from sim_bus.modbus.errors import DeviceFailure, IllegalValue
-from sim_bus.modbus.families import Words
-from sim_bus.modbus.number import Layout
 from sim_bus.modbus.parameters import Parameters
-from sim_bus.modbus.wrongs import Wrong
+from sim_bus.modbus.wrong_maps import Wrong
 
 HOT_C = 120.0
 """What the simulated drive's motor bears."""

@@ -10,8 +10,8 @@ from math import inf, pi
 from typing import Protocol
 
 from profiles.errors import TdhilError
-from profiles.modbus_schema import ModbusProfile, Parameter
-from sim_bus.modbus.number import Layout
+from profiles.modbus import ModbusProfile, Parameter
+from sim_bus.modbus.codec import Layout
 from sim_bus.modbus.requirement import meets, value_that_meets
 from sim_bus.params import RigParams
 from sim_bus.reporting import RPM

@@ -12,7 +12,7 @@ characters, but a latency each way, with a jitter on top.
 from dataclasses import dataclass
 from typing import Self
 
-from profiles.modbus_schema import Line
+from profiles.modbus import Line
 
 CHARACTER_BITS = 11
 _FRAME = 3

@@ -1,6 +1,6 @@
 """The drive's supervision of its host: begins with the first message that feeds it, acts once when none comes. Pure."""
 
-from profiles.modbus_schema import ModbusWatchdog
+from profiles.modbus import ModbusWatchdog
 
 _OWN = "_of_this_connection"
 

@@ -1,1 +1,1 @@
-"""The commands, each put together from the rooms; `tdhil.cli` chooses among them."""
+"""What is merged into another room next."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from tdhil.identify.identification import Identification, Verdict
+from tdhil.estimation.result import Identification, Verdict
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
@@ -21,7 +21,7 @@ def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
     last = stopping["decisions"][-1]
     if stopping.get("confidence") == confidence:
         return float(last["working_confidence"])
-    from tdhil.protocol.design.stopping import interval_confidence
+    from tdhil.run.design.stopping_rule import interval_confidence
 
     return interval_confidence(confidence, float(stopping["pilot_dof"]), int(last["seen"]))
 

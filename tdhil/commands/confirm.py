@@ -15,9 +15,9 @@ from drivers.errors import PreflightRefused
 from drivers.no_watchdog import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
 from profiles.quantities import RPM
 from profiles.visible import visible
-from tdhil.protocol.settings import ExcitationRequest, MachineLimits
-from tdhil.protocol.task import Idle, Task
 from tdhil.report.numbers import minutes
+from tdhil.run.settings import ExcitationRequest, MachineLimits
+from tdhil.run.task import Idle, Task
 
 WORD = "MOVE"
 SPEED_FLAG = "--accept-speed-unit"

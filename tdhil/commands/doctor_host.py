@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tdhil.commands.finding import Finding, bad, note, ok
-from tdhil.commands.real_time import HOW, allowed
+from tdhil.cli.finding import Finding, bad, note, ok
+from tdhil.cli.real_time import HOW, allowed
 
 LIBRARIES = {"python-can": (4, 6), "canopen": (2, 4), "pymodbus": (3, 16)}
 """Name on the package index → the first version that this program was written for."""
 
 WANTED_FREE_BYTES = 200_000_000
-"""As the log wants it (tdhil.record.writer)."""
+"""As the log wants it (tdhil.recording.log_writer)."""
 TIMER_RESOLUTION_S = 1e-4
 LATE_S = 0.002
 """Half a period at 250 Hz: a cycle that starts later counts as an overrun."""

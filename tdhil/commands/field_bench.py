@@ -13,12 +13,12 @@ from tdhil import __version__
 if TYPE_CHECKING:
     from drivers.drive import Command, Identity, Preflight, Sample
     from sim_bus.params import RigParams
-    from tdhil.options import RunOptions
-    from tdhil.protocol.excitation import Plan, SwingPlan
-    from tdhil.protocol.task import Idle, RunOutcome, Task
-    from tdhil.record.recording import Recording, Stage
-    from tdhil.rig import Rig
-    from tdhil.study.field import FieldRun, RunProgress
+    from tdhil.config.options import RunOptions
+    from tdhil.config.rig import Rig
+    from tdhil.recording.recording import Recording, Stage
+    from tdhil.run.excitation import Plan, SwingPlan
+    from tdhil.run.task import Idle, RunOutcome, Task
+    from tdhil.studies.field.bench import FieldRun, RunProgress
 
 BEFORE_ACQUIRE_S = 32.0
 """Setup and the stage of speed take about so long; only the progress bar rests on it."""
@@ -32,13 +32,13 @@ class SimulatedFieldBench:
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
         """The Recording; raises what ended the run before its end."""
-        from tdhil.commands.connection import simulated_canopen
-        from tdhil.commands.peer import PeerPlan, open_drive
+        from tdhil.cli.connection import simulated_canopen
+        from tdhil.cli.open_drive import PeerPlan, open_drive
         from tdhil.commands.stop_signals import stop_on_signals
-        from tdhil.options import resolve
-        from tdhil.protocol.runner import Runner
-        from tdhil.record.run_log import RunLog
-        from tdhil.record.writer import RunWriter
+        from tdhil.config.options import resolve
+        from tdhil.recording.log_writer import RunWriter
+        from tdhil.recording.run_log import RunLog
+        from tdhil.run.runner import Runner
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -60,7 +60,7 @@ class SimulatedFieldBench:
 
 def bench_rig(wish: FieldRun) -> Rig:
     """The limits of the bench: those of the simulated rig, with the study's torque limit."""
-    from tdhil.rig import Rig, simulated_default_rig
+    from tdhil.config.rig import Rig, simulated_default_rig
 
     usual = simulated_default_rig().model_dump(by_alias=True)
     return Rig.model_validate({**usual, "limits": {**usual["limits"], "torque_nm": wish.torque_limit_nm}})
@@ -104,8 +104,8 @@ def _asked(wish: FieldRun) -> dict[str, object]:
 
 
 def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
-    from tdhil.commands.task import bench_of, excitation_request, facts, machine_limits
-    from tdhil.protocol.task import Task
+    from tdhil.cli.task import bench_of, excitation_request, facts, machine_limits
+    from tdhil.run.task import Task
 
     bench = bench_of(identity, rig)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))
@@ -117,7 +117,7 @@ def _no_prompt(task: Task, preflight: Preflight, idle: Idle) -> None:
 
 
 def _raise_if_ended(outcome: RunOutcome) -> None:
-    from tdhil.protocol.stop import not_confirmed
+    from tdhil.run.stop import not_confirmed
 
     if outcome.cause is not None:
         raise outcome.cause

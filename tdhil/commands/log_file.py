@@ -61,7 +61,7 @@ class LogPlace:
 
 def check_log_path(path: Path, where: str = "--log") -> None:
     """UsageError for a file that is no log: it would be moved aside by mistake."""
-    from tdhil.record.container import MAGIC
+    from tdhil.recording.mcap_container import MAGIC
 
     if not path.is_file() or path.suffix == ".mcap":
         return
@@ -123,7 +123,7 @@ def _dated(path: Path, time_s: float) -> Path:
 def _is_stub(path: Path) -> bool:
     """Does an older log hold no motion either?"""
     from tdhil.record.errors import LogError
-    from tdhil.record.reader import read_run
+    from tdhil.recording.log_reader import read_run
 
     with suppress(OSError, LogError):
         return path.stat().st_size < _LARGEST_STUB and not any(

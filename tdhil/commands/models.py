@@ -1,6 +1,6 @@
 """Which shafts may be asked for, and which motions of stage 5.
 
-They are `tdhil.identify.options.MODELS` and the kinds of `tdhil.protocol.settings`, without what importing those costs.
+They are `tdhil.estimation.options.MODELS` and the kinds of `tdhil.run.settings`, without what importing those costs.
 """
 
 MODELS = ("auto", "rigid", "two-mass", "string", "paper")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from profiles.canopen import CanopenProfile
 from profiles.canopen_parameter import Parameter
 from profiles.entry import Entry
 from profiles.library import Profile
-from profiles.modbus_schema import ModbusProfile
-from profiles.modbus_schema import Parameter as ModbusParameter
-from profiles.schema import CanopenProfile
-from tdhil.commands.profile_registers import register_uses, unit_text
-from tdhil.commands.profile_said import (
+from profiles.modbus import ModbusProfile
+from profiles.modbus import Parameter as ModbusParameter
+from tdhil.cli.profile_text import (
     facts_of,
     modes_text,
     rated_torque_is_told_by_hand,
@@ -19,6 +18,7 @@ from tdhil.commands.profile_said import (
     sure_text,
     watchdog_text,
 )
+from tdhil.commands.profile_registers import register_uses, unit_text
 from tdhil.commands.unverified import FLAG, doubtful
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from profiles.entry import Entry
-from profiles.modbus_schema import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Register
 
 _UNITS = {"rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "hz": "Hz", "kw": "kW", "none": ""}
 _SIGNALS = {

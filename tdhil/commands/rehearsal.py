@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from tdhil.commands.peer import PeerPlan
+from tdhil.cli.open_drive import PeerPlan
 from tdhil.errors import UsageError
 
 

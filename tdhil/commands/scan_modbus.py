@@ -12,19 +12,19 @@ from typing import Any
 
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.access import Access
+from drivers.modbus.codec import from_words
 from drivers.modbus.errors import BadReply, NoReply
 from drivers.modbus.identity import read_marker
 from drivers.modbus.link import Link
 from drivers.modbus.parameters import Parameters, check_name_plate, find_rated_torque
-from drivers.modbus.registers import from_words
-from drivers.modbus.requests import READ_HOLDING, READ_INPUT, read
+from drivers.modbus.pdu import READ_HOLDING, READ_INPUT, read
 from drivers.modbus.scales import settle
-from drivers.table import Table
+from drivers.preflight import Table
 from profiles.library import load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Register
 from profiles.visible import visible
+from tdhil.cli.found_drive import FoundDrive
 from tdhil.commands.profile_registers import register_uses
-from tdhil.commands.scan_found import FoundDrive
 
 ANSWER_S = 0.25
 """For one reply: at 9600 baud a request and its reply take 17 ms, and drives turn around in 5 to 100 ms."""

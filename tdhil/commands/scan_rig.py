@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from profiles.library import Profile
-from profiles.modbus_schema import ModbusProfile
-from tdhil.commands.profile_said import rated_torque_is_told_by_hand, required_text
-from tdhil.commands.scan_found import FoundDrive
+from profiles.modbus import ModbusProfile
+from tdhil.cli.found_drive import FoundDrive
+from tdhil.cli.profile_text import rated_torque_is_told_by_hand, required_text
 from tdhil.commands.unverified import doubtful
-from tdhil.rig import Limits, Rig
+from tdhil.config.rig import Limits, Rig
 
 _PLAIN = re.compile(r"[A-Za-z_./][A-Za-z0-9_./-]*")
 _WORDS = {"true", "false", "null", "yes", "no", "on", "off", "y", "n", "~", ".inf", ".nan"}

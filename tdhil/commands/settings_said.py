@@ -10,10 +10,10 @@ from tdhil import __version__
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tdhil.commands.connection import Connection
-    from tdhil.commands.peer import PeerPlan
-    from tdhil.options import RunOptions
-    from tdhil.rig import Rig
+    from tdhil.cli.connection import Connection
+    from tdhil.cli.open_drive import PeerPlan
+    from tdhil.config.options import RunOptions
+    from tdhil.config.rig import Rig
 
 
 def configuration(options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """Limits of the embedded simulated rig where a plant.yaml hangs a drill string on it and no rig.yaml names any.
 
-The usual ones (`tdhil.rig`) are those of the default rig, which is light: with them a string is neither moved to speed
-nor brought to rest in reasonable time. These follow from the simulated drive's own torque limit.
+The usual ones (`tdhil.config.rig`) are those of the default rig, which is light: with them a string is neither moved to
+speed nor brought to rest in reasonable time. These follow from the simulated drive's own torque limit.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from tdhil.rig import Rig, simulated_default_rig
+from tdhil.config.rig import Rig, simulated_default_rig
 
 TORQUE_SHARE, PROBE_SHARE = 0.5, 0.25
 """Of the simulated drive's torque limit, which also stands for the make-up torque of the string's joints."""

@@ -2,8 +2,8 @@
 
 import math
 
-from tdhil.identify.identification import BudgetLine, Estimate, InertiaEstimate
-from tdhil.identify.lines.profile import student_quantile
+from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.result import BudgetLine, Estimate, InertiaEstimate
 
 _CERTAIN = 1e6      # degrees of freedom: what a data sheet states is taken for normally distributed
 

@@ -1,1 +1,1 @@
-"""The five stages, their order, the guard over every command and sample, the excitations."""
+"""What is merged into another room next."""

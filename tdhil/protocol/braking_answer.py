@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.drive import Sample
 from tdhil.protocol.braking_pulse import Pulse
-from tdhil.protocol.steady import trace
+from tdhil.run.stages.steady import trace
 
 MEAN_S = 0.05
 """What is looked at is a mean over this time, or one sample where that is longer."""

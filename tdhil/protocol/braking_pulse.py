@@ -32,8 +32,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tdhil.protocol.excitation import RigGuess
-from tdhil.protocol.settings import ControlAssumptions, MachineLimits
+from tdhil.run.excitation import RigGuess
+from tdhil.run.settings import ControlAssumptions, MachineLimits
 
 UP_SHARE, DOWN_SHARE = 0.8, 0.6
 SEEN_SHARE = 0.06

@@ -79,7 +79,7 @@ def quieten() -> None:
     import scipy.special
     import scipy.stats  # noqa: F401
 
-    import tdhil.identify  # noqa: F401
+    import tdhil.estimation  # noqa: F401
 
     gc.collect()
     gc.freeze()

@@ -9,8 +9,8 @@ the crossing is at about ω_b, where the lag costs atan(0.2) = 11° and the inte
 phase are left, and 45° if the lag is four times what was assumed.
 """
 
-from tdhil.protocol.excitation import RigGuess
-from tdhil.protocol.settings import ControlAssumptions
+from tdhil.run.excitation import RigGuess
+from tdhil.run.settings import ControlAssumptions
 
 
 class MeanSpeedControl:

@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 from drivers.drive import ReportingFilters
-from tdhil.protocol.settings import ControlAssumptions
-from tdhil.record.recording import LagPrior
+from tdhil.recording.recording import LagPrior
+from tdhil.run.settings import ControlAssumptions
 
 READ_FILTER_SD_SHARE = 0.1
 READ_FILTER_SD_S = 0.001

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.drive import Command, Mode
-from tdhil.protocol.bench import Bench
 from tdhil.protocol.control import MeanSpeedControl
-from tdhil.protocol.excitation import RigGuess
-from tdhil.protocol.excitation.swing import CALM_S, SwingPlan, Way
-from tdhil.protocol.settings import ControlAssumptions, MachineLimits
-from tdhil.protocol.stage_acquire import AcquireResult, Announce, Follower
-from tdhil.record.recording import Excitation
+from tdhil.recording.recording import Excitation
+from tdhil.run.control_loop import Bench
+from tdhil.run.excitation import RigGuess
+from tdhil.run.excitation.pulses import CALM_S, SwingPlan, Way
+from tdhil.run.settings import ControlAssumptions, MachineLimits
+from tdhil.run.stages.acquire import AcquireResult, Announce, Follower
 
 _LONGEST = 2.0            # times the planned coasting, at most: friction may have been taken too high
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drivers.drive import Preflight
 from drivers.errors import PreflightRefused
 from drivers.no_watchdog import FLAG, SHARED_FLAG
-from tdhil.protocol.settings import ExcitationRequest, MachineLimits
+from tdhil.run.settings import ExcitationRequest, MachineLimits
 
 _LETS_GO = ("coast", "none", "fault_reaction")
 """Reactions to a silent host after which nothing holds the string; a drive in fault has its torque off (CiA 402)."""

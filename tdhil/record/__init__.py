@@ -1,1 +1,1 @@
-"""From samples to run.mcap and back to a Recording."""
+"""What is merged into another room next."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from tdhil.record.csv_errors import CsvUnusable
 from tdhil.record.csv_rows import LineArray
-from tdhil.record.recording import BoolArray, FloatArray
+from tdhil.recording.recording import BoolArray, FloatArray
 
 LONGEST_S = 7 * 86400.0
 _MOST_DROPPED = 0.10      # of the rows; more and it isn't one record

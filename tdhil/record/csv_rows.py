@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.record.csv_clock import ClockReader
-from tdhil.record.csv_layout import Layout
 from tdhil.record.csv_numbers import is_missing, number, split_cells
-from tdhil.record.csv_text import Block
-from tdhil.record.recording import FloatArray
+from tdhil.recording.csv.layout import Layout
+from tdhil.recording.csv.text import Block
+from tdhil.recording.recording import FloatArray
 
 LineArray = NDArray[np.int64]
 

@@ -10,12 +10,12 @@ import numpy as np
 from tdhil.errors import UsageError
 from tdhil.record.csv_choice import USUAL, Choices
 from tdhil.record.csv_errors import CsvUnusable
-from tdhil.record.csv_layout import Layout, find_layout
 from tdhil.record.csv_numbers import LARGEST
 from tdhil.record.csv_order import rising
 from tdhil.record.csv_rows import LineArray, RowReader, Tally
-from tdhil.record.csv_text import Block, blocks, encoding_of
-from tdhil.record.recording import FloatArray
+from tdhil.recording.csv.layout import Layout, find_layout
+from tdhil.recording.csv.text import Block, blocks, encoding_of
+from tdhil.recording.recording import FloatArray
 
 MAX_ROWS = 10_000_000      # 32 bytes each while they are read
 _MOST_ODD = 0.10           # of the rows, ragged or without a number where one should be

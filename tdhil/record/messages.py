@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from tdhil.record import chunk
-from tdhil.record.channels import CHANNELS, PACKAGE, schema_name
-from tdhil.record.container import MAGIC
 from tdhil.record.errors import LogError
 from tdhil.record.inflate import Contents, Damage
-from tdhil.record.recovery import Library, Whole, walk
+from tdhil.recording.log_format import CHANNELS, PACKAGE, schema_name
+from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.mcap_recovery import Library, Whole, walk
 
 _NUMBER: Final = {(topic, schema_name(message)): number for number, (topic, message) in CHANNELS.items()}
 _OTHER: Final = "Give a run.mcap of this tool"

@@ -6,13 +6,13 @@ from typing import Final
 
 from drivers.drive import RawFrame, Sample
 from tdhil.record.backlog import Backlog
-from tdhil.record.channels import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE
-from tdhil.record.cold import Cold, event_message
-from tdhil.record.container import Container
 from tdhil.record.event import Event
 from tdhil.record.foxglove import log_payload
 from tdhil.record.sync import Syncer
 from tdhil.record.wire import pack_command, pack_frames, pack_sample
+from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE
+from tdhil.recording.log_messages import Cold, event_message
+from tdhil.recording.mcap_container import Container
 
 POLL_S: Final = 0.05
 CHUNK_WALL_S: Final = 0.25

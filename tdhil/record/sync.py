@@ -9,7 +9,7 @@ import os
 from threading import Event, Thread
 from typing import Final
 
-from tdhil.record.container import RawFile
+from tdhil.recording.mcap_container import RawFile
 
 EVERY_S: Final = 0.25                  # of wall time, at most so often
 _CANNOT: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EROFS, errno.ENOSYS})

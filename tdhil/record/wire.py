@@ -19,7 +19,7 @@ from functools import lru_cache
 from struct import Struct
 
 from drivers.drive import Command, RawFrame, Sample
-from tdhil.record.channels import MODES, STATES
+from tdhil.recording.log_format import MODES, STATES
 
 _SAMPLE = Struct("<BdBdBdBdBd B?B?B?BBBB BI".replace(" ", ""))
 _DEMAND = Struct("<Bd")

@@ -1,1 +1,1 @@
-"""Findings to terminal and JSON."""
+"""Findings to terminal, JSON, HTML and PDF."""

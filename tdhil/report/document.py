@@ -8,8 +8,8 @@ from dataclasses import asdict
 from typing import Any
 
 from tdhil import __version__
-from tdhil.identify.identification import Identification, InertiaEstimate, LineFit
-from tdhil.record.recording import Recording
+from tdhil.estimation.result import Identification, InertiaEstimate, LineFit
+from tdhil.recording.recording import Recording
 
 SIMULATED = "SIMULATED"
 

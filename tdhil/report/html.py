@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.errors import UsageError
-from tdhil.record.recording import Recording
+from tdhil.recording.recording import Recording
 from tdhil.report.content import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.html_template import STYLE, TEMPLATE
 from tdhil.report.page import inline_svg, require_extra

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from drivers.drive import Command, Outcome, Preflight, Sample
 from profiles.visible import visible
-from tdhil.record.recording import Stage
+from tdhil.recording.recording import Stage
 from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED
 from tdhil.report.numbers import minutes

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray, Recording
+from tdhil.recording.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

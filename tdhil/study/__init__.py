@@ -1,1 +1,1 @@
-"""The paper's simulated and field experiments, and ours, as commands: published figures beside what comes out here."""
+"""What is merged into another room next."""

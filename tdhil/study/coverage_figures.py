@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.study.coverage_plants import CoveragePlant
+from tdhil.studies.coverage.plants import CoveragePlant
 from tdhil.study.coverage_runs import Run
 
 ONE_SIDED = 0.99          # confidence of each bound of the miss rate

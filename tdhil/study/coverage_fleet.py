@@ -7,7 +7,7 @@ of the design's notes and is scaled to the torque and speed of the others.
 
 from __future__ import annotations
 
-from tdhil.study.coverage_plants import Bend, CoveragePlant, Noise, Reading, Report
+from tdhil.studies.coverage.plants import Bend, CoveragePlant, Noise, Reading, Report
 
 RPM = 0.10471975511965977   # rad/s
 

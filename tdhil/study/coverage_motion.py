@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.protocol.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
-from tdhil.record.recording import Segment
-from tdhil.study.coverage_plants import CoveragePlant, FloatArray
+from tdhil.recording.recording import Segment
+from tdhil.run.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
+from tdhil.studies.coverage.plants import CoveragePlant, FloatArray
 
 ROUGH_ERROR = 0.15        # the rough inertia is wrong by up to this share, uniformly, either way
 _FRICTION_ERROR = 0.03    # so is the rough friction: the steady holds of stages 2 to 4 tell it well

@@ -10,11 +10,11 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from tdhil.identify.identify import identify
+from tdhil.estimation.identify import identify
 from tdhil.identify.options import Options
-from tdhil.study.coverage_plants import CoveragePlant
-from tdhil.study.coverage_simulator import simulate
-from tdhil.study.workers import results
+from tdhil.studies.coverage.plants import CoveragePlant
+from tdhil.studies.coverage.simulate import simulate
+from tdhil.studies.coverage.workers import results
 
 GROUP = 20     # runs simulated together: some 200 MB
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tdhil.studies.study import Cell, ResultTable, Statement
 from tdhil.study.coverage_figures import MOST_REFUSED, PlantFigures, answers, covers, efficient, not_too_wide, unbiased
-from tdhil.study.outcome import Cell, ResultTable, Statement
 
 
 def normal_quantile(confidence: float) -> float:

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.studies.coverage.plants import CoveragePlant, FloatArray
 from tdhil.study.coverage_motion import Motion
-from tdhil.study.coverage_plants import CoveragePlant, FloatArray
 
 _BANDWIDTH_RAD_S = 0.2 / 0.4
 _LEAST_DELAY_S = 0.005

@@ -12,8 +12,8 @@ from functools import cache
 from importlib.resources import files
 from itertools import combinations
 
-from profiles.data_model import DataModel
-from profiles.strict_yaml import parse_model
+from profiles.model import DataModel
+from profiles.yaml_loader import parse_model
 
 Rows = tuple[tuple[int, ...], ...]
 
@@ -35,7 +35,7 @@ class _Arrays(DataModel):
 def shipped_arrays() -> dict[str, Rows]:
     """L9, L16."""
     name = "design_arrays.yaml"
-    text = files("tdhil.study").joinpath(name).read_text(encoding="utf-8")
+    text = files("tdhil.studies").joinpath(name).read_text(encoding="utf-8")
     return {array.name: array.rows for array in parse_model(text, name, _Arrays).arrays}
 
 

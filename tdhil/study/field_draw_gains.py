@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tdhil.studies.field.tone import Amplitudes
 from tdhil.study.field_draw import PUBLISHED, colour, tidy
-from tdhil.study.field_tone import Amplitudes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

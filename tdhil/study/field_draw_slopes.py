@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from tdhil.identify.identification import Identification
+from tdhil.estimation.result import Identification
+from tdhil.studies.field.tone import Scatter
 from tdhil.study.field_draw import PUBLISHED, colour, tidy
-from tdhil.study.field_tone import Scatter
 from tdhil.study.joint import slope_of
 
 if TYPE_CHECKING:

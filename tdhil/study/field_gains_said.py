@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
+from tdhil.studies.field.settings import GainSweepSettings
+from tdhil.studies.field.tone import Amplitudes
+from tdhil.studies.study import Statement
 from tdhil.study.field_loop import best_kp, gain, tones_with_steady_rise
-from tdhil.study.field_settings import GainSweepSettings
-from tdhil.study.field_tone import Amplitudes
-from tdhil.study.outcome import Statement
 
 
 def said_of_kp(settings: GainSweepSettings, values: Sequence[float], found: Sequence[Amplitudes]) -> tuple[

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray
-from tdhil.study.field_settings import SimulatedRig
+from tdhil.recording.recording import FloatArray
+from tdhil.studies.field.settings import SimulatedRig
 
 
 def gain(

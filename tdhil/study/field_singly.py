@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.identify import Estimate, Identification, Options, identify
-from tdhil.record.recording import LagPrior, Recording
+from tdhil.estimation import Estimate, Identification, Options, identify
+from tdhil.recording.recording import LagPrior, Recording
+from tdhil.studies.study import Cell, ResultTable, Statement
 from tdhil.study.coverage_said import normal_quantile
-from tdhil.study.outcome import Cell, ResultTable, Statement
 
 SPREAD = 0.01
 """How far apart the tones' inertias may be, as a share of their mean; the paper's slopes are 76 % apart."""

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.identification import Identification
-from tdhil.record.recording import FloatArray
-from tdhil.study.field_settings import SlopeSettings
-from tdhil.study.field_tone import Scatter
-from tdhil.study.outcome import Statement
+from tdhil.estimation.result import Identification
+from tdhil.recording.recording import FloatArray
+from tdhil.studies.field.settings import SlopeSettings
+from tdhil.studies.field.tone import Scatter
+from tdhil.studies.study import Statement
 
 PUBLISHED = {0.1: (105.379, 73.216), 0.3: (116.557, 70.467), 0.5: (135.622, 70.598), 1.0: (185.757, 73.212)}
 """Tone, Hz: slope, kg·m², and intercept, N·m (figure 22)."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.study.field import FieldBench, FieldRun, part_of
+from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
+from tdhil.studies.field.settings import ToneSweepSettings
+from tdhil.studies.field.tone import Amplitudes, amplitudes, periods_for
+from tdhil.studies.study import Progress, ResultTable, Statement, StudyOutcome
 from tdhil.study.field_draw import PUBLISHED, colour, tidy
 from tdhil.study.field_loop import gain
-from tdhil.study.field_settings import ToneSweepSettings
-from tdhil.study.field_tone import Amplitudes, amplitudes, periods_for
-from tdhil.study.outcome import Progress, ResultTable, Statement, StudyOutcome
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

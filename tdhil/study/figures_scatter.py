@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.study.design import DesignSettings
-from tdhil.study.outcome import Cell, Progress, ResultTable, Statement, StudyOutcome
-from tdhil.study.tables_design import DesignResult, DesignRun, run_design
+from tdhil.studies.paper.design_runs import DesignResult, DesignRun, run_design
+from tdhil.studies.paper.orthogonal_design import DesignSettings
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import model_validator
 
-from profiles.data_model import refuse_if
-from tdhil.study.loop import LoopRecord, simulate
-from tdhil.study.outcome import Cell, Progress, ResultTable, Statement, StudyOutcome
-from tdhil.study.processing import response, torque_line
-from tdhil.study.published import published
+from profiles.model import refuse_if
+from tdhil.studies.paper.loop import LoopRecord, simulate
+from tdhil.studies.paper.processing import response, torque_line
+from tdhil.studies.paper.published import published
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
 from tdhil.study.settings import LoopSettings, Positive, SamplePeriod, changed
 
 if TYPE_CHECKING:

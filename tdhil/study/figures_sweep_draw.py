@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.study.processing import Response
+from tdhil.studies.paper.processing import Response
 from tdhil.study.settings import LABELS
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.identify.identification import Identification
-from tdhil.record.recording import Excitation, FloatArray, Recording, Segment
+from tdhil.estimation.result import Identification
+from tdhil.recording.recording import Excitation, FloatArray, Recording, Segment
 
 _BETWEEN_S = 10.0      # of nothing, between two records
 _AROUND_S = 1.0        # kept before and after a record's segments

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from profiles.data_model import DataModel, Finding, refuse_if
-from sim_bus.batch import LARGEST_BRISTLE_STEP
+from profiles.model import DataModel, Finding, refuse_if
+from sim_bus.plant.batch import LARGEST_BRISTLE_STEP
 
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]

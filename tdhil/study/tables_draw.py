@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from tdhil.study.published import PublishedDesign
+from tdhil.studies.paper.design_runs import DesignResult
+from tdhil.studies.paper.published import PublishedDesign
 from tdhil.study.settings import LABELS
-from tdhil.study.tables_design import DesignResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

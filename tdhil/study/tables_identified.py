@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from tdhil.identify import Identification, Options, identify
-from tdhil.record.recording import Excitation, FloatArray, LagPrior, Recording, Segment
+from tdhil.estimation import Identification, Options, identify
+from tdhil.recording.recording import Excitation, FloatArray, LagPrior, Recording, Segment
 from tdhil.study.settings import LoopSettings
 
 _SETTLE = 1      # periods: the loop settles within J/Kp, below a second

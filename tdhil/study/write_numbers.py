@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from tdhil.study.outcome import Cell
+from tdhil.studies.study import Cell
 
 _DIGITS = 5          # of a column's largest number
 _MOST_DECIMALS = 5

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
-from tdhil.study.outcome import Progress
+from tdhil.studies.study import Progress
 
 LINE_EVERY_S = 60.0
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tdhil.report.page import STYLE
-from tdhil.study.outcome import StudyOutcome
-from tdhil.study.write import Written
+from tdhil.studies.output import Written
+from tdhil.studies.study import StudyOutcome
 from tdhil.study.write_numbers import shown
 from tdhil.study.write_terminal import MARKS
 

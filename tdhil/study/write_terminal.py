@@ -10,8 +10,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from tdhil.study.outcome import ResultTable, Statement, Study, StudyOutcome
-from tdhil.study.write import Written
+from tdhil.studies.output import Written
+from tdhil.studies.study import ResultTable, Statement, Study, StudyOutcome
 from tdhil.study.write_numbers import column_texts
 
 MARKS: dict[bool | None, tuple[str, str, str]] = {

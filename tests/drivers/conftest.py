@@ -7,7 +7,7 @@ import pytest
 @pytest.fixture
 def fake_time(monkeypatch):
     """Fake time in every file of the driver that looks at the clock; nothing outside it notices."""
-    import drivers.cia402.drive  # noqa: F401  (all of its files are then loaded)
+    import drivers.canopen.drive  # noqa: F401  (all of its files are then loaded)
     from tests.drivers.scripted_drive import FakeTime
 
     fake = FakeTime()

@@ -15,11 +15,11 @@ from collections import deque
 
 import can
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from profiles.library import load_canopen_profile
-from sim_bus.inline import InlineSimulator
+from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 
 LIMITS = Limits(

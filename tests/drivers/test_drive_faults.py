@@ -6,7 +6,7 @@ import itertools
 import can
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY

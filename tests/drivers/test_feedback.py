@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.canopen.pdo import STANDARD, Shape
 from drivers.cia402.feedback import Feedback
-from drivers.cia402.shape import STANDARD, Shape
-from profiles.marker import CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
+from profiles.simulator_marker import CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 
 OLD, NEW, OTHER = b"\x01" * 8, b"\x02" * 8, b"\x03" * 8
 WIDE = Shape(torque=(0x2000, 0, 32))

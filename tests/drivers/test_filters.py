@@ -5,12 +5,12 @@ import struct
 
 import pytest
 
+from drivers.canopen.bus import CanLink
+from drivers.canopen.sdo import Objects
 from drivers.cia402.filters import lag_seconds, read_filters
-from drivers.cia402.link import CanLink
-from drivers.cia402.sdo import Objects
 from drivers.clock import SteppedClock
 from drivers.errors import ObjectRefused
-from profiles.schema import ReportingFilter
+from profiles.canopen import ReportingFilter
 
 
 def entry(signal="speed", index=0x2504, kind="u16", quantity="time_constant_s", per_lsb=0.001):

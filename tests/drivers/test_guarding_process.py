@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from profiles.library import load_canopen_profile

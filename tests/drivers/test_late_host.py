@@ -5,7 +5,7 @@ On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
 
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost

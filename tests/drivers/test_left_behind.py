@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import PreflightRefused

@@ -8,7 +8,7 @@ from drivers.clock import SteppedClock
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
-from profiles.marker import MARKER_REGISTER, MARKER_STAGE_REGISTER, STAGE_NUMBERS
+from profiles.simulator_marker import MARKER_REGISTER, MARKER_STAGE_REGISTER, STAGE_NUMBERS
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 

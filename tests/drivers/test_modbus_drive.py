@@ -12,7 +12,7 @@ from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from drivers.modbus.errors import CycleRefused, LinkLost, NoisyReply
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, MODE, Bank, high_and_low
 from tests.drivers.power_machine import OFF, STOPPING
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from drivers.errors import PreflightRefused
 from drivers.modbus.plan import Span, plan_cycle, spans
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Register
 
 GENERIC = load_modbus_profile("generic/modbus").model_dump(by_alias=True)
 WHENCE = {"source": "made up for a test", "confidence": "unverified"}

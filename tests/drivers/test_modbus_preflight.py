@@ -11,7 +11,7 @@ from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
 LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)

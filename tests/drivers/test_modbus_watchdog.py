@@ -8,9 +8,9 @@ import pytest
 
 from drivers.clock import SteppedClock
 from drivers.drive import Outcome
-from drivers.modbus.arming import COUNT_S
+from drivers.modbus.watchdog import COUNT_S
 from profiles.library import load_modbus_profile, load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import TIME_OUT, Bank
 from tests.drivers.test_modbus_preflight import LIMITS, changed, drive_on
 

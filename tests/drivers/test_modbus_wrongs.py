@@ -12,9 +12,9 @@ from drivers.errors import PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile, load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
-from sim_bus.modbus.wrongs import parse
+from sim_bus.modbus.wrong_maps import parse
 from sim_bus.params import RigParams
 
 LIMITS = Limits(

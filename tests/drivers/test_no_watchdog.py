@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Limits, Mode, Outcome
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, TIME_OUT, Bank
 from tests.drivers.profile_benches import S120Bench

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.canopen.pdo_mapping import layout
 from drivers.cia402 import objects
-from drivers.cia402.mapping import layout
 from drivers.cia402.objects import Units, consumer_heartbeat, encode_speed, encode_torque, lsb_decimals, mapping_entry
 from drivers.errors import CommandRejected
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.cia402.link import CanLink
-from drivers.cia402.sdo import Objects, is_answer, name
+from drivers.canopen.bus import CanLink
+from drivers.canopen.sdo import Objects, is_answer, name
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, ObjectRefused
 

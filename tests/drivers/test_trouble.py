@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cia402.drive import Cia402Drive
-from drivers.cia402.link import CanLink
+from drivers.canopen.bus import CanLink
+from drivers.canopen.drive import Cia402Drive
+from drivers.canopen.supervision import Watch
 from drivers.cia402.trouble import Condition, condition, queue_is_full
-from drivers.cia402.watch import Watch
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tdhil.report.live import LiveDisplay
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, Finished, Shaft, identify, tdhil
 

@@ -15,8 +15,8 @@ LATE: dict[int, Row] = {
              "tests/drivers/test_late_host.py::test_half_of_the_watchdogs_time_is_the_longest_stall"),
             "\"this computer was late: its control loop stood still for …\" comes before what was seen on the bus"),
     53: Row("Ctrl-C, or a trip of the guard, while the rest of the run is planned", "QS in the next cycle", "130, 7",
-            ("tests/protocol/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
-             "tests/protocol/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
+            ("tests/run/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
+             "tests/run/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
             "the plan is dropped, not waited for; it was before, and nothing was sent meanwhile"),
     54: Row("a busy computer, in stepped time (answers take seconds, or are lost)", "the run is the same", "as without",
             ("tests/drivers/test_drive_faults.py::test_in_stepped_time_nothing_is_late",
@@ -24,14 +24,14 @@ LATE: dict[int, Row] = {
              "tests/drivers/test_drive_faults.py::test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on"),
             "the peer is asked whether anything is still to come; nothing but a dead one (4 s) ends a wait"),
     55: Row("this computer doesn't hold the profile's rate", "a lower one, chosen and said before motion", "0",
-            ("tests/protocol/test_choose_rate.py::"
+            ("tests/run/test_choose_rate.py::"
              "test_the_highest_rate_whose_half_period_is_longer_than_the_delay",
-             "tests/protocol/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
+             "tests/run/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
             "the highest of which 999 cycles of 1000 are in time by half a period"),
 }
 
 SECOND = f"{HERE}test_second_master_rows.py::"
-STRANGERS = "tests/drivers/test_strangers.py::"
+STRANGERS = "tests/drivers/test_other_master.py::"
 
 SECOND_MASTER: dict[int, Row] = {
     56: Row("another node bears the host's number: its heartbeat feeds the drive's watchdog",
@@ -55,12 +55,12 @@ SECOND_MASTER: dict[int, Row] = {
     62: Row("a second master undoes the quick stop again and again", "the host falls silent and looks on; WD", "5",
             (f"{SECOND}test_a_quick_stop_that_is_undone_again_and_again_is_left_to_the_watchdog",)),
     63: Row("`tdhil stop` in torque mode, where the drive's quick stop lets go", "speed mode at zero first", "0",
-            ("tests/drivers/test_bare_stop.py::test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns",),
+            ("tests/drivers/test_quick_stop.py::test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns",),
             "braked to rest, never off while it turned"),
     64: Row("the drive's own limits are tighter than rig.yaml's", "they stay, or R; widened by name only", "0, 4",
             ("tests/drivers/test_preflight.py::test_a_tighter_limit_of_the_drive_s_own_stays",
              "tests/drivers/test_preflight.py::test_it_is_widened_by_name_and_no_other_with_it",
-             "tests/protocol/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
+             "tests/run/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
             "kept, and the run keeps within them"),
     65: Row("a killed host leaves its limits in the drive", "named by doctor, given back by the next run", "-",
             ("tests/drivers/test_left_behind.py::test_the_next_run_gives_back_what_a_killed_one_left",
@@ -96,7 +96,7 @@ MODBUS: dict[int, Row] = {
     70: Row(
         "`tdhil stop` in torque mode where a quick stop doesn't decelerate, and where the drive's watchdog coasts",
         "speed mode at zero first, the stop word again while the shaft turns: braked to rest, never let go", "0",
-        ("tests/drivers/test_modbus_bare_stop.py::test_it_brakes_to_rest_and_never_lets_go",),
+        ("tests/drivers/test_modbus_quick_stop.py::test_it_brakes_to_rest_and_never_lets_go",),
         "every shipped Modbus profile, in each of its modes",
     ),
     71: Row(
@@ -138,25 +138,25 @@ UNITS: dict[int, Row] = {
 STAGES: dict[int, Row] = {
     79: Row("a drill string, and a drive whose quick stop lets go of it", "R", "4",
             ("tests/faults/test_stage_rows.py::test_a_string_and_a_quick_stop_that_lets_go",
-             "tests/protocol/test_stop_string.py::test_what_a_string_forbids",
+             "tests/run/test_stop_string.py::test_what_a_string_forbids",
              "tests/drivers/test_preflight.py::test_whether_a_quick_stop_holds_the_shaft")),
     80: Row("somebody else drives the shaft on against the quick stop", "the drive is fed no more: WD", "as its cause",
-            ("tests/protocol/test_stop_looks.py::"
+            ("tests/run/test_stop_looks.py::"
              "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
     81: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",
             ("tests/faults/test_stage_rows.py::test_a_fault_that_never_comes_is_said",)),
     82: Row("a mode that is lost in motion", "QS", "6",
             ("tests/faults/test_stage_rows.py::test_a_mode_that_is_lost_in_motion",
-             "tests/protocol/test_guard_follows.py::test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame")),
+             "tests/run/test_guard_follows.py::test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame")),
     83: Row("a shaft that does not follow in speed mode", "following error: QS", "7",
             ("tests/faults/test_stage_rows.py::test_a_shaft_that_does_not_follow_in_speed_mode",
-             "tests/protocol/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
-             "tests/protocol/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
+             "tests/run/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
+             "tests/run/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
     84: Row("a log that is removed, cut short, or whose thread dies", "said at once: QS", "3",
             ("tests/faults/test_stage_rows.py::test_a_log_that_is_taken_away",
-             "tests/record/test_writer.py::test_a_log_that_was_taken_away_is_told_at_once",
-             "tests/record/test_writer.py::test_a_log_whose_thread_died_is_told_within_a_second")),
+             "tests/recording/test_writer.py::test_a_log_that_was_taken_away_is_told_at_once",
+             "tests/recording/test_writer.py::test_a_log_whose_thread_died_is_told_within_a_second")),
 }
 
 STREAMS = "tests/path/test_streams.py::"
@@ -164,19 +164,19 @@ FILES = "tests/path/test_files_of_a_run.py::"
 COMMAND_LINE: dict[int, Row] = {
     85: Row("rig.yaml confirms in the operator's place (run: yes, accept_no_watchdog …)", "refused, with the line and "
             "the flag; consent to a profile's entries counts for the profile of the same file only", "2",
-            ("tests/tdhil/test_only_the_operator.py::test_a_file_does_not_confirm",
-             "tests/tdhil/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
-             "tests/tdhil/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
+            ("tests/cli/test_only_the_operator.py::test_a_file_does_not_confirm",
+             "tests/cli/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
+             "tests/cli/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
             "the key is named with its line, nothing is connected to"),
     86: Row("a quantity in rig.yaml in another unit than the key's (speed_max_rad_s: 100 rpm, speed_max_rpm)",
             "converted and shown both ways, or refused without offering a number; both forms of a key are refused",
-            "0, 2", ("tests/tdhil/test_rig_units.py::test_a_value_with_its_unit_is_converted_and_both_are_told",
-             "tests/tdhil/test_rig_units.py::test_a_key_in_the_manual_s_unit",
-             "tests/tdhil/test_rig_units.py::test_what_is_refused_offers_no_wrong_number"),
+            "0, 2", ("tests/config/test_rig_units.py::test_a_value_with_its_unit_is_converted_and_both_are_told",
+             "tests/config/test_rig_units.py::test_a_key_in_the_manual_s_unit",
+             "tests/config/test_rig_units.py::test_what_is_refused_offers_no_wrong_number"),
             "100 rpm = 10.47 rad/s in settings, dry run and prompt"),
     87: Row("a bit rate that CAN doesn't have (500 for 500k)", "refused wherever it stands; the nearest is named", "2",
-            ("tests/tdhil/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
-             "tests/tdhil/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
+            ("tests/config/test_rig_units.py::test_the_command_line_and_the_environment_know_the_same_rates",
+             "tests/config/test_rig_units.py::test_bit_rates_that_can_does_not_have"),
             "500 bit/s is none of CAN's; 500k is one"),
     88: Row("two runs log into one folder", "a live log is never moved; the second takes a name of its own and says it",
             "-", (f"{FILES}test_a_live_log_is_never_moved", f"{FILES}test_runs_begun_at_once_share_no_file",
@@ -208,14 +208,14 @@ COMMAND_LINE: dict[int, Row] = {
 LOG: dict[int, Row] = {
     93: Row("replay of a run that was aborted and came to rest", "what came before the abort counts; it is named", "3",
              ("tests/path/test_replay_ended.py::test_an_aborted_run_is_a_partial_result",
-              "tests/identify/test_aborted.py::test_whatever_follows_the_abort_the_result_is_the_same"),
+              "tests/estimation/test_aborted.py::test_whatever_follows_the_abort_the_result_is_the_same"),
              "result with a warning that names stage and cause"),
     94: Row("replay of a run that was refused, or ended in setup", "its refusal is said", "the run's own",
              ("tests/path/test_replay_ended.py::test_a_refused_run_says_its_refusal",),
              "what, where, and the next step"),
     95: Row("replay on another kind of processor", "numbers the same to 1e-9, words the same", "the run's own",
              ("tests/path/test_two_kernels.py::test_a_replay_under_other_kernels",
-              "tests/identify/test_quality.py::test_rounding_does_not_decide_whether_a_period_is_wrong"),
+              "tests/estimation/test_data_checks.py::test_rounding_does_not_decide_whether_a_period_is_wrong"),
              "the same result"),
 }
 

@@ -12,11 +12,11 @@ import pytest
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, exit_code
-from tdhil.protocol.bench import Bench
-from tdhil.protocol.settings import ExcitationRequest
-from tdhil.protocol.task import STAGES
 from tdhil.record.errors import LogError
-from tests.protocol.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
+from tdhil.run.control_loop import Bench
+from tdhil.run.settings import ExcitationRequest
+from tdhil.run.task import STAGES
+from tests.run.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
 
 IN_STAGE = 60
 """Cycles into a stage at which its fault begins."""

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from sim_bus.modbus import embedded
-from sim_bus.modbus.wrongs import parse
+from sim_bus.modbus.wrong_maps import parse
 from tests.faults.rehearsal import at, run
 
 MODBUS = ("--drive", "modbus")

@@ -7,13 +7,13 @@ from itertools import product
 import pytest
 
 from drivers.drive import PowerState
-from sim_bus.simulator import EmbeddedSimulator
-from tdhil.protocol import plan_stage
-from tdhil.protocol.bench import Bench
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from tdhil.record.errors import LogBroken
-from tdhil.record.reader import read_run
-from tdhil.record.run_log import RunLog
+from tdhil.recording.log_reader import read_run
+from tdhil.recording.run_log import RunLog
 from tdhil.report.live import LiveDisplay
+from tdhil.run import stage_planner
+from tdhil.run.control_loop import Bench
 from tests.faults.rehearsal import at
 from tests.path.path_runs import tdhil
 
@@ -67,7 +67,7 @@ def test_row_5_a_mistake_of_ours(where, rehearse, monkeypatch, seen):
         run = rehearse()
         since_s = acted[0]
     else:
-        monkeypatch.setattr(plan_stage, "plan_acquisition", mistake)
+        monkeypatch.setattr(stage_planner, "plan_acquisition", mistake)
         run = rehearse()
         since_s = next(event.time_s for event in read_run(run.log).events if event.kind == "failure")
     assert run.done.code == 1

@@ -5,7 +5,7 @@ By name: the run is as safe as ever in all that the host can do, and nobody is t
 
 import pytest
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import tdhil
 
 NOT_ARMED = ("--fault", "watchdog-not-armed")

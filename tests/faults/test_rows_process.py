@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import (
     PLAIN,
     QUICK_STOP_RAD_S2,
@@ -92,8 +92,8 @@ def test_row_7_nothing_is_sent_by_kernel_or_thread():
     for path in (path for source in SOURCES for path in (root / source).rglob("*.py")):
         code = path.read_text(encoding="utf-8")
         assert "send_periodic(" not in code, path
-    for sender in ("drive.py", "sign_of_life.py"):
-        assert "threading" not in (root / "drivers" / "cia402" / sender).read_text(encoding="utf-8")
+    for sender in ("drive.py", "supervision.py"):
+        assert "threading" not in (root / "drivers" / "canopen" / sender).read_text(encoding="utf-8")
 
 
 def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):

@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 NOTICED_AT_ONCE_S = 0.1        # five cycles

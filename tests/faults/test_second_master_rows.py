@@ -6,7 +6,7 @@ somebody else's hands. A run is refused, takes another number, or has come to re
 
 import pytest
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 

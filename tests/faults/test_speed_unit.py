@@ -12,21 +12,21 @@ from importlib.resources import files
 import can
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.embedded import EmbeddedLink
 from profiles.library import load_canopen_profile, load_modbus_profile
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
-from sim_bus.simulator import EmbeddedSimulator
 from tdhil.errors import exit_code
-from tdhil.protocol import speed_look
-from tdhil.protocol.runner import Runner
-from tdhil.protocol.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.protocol.task import Task
-from tests.protocol.fake_drive import FakeDisplay, FakeLog
+from tdhil.run import speed_check
+from tdhil.run.runner import Runner
+from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.run.task import Task
+from tests.run.fake_drive import FakeDisplay, FakeLog
 
 LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,
@@ -279,7 +279,7 @@ def test_taken_by_name_nobody_is_asked(made, bus):
     limits = replace(LIMITS, accept_speed_unit=True)
     assert isinstance(rig.run(simulated=False, limits=limits).cause, Enough)
     assert rig.log.run["speed_unit"]["seen_by"] == "--accept-speed-unit"
-    (warning,) = speed_look.warnings(rig.log.run)
+    (warning,) = speed_check.warnings(rig.log.run)
     assert "--accept-speed-unit" in warning
 
 
@@ -323,7 +323,7 @@ def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
         one.log.on = True
         assert isinstance(one.run().cause, Enough)
     assert rig.log.run["speed_unit"]["ratio"] == pytest.approx(1.0, abs=0.005)
-    assert speed_look.warnings(rig.log.run) == ()
+    assert speed_check.warnings(rig.log.run) == ()
     # No cycle of its own; on Modbus its requests take time on the line, which shifts the noise.
     assert rig.log.cycles == pytest.approx(plain.log.cycles, abs=0 if bus is canopen else 20)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tdhil.record.pump import Pump
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tests.faults.rehearsal import at
 
 RIG = """

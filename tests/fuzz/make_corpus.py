@@ -71,7 +71,7 @@ def modbus_scripts() -> dict[str, bytes]:
 
 def main() -> None:
     from tests.fuzz.parsers import CORPUS
-    from tests.record.log_runs import make_run
+    from tests.recording.log_runs import make_run
 
     def put(parser: str, name: str, data: bytes) -> None:
         path = CORPUS / parser / name

@@ -92,7 +92,7 @@ def _eds(path: Path) -> None:
 
 
 def _rig(path: Path) -> None:
-    from tdhil.rig import load_rig
+    from tdhil.config.rig import load_rig
 
     rig = load_rig(path)
     for name in ("limits", "gear.ratio", "run.seed"):
@@ -100,7 +100,7 @@ def _rig(path: Path) -> None:
 
 
 def _plant(path: Path) -> None:
-    from profiles.strict_yaml import load_model
+    from profiles.yaml_loader import load_model
     from sim_bus.params import RigParams
 
     load_model(path, RigParams)
@@ -108,19 +108,19 @@ def _plant(path: Path) -> None:
 
 @cache
 def _studies() -> dict:
-    from tdhil.commands.study import all_studies
+    from tdhil.cli.study import all_studies
 
     return all_studies()
 
 
 def _study(path: Path) -> None:
-    from tdhil.study.settings_files import load_study_file
+    from tdhil.studies.settings_files import load_study_file
 
     load_study_file(path, _studies())
 
 
 def _excitation(path: Path) -> None:
-    from tdhil.record.csv_excitation import load_excitation
+    from tdhil.recording.csv.excitation import load_excitation
 
     found, levels = load_excitation(path, np.linspace(0.0, 100.0, 1001))
     for segment in found.segments:
@@ -130,7 +130,7 @@ def _excitation(path: Path) -> None:
 
 def _csv(path: Path) -> None:
     from tdhil.record.csv_choice import USUAL, parse_columns
-    from tdhil.record.csv_recording import Bench, read_recording
+    from tdhil.recording.csv.reader import Bench, read_recording
 
     choices = USUAL
     if not path.read_bytes().startswith(b"time_s"):
@@ -142,8 +142,8 @@ def _csv(path: Path) -> None:
 
 
 def _mcap(path: Path) -> None:
-    from tdhil.record.reader import read_frames, read_run, read_samples
-    from tdhil.record.salvage import examine, write_copy
+    from tdhil.recording.log_reader import read_frames, read_run, read_samples
+    from tdhil.recording.salvage import examine, write_copy
 
     copy = path.with_suffix(".copy")
     found = examine(path)                  # as `tdhil recover`: also where the head is damaged

@@ -14,7 +14,7 @@ import types
 from collections.abc import Iterator
 from typing import Any
 
-import drivers.cia402.drive
+import drivers.canopen.drive
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import TdhilError
@@ -95,7 +95,7 @@ def can_session(script: bytes) -> None:
         ScriptedDrive(bus)
         Script(script, bus)
         begun_s = now.now_s
-        drive = drivers.cia402.drive.Cia402Drive(bus, _profile, MonotonicClock(), node=1)
+        drive = drivers.canopen.drive.Cia402Drive(bus, _profile, MonotonicClock(), node=1)
         attempt(drive.connect)
         ready = first is None and attempt(drive.preflight, LIMITS)
         if ready:
@@ -164,23 +164,23 @@ class TickingClock:
 
 
 def modbus_requests() -> tuple[bytes, ...]:
-    from drivers.modbus import requests
+    from drivers.modbus import pdu
 
-    return (requests.read(3, 0, 2), requests.read(4, 100, 125), requests.write_one(5, 7),
-            requests.write_many(9, (1, 2, 3)), requests.read_write(0, 3, 10, (1, 2)))
+    return (pdu.read(3, 0, 2), pdu.read(4, 100, 125), pdu.write_one(5, 7),
+            pdu.write_many(9, (1, 2, 3)), pdu.read_write(0, 3, 10, (1, 2)))
 
 
 def modbus_replies(script: bytes) -> None:
     """One request over each of the two links, answered by the script. Raises the last TdhilError."""
-    from drivers.modbus import requests
+    from drivers.modbus import pdu
 
     known = modbus_requests()
     request = known[script[0] % len(known)] if script else known[0]
     said = script[2:]
     errors: list[TdhilError] = []
-    requests.reply_length(said)
+    pdu.reply_length(said)
     framed = script[1:2] == b"\1"
-    for step in (lambda: requests.words_of(request, said, "register 0"), lambda: _over_rtu(request, said, framed),
+    for step in (lambda: pdu.words_of(request, said, "register 0"), lambda: _over_rtu(request, said, framed),
                  lambda: _over_tcp(request, said)):
         try:
             words = step()
@@ -193,7 +193,7 @@ def modbus_replies(script: bytes) -> None:
 
 
 def _over_rtu(request: bytes, said: bytes, framed: bool) -> tuple[int, ...]:
-    from drivers.modbus import requests, rtu
+    from drivers.modbus import pdu, rtu
 
     clock = TickingClock()
     if framed:                             # what is inside a frame that is sound
@@ -212,13 +212,13 @@ def _over_rtu(request: bytes, said: bytes, framed: bool) -> tuple[int, ...]:
             sys.modules["serial"] = former
     try:
         reply = link.transact(1, request, 0.1)
-        return requests.words_of(request, reply.pdu, "register 0")
+        return pdu.words_of(request, reply.pdu, "register 0")
     finally:
         link.close()
 
 
 def _over_tcp(request: bytes, said: bytes) -> tuple[int, ...]:
-    from drivers.modbus import requests, tcp
+    from drivers.modbus import pdu, tcp
 
     ours, theirs = socket.socketpair()
 
@@ -232,6 +232,6 @@ def _over_tcp(request: bytes, said: bytes) -> tuple[int, ...]:
         theirs.shutdown(socket.SHUT_WR)
         try:
             reply = link.transact(1, request, 0.1)
-            return requests.words_of(request, reply.pdu, "register 0")
+            return pdu.words_of(request, reply.pdu, "register 0")
         finally:
             link.close()

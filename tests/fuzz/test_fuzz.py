@@ -97,7 +97,7 @@ GROWING = """
 import resource, sys
 from pathlib import Path
 from drivers.errors import TdhilError
-from tdhil.rig import load_rig
+from tdhil.config.rig import load_rig
 
 limit = 2 * 2**30
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))

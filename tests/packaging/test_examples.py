@@ -10,11 +10,11 @@ import pytest
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from profiles.strict_yaml import load_with_lines
+from profiles.yaml_loader import load_with_lines
 from sim_bus.params import RigParams
 from sim_bus.params import load_rig as load_plant
-from tdhil.options import OPTIONS
-from tdhil.rig import Rig, load_rig, require_limits
+from tdhil.config.options import OPTIONS
+from tdhil.config.rig import Rig, load_rig, require_limits
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "rig.yaml"

@@ -40,7 +40,7 @@ def test_help_lists_the_commands():
 def test_help_imports_nothing_heavy():
     script = (
         "import sys\n"
-        "from tdhil.cli import main\n"
+        "from tdhil.cli.main import main\n"
         "try: main(['--help'])\n"
         "except SystemExit: pass\n"
         f"print('loaded:', *[name for name in {HEAVY!r} if name in sys.modules])\n"

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.cli import build_parser
+from tdhil.cli.main import build_parser
+from tdhil.config.rig import load_rig, require_limits
 from tdhil.errors import ExitCode
-from tdhil.rig import load_rig, require_limits
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

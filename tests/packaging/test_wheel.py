@@ -79,7 +79,7 @@ def test_entry_point(wheel, names):
     (path,) = [name for name in names if name.endswith(".dist-info/entry_points.txt")]
     parser = configparser.ConfigParser()
     parser.read_string(wheel.read(path).decode())
-    assert dict(parser["console_scripts"]) == {"tdhil": "tdhil.cli:main"}
+    assert dict(parser["console_scripts"]) == {"tdhil": "tdhil.cli.main:main"}
 
 
 def test_it_runs_from_the_wheel_alone(wheel, tmp_path):
@@ -87,8 +87,8 @@ def test_it_runs_from_the_wheel_alone(wheel, tmp_path):
     code = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import tdhil; "
         f"assert tdhil.__file__.startswith({str(tmp_path)!r}), tdhil.__file__; "
-        "from profiles.library import load_profile; from sim_bus.cia402_node import generic_eds; "
-        "from tdhil.commands.docs import docs_folder; "
+        "from profiles.library import load_profile; from sim_bus.canopen.node import generic_eds; "
+        "from tdhil.cli.docs import docs_folder; "
         "print(load_profile('generic/cia402').name, generic_eds(), docs_folder())"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)

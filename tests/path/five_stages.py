@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 
-from tdhil.record.reader import read_frames, read_run, read_samples
+from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tests.path.path_runs import HANGS_S, INERTIA, QUICK, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
 
 SEED = 1

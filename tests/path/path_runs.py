@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from tdhil.cli import main
+from tdhil.cli.main import main
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 QUICK = ("--rate", 50)    # a fifth of the drive's usual rate, and of the cycles to compute
@@ -32,7 +32,7 @@ TOO_MUCH = ("--excitation", "sine", "--frequency", 0.2, "--amplitude", 3)
 HANGS_S = 120.0           # wall time after which something is taken to hang
 HELD = {"operation enabled", "quick stop active"}   # the states in which the drive holds its shaft
 
-# What the simulated rig is run with where nothing else is said (tdhil.rig, sim_bus.params).
+# What the simulated rig is run with where nothing else is said (tdhil.config.rig, sim_bus.params).
 WATCHDOG_S = 0.5
 QUICK_STOP_RAD_S2 = 2.0
 TORQUE_NM = 400.0

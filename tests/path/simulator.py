@@ -8,8 +8,9 @@ real      without the simulator's marker object or registers: what the host then
 import functools
 import sys
 
-from profiles.marker import MARKER_INDEX
-from sim_bus import cia402_node, command, simulator
+from profiles.simulator_marker import MARKER_INDEX
+from sim_bus import command
+from sim_bus.canopen import node, simulator
 from sim_bus.modbus import slots
 
 
@@ -18,13 +19,13 @@ def be_patient() -> None:
 
 
 def be_real() -> None:
-    plain = cia402_node.Cia402Node.__init__
+    plain = node.Cia402Node.__init__
 
     def without_marker(self, *arguments, **options):
         plain(self, *arguments, **options)
         del self.store.object_dictionary[MARKER_INDEX]
 
-    cia402_node.Cia402Node.__init__ = without_marker
+    node.Cia402Node.__init__ = without_marker
     slots._marker = lambda stepped: ()  # type: ignore[attr-defined]
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from profiles.library import load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile
-from sim_bus.application_objects import ApplicationObjects
+from profiles.modbus import ModbusProfile
+from sim_bus.canopen.application_objects import ApplicationObjects
 from sim_bus.control import Controller
 from sim_bus.modbus.slots import Map
 from tests.path.path_runs import Shaft, identify

@@ -7,9 +7,9 @@ import sys
 import can
 import pytest
 
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
-from sim_bus.simulator import EmbeddedSimulator
-from tdhil.record.reader import read_run, read_samples
+from tdhil.recording.log_reader import read_run, read_samples
 from tests.path.path_runs import QUICK, TOO_MUCH, Shaft, Terminal, clean_environment, identify, tdhil
 
 SHORT = ("--simulate", *QUICK, "--seed", 1, "--periods", 3)
@@ -295,7 +295,7 @@ def test_eighty_columns_are_enough(tmp_path):
 def test_help_is_quick_because_it_loads_nothing(tmp_path):
     code = (
         "import sys, json\n"
-        "from tdhil.cli import main\n"
+        "from tdhil.cli.main import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit as end:\n    assert end.code == 0\n"
         "heavy = {'numpy', 'scipy', 'can', 'canopen', 'pydantic', 'rich', 'mcap', 'yaml', 'pymodbus', 'matplotlib'}\n"
         "print(json.dumps(sorted(heavy & set(sys.modules))), file=sys.stderr)\n"

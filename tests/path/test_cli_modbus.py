@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from profiles.library import load_modbus_profile, load_profile, profile_path
-from tdhil.record.reader import read_frames, read_run
+from tdhil.recording.log_reader import read_frames, read_run
 from tests.path.path_runs import QUICK, TOO_MUCH, identify, process, tdhil
 
 pytestmark = pytest.mark.one_worker

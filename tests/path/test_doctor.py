@@ -6,12 +6,12 @@ import math
 
 import pytest
 
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus import embedded
-from sim_bus.modbus.wrongs import Wrong
+from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
-from sim_bus.simulator import EmbeddedSimulator
 from tdhil import bus_open
-from tdhil.commands.doctor_can import link_findings
+from tdhil.cli.buses.canopen_doctor import link_findings
 from tdhil.commands.doctor_host import disk_finding, jitter_finding, library_findings, naps, timer_finding
 from tests.path.path_runs import tdhil
 from tests.path.watched_bus import WatchedBus

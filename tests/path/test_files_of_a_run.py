@@ -10,10 +10,10 @@ import pytest
 from sim_bus.trace import HEADER, NotATrace, Trace
 from tdhil.commands.log_file import LogPlace, is_live
 from tdhil.errors import UsageError
-from tdhil.record.container import MAGIC
-from tdhil.record.reader import read_run
-from tdhil.record.recording import Stage
-from tdhil.record.writer import RunWriter
+from tdhil.recording.log_reader import read_run
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.recording import Stage
 from tests.path.path_runs import identify, tdhil
 
 REFUSED = ("--simulate", "--seed", 1, "--fault", "wrong-identity", "--profile", "maxon/epos4")

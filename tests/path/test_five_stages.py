@@ -2,7 +2,7 @@
 
 import pytest
 
-from tdhil.record.reader import read_samples
+from tdhil.recording.log_reader import read_samples
 from tests.path.five_stages import SEED, FiveStages, interrupted, over_a_peer
 from tests.path.path_runs import QUICK, Shaft, identify
 

@@ -13,11 +13,11 @@ import pytest
 
 from drivers.errors import PreflightRefused
 from profiles.library import load_modbus_profile, load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.modbus import embedded, slots
-from sim_bus.modbus.wrongs import parse
+from sim_bus.modbus.wrong_maps import parse
 from tdhil.commands.unverified import accepted_lines, require_accepted
-from tdhil.record.reader import read_frames
+from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import Shaft, identify
 
 NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from tdhil.record.csv_excitation import load_excitation
-from tdhil.record.reader import read_run
+from tdhil.recording.csv.excitation import load_excitation
+from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import identify, tdhil
 
 pytestmark = pytest.mark.one_worker

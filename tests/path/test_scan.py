@@ -8,17 +8,17 @@ import can
 import pytest
 
 from drivers.errors import PreflightRefused
+from profiles.canopen import CanopenProfile
 from profiles.library import load_canopen_profile, load_profile, profile_names
-from profiles.schema import CanopenProfile
+from sim_bus.canopen.simulator import EmbeddedSimulator, Simulator
 from sim_bus.params import RigParams
-from sim_bus.simulator import EmbeddedSimulator, Simulator
 from tdhil import bus_open
-from tdhil.commands import peer_modbus
-from tdhil.commands.scan_canopen import match
-from tdhil.commands.scan_found import FoundDrive
+from tdhil.cli.buses import modbus
+from tdhil.cli.buses.canopen_scan import match
+from tdhil.cli.found_drive import FoundDrive
 from tdhil.commands.scan_modbus import parse_identification, parse_units
 from tdhil.commands.scan_rig import starter
-from tdhil.rig import load_rig, require_limits
+from tdhil.config.rig import load_rig, require_limits
 from tests.path.path_runs import tdhil
 from tests.path.scan_lines_scripted import Answering, Garbled, Silent
 from tests.path.watched_bus import WatchedBus
@@ -214,7 +214,7 @@ def test_a_serial_line_is_asked_at_the_usual_settings_until_somebody_answers(tmp
         opened.append((line.baud, line.parity, line.stop_bits))
         return Answering(clock) if opened[-1] == (9600, "N", 1) else Silent(clock)
 
-    monkeypatch.setattr(peer_modbus, "open_wire", open_wire)
+    monkeypatch.setattr(modbus, "open_wire", open_wire)
     done = tdhil("scan", "--serial", "/dev/ttyUSB9", "--units", "2-4", "--write", tmp_path / "rig.yaml")
     assert done.code == 0, done.err
     assert opened[0] == (115200, "E", 1)                          # as the profile has it
@@ -235,7 +235,7 @@ def test_what_is_said_of_the_line_is_not_tried_otherwise(monkeypatch):
         opened.append((line.baud, line.parity, line.stop_bits))
         return Silent(clock)
 
-    monkeypatch.setattr(peer_modbus, "open_wire", open_wire)
+    monkeypatch.setattr(modbus, "open_wire", open_wire)
     done = tdhil("scan", "--serial", "/dev/ttyUSB9", "--baud", 38400, "--parity", "O", "--unit", 1)
     assert done.code == 5
     assert opened == [(38400, "O", 1)]
@@ -243,7 +243,7 @@ def test_what_is_said_of_the_line_is_not_tried_otherwise(monkeypatch):
 
 
 def test_garbled_replies_point_to_the_line(monkeypatch):
-    monkeypatch.setattr(peer_modbus, "open_wire", lambda line, clock: Garbled(clock))
+    monkeypatch.setattr(modbus, "open_wire", lambda line, clock: Garbled(clock))
     done = tdhil("scan", "--host", "192.0.2.10", "--units", "1-2")
     assert done.code == 5
     assert "2 garbled replies" in done.err

@@ -22,8 +22,8 @@ class Master:
     """Another master: enables, turns the shaft, and (``stubborn``) goes on with its RPDO and SYNC whatever happens."""
 
     def __init__(self, drive):
-        from drivers.cia402.link import CanLink
-        from drivers.cia402.sdo import Objects
+        from drivers.canopen.bus import CanLink
+        from drivers.canopen.sdo import Objects
         from drivers.clock import MonotonicClock
 
         options = dict(text.split("=") for text in drive.options if "=" in text)
@@ -202,13 +202,13 @@ def test_a_hub_that_dies_while_it_stops(turning):
 
 
 def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
-    from drivers import bare_stop
+    from drivers import quick_stop
 
-    monkeypatch.setattr(bare_stop, "NO_SLOWER_S", 1.0)
+    monkeypatch.setattr(quick_stop, "NO_SLOWER_S", 1.0)
     drive, master = turning
     master.turn(speed_lsb=800)
     master.objects.write(0x6085, 0, 1, 32)             # as good as no deceleration: 0.1 rpm/s
-    monkeypatch.setattr(bare_stop, "SLOWER", 0.5)
+    monkeypatch.setattr(quick_stop, "SLOWER", 0.5)
     done = stop(drive)
     assert done.code == 8
     assert "NOT seen at rest" in done.out and SENTENCE in done.out

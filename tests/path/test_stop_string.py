@@ -51,7 +51,7 @@ def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
     from sim_bus.params import RigParams
     from sim_bus.params import load_rig as load_plant
     from tdhil.commands.simulated_bench import suited
-    from tdhil.rig import Rig, load_rig
+    from tdhil.config.rig import Rig, load_rig
 
     bench = suited(None, load_plant(EXAMPLES / "plant_string.yaml"))
     assert (bench.load, bench.limits.torque_nm, bench.make_up_torque_nm) == ("string", 4000.0, 8000.0)

@@ -11,7 +11,7 @@ from itertools import pairwise, product
 
 import pytest
 
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tdhil.report.live import LiveDisplay
 from tests.path.path_runs import (
     INERTIA,

@@ -9,10 +9,10 @@ import sys
 
 import pytest
 
-from tdhil.cli import main
-from tdhil.commands.conclude import conclude
+from tdhil.cli.conclude import conclude
+from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, clean_environment
 
 FULL = "/dev/full"
@@ -108,7 +108,7 @@ def test_a_dead_stderr_takes_no_cause_with_it(monkeypatch, tmp_path, buffering):
 
 def test_closed_descriptors_are_given_to_no_file():
     script = "import os, sys; os.close(1); os.close(0)\n" \
-             "from tdhil.cli import main; main(['profiles', 'show', 'nothing'])\n" \
+             "from tdhil.cli.main import main; main(['profiles', 'show', 'nothing'])\n" \
              "sys.exit(0 if min(os.open('/dev/null', 0), 9) > 2 else 1)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60, env=clean_environment())
     assert done.returncode == 0, done.stderr
@@ -118,7 +118,7 @@ def test_ctrl_c_while_a_command_is_being_loaded(monkeypatch, capsys):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tdhil.cli._builder", interrupted)
+    monkeypatch.setattr("tdhil.cli.main._builder", interrupted)
     assert main(["identify"]) == 130
     assert capsys.readouterr().err == "tdhil: interrupted\n"
 
@@ -128,7 +128,7 @@ def test_what_the_system_refuses_is_said_in_one_line(monkeypatch, capsys, number
     def refused(_):
         raise OSError(number, "the system's word")
 
-    monkeypatch.setattr("tdhil.cli._builder", refused)
+    monkeypatch.setattr("tdhil.cli.main._builder", refused)
     assert main(["identify"]) == 1
     assert capsys.readouterr().err == "tdhil: the system refused: the system's word\n"
 
@@ -143,14 +143,14 @@ def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
     """Later there may be no descriptor left to load it with, or no disk."""
     script = f"""
 import sys
-from tdhil.commands import confirm
+from tdhil.cli import confirm
 before = set()
 whole = confirm.confirm_motion
 def noted(*args, **named):
     whole(*args, **named)
     before.update(sys.modules)
 confirm.confirm_motion = noted
-from tdhil.cli import main
+from tdhil.cli.main import main
 main({["identify", "--simulate", *map(str, QUICK), "--seed", "4", "--periods", "3", *fault]!r})
 assert before
 print(sorted(name for name in set(sys.modules) - before), file=sys.stderr)

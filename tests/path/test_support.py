@@ -10,13 +10,13 @@ import pytest
 
 from drivers.errors import PreflightRefused
 from profiles.library import profile_names
-from tdhil.commands.support import Scrub
+from tdhil.cli.support import Scrub
+from tdhil.config.rig import load_rig, require_limits
 from tdhil.record.event import Event
 from tdhil.record.messages import Ours, messages
-from tdhil.record.reader import read_run
-from tdhil.record.recording import Stage
-from tdhil.record.writer import RunWriter
-from tdhil.rig import load_rig, require_limits
+from tdhil.recording.log_reader import read_run
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.recording import Stage
 from tests.path.path_runs import tdhil
 
 USER, HOST = "janedoe", "drilling-laptop-7"

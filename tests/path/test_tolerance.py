@@ -4,7 +4,7 @@ import pytest
 
 from profiles.quantities import TIME
 from tdhil.commands.quantities import amount, share
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, Shaft, identify, tdhil
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import threading
 
-from sim_bus.hub import Hub
+from sim_bus.canopen.socketcand import Hub
 
 
 @contextlib.contextmanager

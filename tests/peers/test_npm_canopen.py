@@ -12,11 +12,11 @@ import subprocess
 import can
 import pytest
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, Limits, Mode, Outcome, PowerState
 from profiles.library import load_canopen_profile
-from tdhil.record.reader import read_frames
+from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import HANGS_S, STAGES, identify, peer, process, tdhil
 from tests.peers.hub_thread import open_hub
 

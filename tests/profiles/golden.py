@@ -46,8 +46,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from profiles.data_model import DataModel
-from profiles.strict_yaml import load_model
+from profiles.model import DataModel
+from profiles.yaml_loader import load_model
 
 FOLDER = Path(__file__).parent / "golden"
 

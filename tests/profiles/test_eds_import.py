@@ -11,12 +11,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from profiles.canopen import CanopenProfile
 from profiles.eds_import import begin_profile
 from profiles.eds_reader import read_eds
 from profiles.errors import DataFileError
 from profiles.library import profile_path
-from profiles.schema import CanopenProfile
-from profiles.strict_yaml import load_model
+from profiles.yaml_loader import load_model
 
 OURS = profile_path("generic/cia402").parent / "cia402.eds"
 U8, I8, U16, I16, U32, I32, F32, TEXT = 5, 2, 6, 3, 7, 4, 8, 9

@@ -8,7 +8,7 @@ import pytest
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Mode
 from drivers.drive import Limits as DriveLimits
-from drivers.modbus import requests
+from drivers.modbus import pdu as requests
 from drivers.modbus.access import Access
 from drivers.modbus.cycle import Codec, shown_mode
 from drivers.modbus.limits import wanted_setting
@@ -16,8 +16,8 @@ from drivers.modbus.link import Reply
 from drivers.modbus.parameters import Parameters, find_filters
 from drivers.modbus.plan import plan_cycle
 from drivers.modbus.scales import find_scales, settle, si_per_count
-from drivers.modbus.states import Wish, controlword_towards, decode, seen
-from drivers.table import Table
+from drivers.modbus.state_machine import Wish, controlword_towards, decode, seen
+from drivers.preflight import Table
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.parameters import reporting_lag_s

@@ -9,12 +9,12 @@ import can
 import pytest
 import yaml
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from profiles.library import load_canopen_profile, profile_names, profile_path
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams
-from sim_bus.simulator import EmbeddedSimulator
 
 FOLDER = Path(__file__).parent / "golden_canopen"
 GOLDEN = {path.stem: yaml.safe_load(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.yaml"))}

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError
 from profiles.library import eds_path, load_profile, profile_names, profile_path
-from profiles.schema import CanopenProfile
 
 GENERIC = Path(profile_path("generic/cia402")).read_text(encoding="utf-8")
 

@@ -7,7 +7,7 @@ import pytest
 
 from profiles.errors import DataFileError
 from profiles.library import load_modbus_profile, profile_names, profile_path
-from profiles.modbus_schema import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Register
 
 NAMES = (
     "abb/acs880-classic", "abb/acs880-enhanced", "danfoss/fc302", "delta/ms300", "generic/modbus", "lenze/i550",

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import Field
 
 from profiles.errors import DataFileError
-from profiles.strict_yaml import MAX_BYTES, MAX_PROBLEMS, DataModel, load_model, load_with_lines, parse_model
+from profiles.yaml_loader import MAX_BYTES, MAX_PROBLEMS, DataModel, load_model, load_with_lines, parse_model
 
 
 class Part(DataModel):

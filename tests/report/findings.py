@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.identify import (
+from tdhil.estimation import (
     BudgetLine,
     Compliant,
     Estimate,
@@ -17,8 +17,8 @@ from tdhil.identify import (
     SecondOpinion,
     Verdict,
 )
-from tdhil.identify.identification import LinePoint
-from tdhil.record.recording import Excitation, Level, Recording, Segment, Stage
+from tdhil.estimation.result import LinePoint
+from tdhil.recording.recording import Excitation, Level, Recording, Segment, Stage
 
 RUN = {
     "tdhil": "0.1.0", "started": "2026-03-04T05:06:07+01:00", "operator": "A. <Person>", "note": "after\x1b[31m repair",

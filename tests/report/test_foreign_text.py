@@ -13,11 +13,11 @@ from rich.table import Table
 from drivers.drive import Check, Identity, Outcome, Preflight
 from drivers.errors import PreflightRefused
 from profiles.visible import visible
-from tdhil.cli import main
+from tdhil.cli.main import main
 from tdhil.commands.confirm import summary
-from tdhil.protocol.settings import ExcitationRequest
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table
+from tdhil.run.settings import ExcitationRequest
 
 EVIL = "\x1b[2J\x1b]0;x\x07A\x9b31m[/][red]\u202egnirts\u2066\x00\r\nDrive: safe\u2028 \x7f"
 ROOT = Path(__file__).parents[2]
@@ -116,6 +116,6 @@ def test_the_head_of_a_column(tmp_path, capsys):
 
 @pytest.mark.parametrize("grade", ["ok", "bad"])
 def test_a_line_of_the_doctor_s(grade):
-    from tdhil.commands.finding import Finding
+    from tdhil.cli.finding import Finding
 
     assert harmless(Finding(grade, "drive", EVIL, EVIL).text)

@@ -169,7 +169,7 @@ sys.path.insert(0, {str(Path(__file__).parents[2])!r})
 from pathlib import Path
 from tests.report.findings import RUN, full, recording
 from tdhil.errors import UsageError
-from tdhil.report import html, page, pictures
+from tdhil.report import html, page, plots as pictures
 from tdhil.report.document import result_document
 own = recording()
 document = result_document(full(), own, RUN, "run.mcap")

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from drivers.drive import Command, Mode, PowerState, Sample
-from tdhil.record.recording import Stage
+from tdhil.recording.recording import Stage
 from tdhil.report.live import LiveDisplay
 from tdhil.report.painter import MOST_LINES, Painter
 

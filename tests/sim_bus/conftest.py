@@ -7,8 +7,8 @@ from contextlib import ExitStack
 import can
 import pytest
 
+from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
-from sim_bus.simulator import EmbeddedSimulator
 
 SIZES = {1: ("B", 0x2F), 2: ("H", 0x2B), 4: ("I", 0x23)}
 

@@ -4,9 +4,9 @@ import struct
 from collections.abc import Sequence
 
 from profiles.library import load_modbus_profile
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
-from sim_bus.modbus.wrongs import parse
+from sim_bus.modbus.wrong_maps import parse
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 
 QUIET_RIG = RigParams(noise=QUIET, reporting=FAITHFUL)

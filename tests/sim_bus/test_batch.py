@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_bus.batch import ANGLE, BRISTLE, SPEED, FixedStep, Shafts, white_torque
-from sim_bus.plant import Params, State, step
+from sim_bus.plant.batch import ANGLE, BRISTLE, SPEED, FixedStep, Shafts, white_torque
+from sim_bus.plant.rigid import Params, State, step
 
 TOLERANCE = 1e-9      # relative to the larger of 1 and the value
 

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_bus.drill_string import DrillString, StringParams, StringState
 from sim_bus.inverter import Inverter
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams
-from sim_bus.two_mass import Bottom
+from sim_bus.plant.drill_string import DrillString, StringParams, StringState
+from sim_bus.plant.two_mass import Bottom
 
 DT = 0.002
 ENDS = ("mass", "free", "clamped")

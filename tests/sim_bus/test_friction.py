@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from sim_bus.friction import torque
-from sim_bus.plant import Params, State, friction_torque, step
+from sim_bus.plant.friction import torque
+from sim_bus.plant.rigid import Params, State, friction_torque, step
 
 MODELS = ("coulomb", "stribeck", "dahl", "lugre")
 STICKING = ("coulomb", "stribeck")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from profiles.library import load_modbus_profile, load_profile, profile_names
-from profiles.modbus_schema import ModbusProfile
+from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive

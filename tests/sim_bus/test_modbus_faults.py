@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from profiles.marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
+from profiles.simulator_marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
 from sim_bus.command import main
 from sim_bus.fault_script import FaultRefused
 from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON, WRONGS, parse_all

@@ -6,7 +6,7 @@ from math import pi
 import pytest
 
 from profiles.errors import TdhilError
-from sim_bus.modbus.wrongs import KINDS, Wrong, parse
+from sim_bus.modbus.wrong_maps import KINDS, Wrong, parse
 from tests.sim_bus.modbus_host import GenericHost, drive
 
 

@@ -8,8 +8,8 @@ import can
 import canopen
 import pytest
 
-from profiles.marker import MARKER_INDEX, MARKER_TEXT
-from sim_bus.cia402_node import generic_eds
+from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
+from sim_bus.canopen.node import generic_eds
 
 Open = Callable[..., tuple[Any, Any]]
 

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from sim_bus import plant
-from sim_bus.plant import Params, State, step
+from sim_bus.plant import rigid
+from sim_bus.plant.rigid import Params, State, step
 
 
 def torque_at(time_s: float) -> float:
@@ -129,9 +129,9 @@ def test_torque_below_friction_always_ends_at_rest(speed: float, torque: float) 
 
 
 def test_friction_torque_and_loads() -> None:
-    assert plant.friction_torque(Params(), State(-1.0)) == -60.0
-    assert plant.friction_torque(Params(), State(), 25.0) == 25.0
-    assert plant.friction_torque(Params(friction="dahl"), State(1.0, 0.0, 0.012)) == pytest.approx(60.0)
+    assert rigid.friction_torque(Params(), State(-1.0)) == -60.0
+    assert rigid.friction_torque(Params(), State(), 25.0) == 25.0
+    assert rigid.friction_torque(Params(friction="dahl"), State(1.0, 0.0, 0.012)) == pytest.approx(60.0)
     with_load = step(Params(load_nm=30.0), State(1.0), 100.0, 0.002)
     assert with_load == step(Params(), State(1.0), 70.0, 0.002) == step(Params(), State(1.0), 100.0, 0.002, 30.0)
 

@@ -11,13 +11,13 @@ import pytest
 from pydantic import BaseModel
 
 from profiles.errors import DataFileError
-from profiles.strict_yaml import parse_model
-from sim_bus.drill_string import StringParams
+from profiles.yaml_loader import parse_model
 from sim_bus.inverter import Inverter
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams, load_rig
-from sim_bus.plant import Params
-from sim_bus.plant_kinds import build
-from sim_bus.two_mass import TwoMassParams
+from sim_bus.plant.drill_string import StringParams
+from sim_bus.plant.kinds import build
+from sim_bus.plant.rigid import Params
+from sim_bus.plant.two_mass import TwoMassParams
 
 ROOT = Path(__file__).parents[2]
 KINDS = {"plant.yaml": Params, "plant_two_mass.yaml": TwoMassParams, "plant_string.yaml": StringParams,

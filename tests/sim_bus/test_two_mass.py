@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from sim_bus.inverter import Inverter
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams
-from sim_bus.two_mass import Bottom, TwoMassParams, TwoMassState, spring_torque, step
+from sim_bus.plant.two_mass import Bottom, TwoMassParams, TwoMassState, spring_torque, step
 
 JR, JL, K, C = 1500.0, 374.0, 473.0, 23.2
 DT = 0.002

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.record.reader import read_frames
+from tdhil.recording.log_reader import read_frames
 from tests.path.five_stages import FiveStages, interrupted, over_a_peer
 from tests.vcan.candump_log import DRIVES, HOSTS, SYNC, TPDO1, watching
 

@@ -25,8 +25,8 @@ from typing import Any
 
 import pytest
 
-from tdhil.protocol import stage_speed
-from tdhil.record.reader import read_run
+from tdhil.recording.log_reader import read_run
+from tdhil.run.stages import speed
 from tests.path.path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
 from tests.vcan.vcan_runs import root_s_ip, run
 
@@ -75,7 +75,7 @@ class Lane:
     def _go(self, numbers: range) -> None:
         os.environ["HOME"] = str(self.folder)          # no bus of the user
         os.chdir(self.folder)
-        stage_speed.LEVEL_S, stage_speed.FIRST_RAMP_S = LEVEL_S, FIRST_RAMP_S
+        speed.LEVEL_S, speed.FIRST_RAMP_S = LEVEL_S, FIRST_RAMP_S
         for number in numbers:
             done = identify(self.folder, *self.drive.options, *SHORT, log=f"{number}.mcap")
             # Stopped for lateness before anything has moved, it is a refusal, with a log of its own.

@@ -13,7 +13,7 @@ import time
 
 import pytest
 
-from tdhil.record.reader import read_frames
+from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wait_for
 from tests.vcan.candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
 from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated

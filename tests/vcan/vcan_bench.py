@@ -8,11 +8,11 @@ from types import SimpleNamespace
 
 import can
 
-from drivers.cia402.drive import Cia402Drive
+from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from profiles.library import load_canopen_profile
+from sim_bus.canopen.simulator import Simulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
-from sim_bus.simulator import Simulator
 from tests.drivers.drive_benches import LIMITS, CanopenBench, TamperedBus
 
 RECEIVE_BYTES = 4 << 20

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import can
 
+from sim_bus.canopen.simulator import Simulator
 from sim_bus.params import RigParams
-from sim_bus.simulator import Simulator
 from tests.path.path_runs import HANGS_S, INERTIA, TORQUE_NM, Finished, Shaft, identify, wait_for
 
 RATE_HZ = 25.0

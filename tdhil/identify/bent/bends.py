@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _WIDTHS = 9
 _NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: outside, a bell is not to be seen

@@ -10,22 +10,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, slope_over_speed
+from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
+from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.frequency_domain.rigid import RigidResult
+from tdhil.estimation.frequency_domain.shafts import INERTIA, RigidShaft
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import Estimate, ResidualTest
 from tdhil.identify.bent.bends import Bend, bends
 from tdhil.identify.bent.shaft import BEND, BentShaft
 from tdhil.identify.bent.wave import Wave
-from tdhil.identify.identification import Estimate, ResidualTest
-from tdhil.identify.lines.descent import Fit
 from tdhil.identify.lines.fit import Held, box, minimise, rough_inertia_of
-from tdhil.identify.lines.friction import Levels, ViscousTie, slope_over_speed
 from tdhil.identify.lines.interval import estimate, quantile_of
-from tdhil.identify.lines.likelihood import Likelihood, Load
-from tdhil.identify.lines.model import GaussianPrior, Model
 from tdhil.identify.lines.residual import residual_of
-from tdhil.identify.lines.rigid_result import RigidResult
-from tdhil.identify.lines.shaft import INERTIA, RigidShaft
-from tdhil.identify.lines.spectrum import Line
-from tdhil.identify.lines.structure import Fitted, fit_model
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _ROUNDS = 3
 _RIGID = len(RigidShaft.names)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.lines.shaft import INERTIA, VISCOUS, RigidShaft
-from tdhil.identify.lines.spectrum import ComplexArray
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.recording.recording import FloatArray
 
 BEND = 2
 

@@ -18,10 +18,10 @@ from functools import cached_property
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, PeriodLines
 from tdhil.identify.bent.bends import Bend
-from tdhil.identify.lines import reports
-from tdhil.identify.lines.spectrum import ComplexArray, PeriodLines
-from tdhil.record.recording import FloatArray, Segment
+from tdhil.recording.recording import FloatArray, Segment
 
 _POINTS = 16      # to a cycle of the fastest line
 
@@ -50,14 +50,14 @@ class Wave:
 
     def over_period(self, phi: FloatArray) -> FloatArray:
         """The shaft's own speed behind the report ``phi`` (6,) (`reports`), (N,) rad/s."""
-        found: FloatArray = self.mean + (self._turned @ (self.speed / reports.filters(phi, self._s)[0])).real
+        found: FloatArray = self.mean + (self._turned @ (self.speed / signal_filters.filters(phi, self._s)[0])).real
         return found
 
     def through(self, bend: Bend, phi: FloatArray) -> tuple[ComplexArray, float]:
         """F_T G (K,) and ḡ."""
         torque = bend.over(self.over_period(phi))
         lines = torque @ self._turned.conj() * (2.0 / len(torque))
-        return reports.filters(phi, self._s)[1] * lines, float(torque.mean())
+        return signal_filters.filters(phi, self._s)[1] * lines, float(torque.mean())
 
 
 def wave_of(fit: PeriodLines, segment: Segment) -> Wave:

@@ -1,17 +1,17 @@
 """The points of a friction curve: friction torque over each stretch of steady or slowly drifting speed.
 
-How a point is made of a balance of momentum stands in `tdhil.identify.beside.friction_curve`.
+How a point is made of a balance of momentum stands in `tdhil.estimation.cross_checks.friction_curve`.
 """
 
 import math
 from dataclasses import dataclass, replace
 
-from tdhil.identify.beside.momentum import KNOT_S, periodic_segments
+from tdhil.estimation.cross_checks.momentum import KNOT_S, periodic_segments
+from tdhil.estimation.cross_checks.momentum_fit import UNKNOWN_DELAY, Delay
+from tdhil.estimation.samples import Samples, excited_window
 from tdhil.identify.beside.momentum_calm import block_means, drifting_spans
-from tdhil.identify.beside.momentum_fit import UNKNOWN_DELAY, Delay
 from tdhil.identify.beside.momentum_rows import Row, through
-from tdhil.identify.samples import Samples, excited_window
-from tdhil.record.recording import Recording
+from tdhil.recording.recording import Recording
 
 _ALIKE = 0.01             # of the fastest: speeds closer than that are one
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import BoolArray, FloatArray, Segment
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import BoolArray, FloatArray, Segment
 
 BLOCK_S = 0.5
 _MOST_BLOCKS = 1_000_000

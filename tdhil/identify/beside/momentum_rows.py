@@ -23,8 +23,8 @@ from enum import Enum
 
 import numpy as np
 
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import FloatArray
 
 _LONGEST_GAP_S = 0.3
 _CHUNK = 65_536           # samples worked on at once: a long row never stands in memory as a whole

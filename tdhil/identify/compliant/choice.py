@@ -16,17 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.compliant.fit import SLOWEST_SEEN, CompliantFit, chance_gain, fit_compliant
+from tdhil.estimation.frequency_domain.compliant_fit import SLOWEST_SEEN, CompliantFit, chance_gain, fit_compliant
+from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+from tdhil.estimation.frequency_domain.model import GaussianPrior
+from tdhil.estimation.frequency_domain.rigid import RigidResult
+from tdhil.estimation.frequency_domain.shafts import INERTIA
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import Refusal
 from tdhil.identify.compliant.string_shaft import StringShaft
 from tdhil.identify.compliant.two_mass import LOAD, SWING, TwoMassShaft
-from tdhil.identify.identification import Refusal
 from tdhil.identify.lines.fit import Held
-from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.model import GaussianPrior
 from tdhil.identify.lines.residual import rejects
-from tdhil.identify.lines.rigid_result import RigidResult
-from tdhil.identify.lines.shaft import INERTIA
-from tdhil.identify.lines.spectrum import Line
 from tdhil.identify.options import Model as Asked
 
 _DOUBT = 0.3                 # of the residual test's p, above which a rigid shaft isn't doubted

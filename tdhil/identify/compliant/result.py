@@ -3,18 +3,18 @@
 import math
 from dataclasses import dataclass, replace
 
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.compliant_fit import CompliantFit, CompliantIntervals, inertias, intervals
+from tdhil.estimation.frequency_domain.friction_levels import Levels, coulomb_level
+from tdhil.estimation.frequency_domain.inference import standard_deviation, student_quantile
+from tdhil.estimation.frequency_domain.rigid import lags_of
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.result import BudgetLine, Compliant, Estimate
 from tdhil.identify.compliant.choice import Chosen
-from tdhil.identify.compliant.fit import CompliantFit, CompliantIntervals, inertias, intervals
 from tdhil.identify.compliant.string_shaft import STRING_SHARE
 from tdhil.identify.compliant.two_mass import DAMPING, LOAD, LOAD_VISCOUS, SWING
-from tdhil.identify.identification import BudgetLine, Compliant, Estimate
-from tdhil.identify.lines import reports
 from tdhil.identify.lines.budget import grown_lines
-from tdhil.identify.lines.friction import Levels, coulomb_level
 from tdhil.identify.lines.interval import half_width_first_order
-from tdhil.identify.lines.profile import standard_deviation, student_quantile
-from tdhil.identify.lines.rigid_result import lags_of
-from tdhil.identify.lines.shaft import INERTIA, VISCOUS
 from tdhil.identify.torque_scale import torque_scale_line
 
 
@@ -86,7 +86,7 @@ def _budget(
 ) -> tuple[BudgetLine, ...]:
     """As `budget.py` has it for a rigid shaft: set free one group after another, each its share in squares."""
     at = fit.fitted.problem.model.at
-    lags, timing = (at(reports.SPEED_LAG), at(reports.TORQUE_LAG)), (at(reports.SKEW),)
+    lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
     friction = (VISCOUS, DAMPING, LOAD_VISCOUS)
     spring = (LOAD, SWING, *((STRING_SHARE,) if fit.is_string else ()))
 

@@ -17,14 +17,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
 from tdhil.identify.compliant.string_shaft import STRING_SHARE
 from tdhil.identify.compliant.two_mass import DAMPING, LOAD, SWING
-from tdhil.identify.lines import reports
 from tdhil.identify.lines.fit import Held, box, minimise, rough_inertia_of
-from tdhil.identify.lines.likelihood import Likelihood
-from tdhil.identify.lines.shaft import INERTIA, VISCOUS
-from tdhil.identify.lines.spectrum import ComplexArray
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _PER_OCTAVE = 24
 _BEYOND = (0.6, 2.0)                     # the grid's ends, of the lowest and highest line
@@ -117,17 +117,17 @@ def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -
     quadratic, linear, viscous, torque_lag, load_late, load = (float(value) for value in x)
     size = linear**2 + load**2
     speed_lag = (quadratic * linear + load_late * load) / size if size > 0.0 else 0.0
-    speed_lag = float(np.clip(speed_lag, 0.0, reports.LAG_BOUND_S))
+    speed_lag = float(np.clip(speed_lag, 0.0, signal_filters.LAG_BOUND_S))
     inertia = linear - viscous * speed_lag
     if inertia <= 0.0 or load <= 0.0:
         return None
     mechanical = shape.copy()
     mechanical[INERTIA], mechanical[VISCOUS], mechanical[LOAD] = inertia, viscous, load
     mechanical[DAMPING] *= load
-    phi = np.zeros(reports.COUNT)
-    phi[reports.SPEED_LAG] = speed_lag
-    phi[reports.TORQUE_LAG] = float(np.clip(torque_lag, 0.0, reports.LAG_BOUND_S))
-    phi[reports.SKEW] = skew
+    phi = np.zeros(signal_filters.COUNT)
+    phi[signal_filters.SPEED_LAG] = speed_lag
+    phi[signal_filters.TORQUE_LAG] = float(np.clip(torque_lag, 0.0, signal_filters.LAG_BOUND_S))
+    phi[signal_filters.SKEW] = skew
     theta = np.concatenate([mechanical, phi])
     for prior in problem.priors:
         theta[prior.index] = prior.mean

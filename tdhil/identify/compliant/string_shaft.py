@@ -26,10 +26,10 @@ import math
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain.shafts import INERTIA
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
 from tdhil.identify.compliant.two_mass import DAMPING, LOAD, LOAD_VISCOUS, SWING, TwoMassShaft
-from tdhil.identify.lines.shaft import INERTIA
-from tdhil.identify.lines.spectrum import ComplexArray
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 STRING_SHARE = 6         # in m
 _RAYLEIGH = 2.0 / 3.0

@@ -23,8 +23,8 @@ c and B_L damp alike and can hardly be told apart.
 
 import numpy as np
 
-from tdhil.identify.lines.spectrum import ComplexArray
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.recording.recording import FloatArray
 
 LOAD, SWING, DAMPING, LOAD_VISCOUS = range(2, 6)    # in m, after shaft.py's INERTIA and VISCOUS
 

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain.filter_order import Fitted
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.model import Model
+from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.frequency_domain.shafts import INERTIA, Shaft
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
 from tdhil.identify.compliant.string_shaft import STRING_SHARE
 from tdhil.identify.compliant.two_mass import LOAD, SWING
-from tdhil.identify.lines.descent import Fit
 from tdhil.identify.lines.fit import box, rough_inertia_of
-from tdhil.identify.lines.likelihood import Likelihood
-from tdhil.identify.lines.model import Model
-from tdhil.identify.lines.shaft import INERTIA, Shaft
-from tdhil.identify.lines.spectrum import ComplexArray
-from tdhil.identify.lines.structure import Fitted
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 
 @dataclass(frozen=True)

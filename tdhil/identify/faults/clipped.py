@@ -11,9 +11,9 @@ it bends nothing.
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import FloatArray, Recording, Segment
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import FloatArray, Recording, Segment
 
 LIMIT_SHARE = 0.005       # of the excited samples that may be at a limit: they bend the line fit by about as much
 _AT_LIMIT = 0.98          # of the torque limit counts as at it

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
-from tdhil.identify.samples import Samples, excited_window, usual_interval
-from tdhil.record.recording import Excitation, Segment
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import Samples, excited_window, usual_interval
+from tdhil.recording.recording import Excitation, Segment
 
 _WHOLE = 2e-3             # of a line that it may be off a whole number of cycles a period
 _NYQUIST = 0.9            # of half the sample rate that lines may reach: the last tenth is too near to its image

@@ -9,8 +9,8 @@ number at lines that are far apart, torque is a copy of speed: inertia and lags 
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
-from tdhil.identify.lines.spectrum import Line
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import Refused
 
 _CLEAR = 5.0      # sd by which Im(T W*) must be below zero at one line at least; at the others it must be below
 _COPY = 1e-3      # relative

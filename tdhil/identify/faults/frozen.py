@@ -8,7 +8,7 @@ wave. Two kinds of rest are other faults and are told elsewhere: at the extreme 
 
 import numpy as np
 
-from tdhil.record.recording import BoolArray, FloatArray, Recording, Segment
+from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
 
 _NATURAL = 3.0            # times as long as a rounded crest
 _SHARE_OF_CYCLE = 0.1     # of the fastest line's

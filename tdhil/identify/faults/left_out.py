@@ -4,7 +4,7 @@ import numpy as np
 
 from tdhil.identify.faults.frozen import frozen
 from tdhil.identify.faults.spikes import spikes
-from tdhil.record.recording import BoolArray, Recording
+from tdhil.recording.recording import BoolArray, Recording
 
 
 def good_samples(recording: Recording) -> BoolArray:

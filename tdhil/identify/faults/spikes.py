@@ -7,7 +7,7 @@ that doesn't occur, and motion doesn't go there and back within three samples.
 
 import numpy as np
 
-from tdhil.record.recording import BoolArray, FloatArray, Recording
+from tdhil.recording.recording import BoolArray, FloatArray, Recording
 
 _FAR = 25.0       # usual steps
 _QUANTA = 6.0     # and at least so many of the signal's resolution: at rest the usual step may be next to nothing

@@ -6,9 +6,9 @@ that the levels and the lines are read with, and a jump of friction has lines of
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import Segment
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import Segment
 
 _NEAR_ZERO = 0.01       # of the speed's largest value counts as rest; at least so many of the signal's steps:
 _STEPS = 2.0

@@ -14,10 +14,10 @@ turning counts as scatter besides.
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
-from tdhil.identify.lines.spectrum import ComplexArray, PeriodLines
-from tdhil.identify.samples import Stretch
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, PeriodLines
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import Stretch
+from tdhil.recording.recording import FloatArray
 
 _CLEAR = 40.0           # of Λ
 _HARMLESS = 5e-4        # of the period: it makes J wrong by as much

@@ -11,9 +11,9 @@ neighbourhood: forty times the median of the neighbours, at one in 10¹² bins.
 
 import numpy as np
 
-from tdhil.identify.lines.spectrum import ComplexArray, PeriodLines
-from tdhil.identify.samples import Samples, Stretch
-from tdhil.record.recording import BoolArray, FloatArray
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, PeriodLines
+from tdhil.estimation.samples import Samples, Stretch
+from tdhil.recording.recording import BoolArray, FloatArray
 
 _BINS_A_CYCLE = 20.0
 _MOST_BINS = 400_000

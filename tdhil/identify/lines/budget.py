@@ -9,11 +9,11 @@ lags that mix the two.
 import math
 from collections.abc import Iterable
 
-from tdhil.identify.identification import BudgetLine, Estimate
-from tdhil.identify.lines import reports
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.filter_order import Fitted
+from tdhil.estimation.frequency_domain.shafts import INERTIA
+from tdhil.estimation.result import BudgetLine, Estimate
 from tdhil.identify.lines.interval import half_width_first_order
-from tdhil.identify.lines.shaft import INERTIA
-from tdhil.identify.lines.structure import Fitted
 from tdhil.identify.torque_scale import torque_scale_line
 
 
@@ -22,8 +22,8 @@ def budget_of(
 ) -> tuple[BudgetLine, ...]:
     """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
     model = fitted.problem.model
-    lags = (model.at(reports.SPEED_LAG), model.at(reports.TORQUE_LAG))
-    timing = (model.at(reports.SKEW),)
+    lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
+    timing = (model.at(signal_filters.SKEW),)
     friction = tuple(range(1, model.mechanical))
     half = 0.5 * (inertia.high - inertia.low)
     grown = (

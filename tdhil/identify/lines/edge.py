@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.identify.samples import Samples
+from tdhil.estimation.samples import Samples
 
 _EDGE_S = 0.1             # either side of a period's end, averaged to read the speed there
 _EDGE_SAMPLES = 4

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.lines import reports
-from tdhil.identify.lines.descent import Box, Fit, descend
-from tdhil.identify.lines.likelihood import Likelihood
-from tdhil.identify.lines.shaft import INERTIA, VISCOUS
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.optimiser import Box, Fit, descend
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.recording.recording import FloatArray
 
 # τ_w, τ_T, d to start from besides what linear least squares proposes: the field rig's, and its mirror image
 _STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
@@ -67,17 +67,17 @@ def _descent(problem: Likelihood, limits: Box, start: FloatArray, held: Held) ->
 def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterator[FloatArray]:
     """Starts with a lag of some size instead of hardly any, and the skew that makes up for its delay."""
     at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
-    if at(reports.SKEW) in held:
+    if at(signal_filters.SKEW) in held:
         return
     for lag, shape, sign in (
-        (reports.SPEED_LAG, reports.SPEED_SHAPE, 1.0), (reports.TORQUE_LAG, reports.TORQUE_SHAPE, -1.0)
+        (signal_filters.SPEED_LAG, signal_filters.SPEED_SHAPE, 1.0), (signal_filters.TORQUE_LAG, signal_filters.TORQUE_SHAPE, -1.0)
     ):
         if at(lag) in held or theta[at(lag)] * fastest > _NO_LAG:
             continue
         begin = theta.copy()
         begin[at(lag)] = _SOME_LAG / fastest
         begin[at(shape)] = 0.0
-        begin[at(reports.SKEW)] += sign * (begin[at(lag)] - theta[at(lag)])
+        begin[at(signal_filters.SKEW)] += sign * (begin[at(lag)] - theta[at(lag)])
         yield begin
 
 
@@ -110,19 +110,19 @@ def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
     (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report can't be told apart if both J/B and τ_w are
     plausible lags of a report. An answer has this rival, and so has an interval.
     """
-    inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + reports.SPEED_LAG]
-    if viscous <= 0.0 or inertia > 1.2 * reports.LAG_BOUND_S * viscous:
+    inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + signal_filters.SPEED_LAG]
+    if viscous <= 0.0 or inertia > 1.2 * signal_filters.LAG_BOUND_S * viscous:
         return []
     rival = theta.copy()
-    rival[INERTIA], rival[2 + reports.SPEED_LAG] = viscous * max(lag, 1e-3), inertia / viscous
+    rival[INERTIA], rival[2 + signal_filters.SPEED_LAG] = viscous * max(lag, 1e-3), inertia / viscous
     return [rival]
 
 
 def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
     """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
-    phi = np.zeros(reports.COUNT)
-    phi[[reports.SPEED_LAG, reports.TORQUE_LAG, reports.SKEW]] = lags
-    seen = problem.torque / (np.exp(reports.log_ratio(phi, problem.s))[problem.owner] * problem.speed)
+    phi = np.zeros(signal_filters.COUNT)
+    phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
+    seen = problem.torque / (np.exp(signal_filters.log_ratio(phi, problem.s))[problem.owner] * problem.speed)
     s = problem.s[problem.owner]
     weight = np.abs(problem.speed)
     inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))
@@ -157,6 +157,6 @@ def _proposals(problem: Likelihood) -> list[FloatArray]:
         root = b * b - 4.0 * viscous * a
         denominator = b + np.sign(b) * np.sqrt(max(root, 0.0))
         speed_lag = 2.0 * a / denominator if denominator != 0.0 else 0.0
-        lags = np.clip([speed_lag, torque_lag], 0.0, reports.LAG_BOUND_S)
+        lags = np.clip([speed_lag, torque_lag], 0.0, signal_filters.LAG_BOUND_S)
         found.append(_start(problem, (float(lags[0]), float(lags[1]), skew)))
     return found

@@ -8,11 +8,18 @@ same frequency says the same again: it helps the scatter, not the count.
 The parameters are those of the rigid model.
 """
 
-from tdhil.identify.identification import Refusal
-from tdhil.identify.lines.friction import ViscousTie
-from tdhil.identify.lines.model import GaussianPrior, Model
-from tdhil.identify.lines.reports import AVERAGE, SKEW, SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE
-from tdhil.record.recording import LagPrior
+from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.signal_filters import (
+    AVERAGE,
+    SKEW,
+    SPEED_LAG,
+    SPEED_SHAPE,
+    TORQUE_LAG,
+    TORQUE_SHAPE,
+)
+from tdhil.estimation.result import Refusal
+from tdhil.recording.recording import LagPrior
 
 UNKNOWNS = 5
 _AT = Model().at

@@ -8,12 +8,12 @@ one standard deviation 4 %, and the value is never at the interval's edge.)
 
 import math
 
-from tdhil.identify.identification import Estimate
-from tdhil.identify.lines.descent import Fit
+from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
+from tdhil.estimation.frequency_domain.inference import profile_edge, standard_deviation, student_quantile
+from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.result import Estimate
 from tdhil.identify.lines.fit import Held, minimise
-from tdhil.identify.lines.profile import profile_edge, standard_deviation, student_quantile
-from tdhil.identify.lines.structure import Fitted, excess_rise, unit
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 
 def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:

@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
-from tdhil.identify.identification import Estimate, LinePoint
-from tdhil.identify.lines.profile import student_quantile
-from tdhil.identify.lines.spectrum import ComplexArray, Line
-from tdhil.identify.lines.structure import Fitted
+from tdhil.estimation.frequency_domain.filter_order import Fitted
+from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
+from tdhil.estimation.result import Estimate, LinePoint
 
 
 def fitted_points(fitted: Fitted, confidence: float) -> tuple[LinePoint, ...]:

@@ -14,11 +14,11 @@ import math
 
 import numpy as np
 
-from tdhil.identify.identification import ResidualTest
-from tdhil.identify.lines.likelihood import Likelihood
-from tdhil.identify.lines.spectrum import Line
-from tdhil.identify.lines.structure import Fitted
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.frequency_domain.filter_order import Fitted
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import ResidualTest
+from tdhil.recording.recording import FloatArray
 
 REJECT_P = 0.001
 _AT_BOUND = 1e-6      # of the natural scale

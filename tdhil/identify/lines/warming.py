@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _NONE, _ALL = 2.0, 4.0       # normal deviations of the trend at which none, and all, of it is believed
 _TOLD = 3.5                  # at which the user is told

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.identify.identification import Estimate
-from tdhil.identify.lines.descent import Fit
-from tdhil.identify.lines.profile import profile_edge, student_quantile
-from tdhil.identify.record_route.equation import SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, evaluate
-from tdhil.identify.record_route.fitting import Problem, covariance, minimise
+from tdhil.estimation.frequency_domain.inference import profile_edge, student_quantile
+from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.result import Estimate
+from tdhil.estimation.time_domain.equation import SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, evaluate
+from tdhil.estimation.time_domain.fit import Problem, covariance, minimise
 from tdhil.identify.record_route.moments import sandwich
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _LEAST_DOF = 3.0
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))

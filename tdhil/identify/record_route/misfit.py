@@ -10,10 +10,10 @@ leaves so much more that F says it is no chance, then the data contradict it.
 
 import numpy as np
 
-from tdhil.identify.identification import ResidualTest
-from tdhil.identify.record_route.equation import evaluate
-from tdhil.identify.record_route.fitting import Problem
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.result import ResidualTest
+from tdhil.estimation.time_domain.equation import evaluate
+from tdhil.estimation.time_domain.fit import Problem
+from tdhil.recording.recording import FloatArray
 
 _GROUP = 6
 _FIRST = 2       # bins of a window below it are friction's, constant and all

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.record_route.bins import Window, seen_through
-from tdhil.identify.record_route.equation import evaluate
-from tdhil.identify.record_route.fitting import Problem
+from tdhil.estimation.samples import Samples
+from tdhil.estimation.time_domain.equation import evaluate
+from tdhil.estimation.time_domain.fit import Problem
+from tdhil.estimation.time_domain.windows import Window, seen_through
 from tdhil.identify.record_route.tapers import flat_top, times
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _BLOCK_S = 4.0
 _BLOCKS = 40

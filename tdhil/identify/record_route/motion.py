@@ -4,10 +4,10 @@ from typing import NoReturn
 
 import numpy as np
 
-from tdhil.identify.identification import Refused
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import Samples
 from tdhil.identify.record_route.stretches import Run
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import FloatArray, Recording
+from tdhil.recording.recording import FloatArray, Recording
 
 _STEADY_SHARE = 0.05       # of the speed: less excursion than this is a constant speed
 _IDLE_SHARE = 0.02         # of the torque's span: torque this small is none

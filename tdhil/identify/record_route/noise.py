@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.record_route.bins import Bins
-from tdhil.identify.record_route.series import ComplexArray
-from tdhil.record.recording import FloatArray
+from tdhil.estimation.time_domain.taylor import ComplexArray
+from tdhil.estimation.time_domain.windows import Bins
+from tdhil.recording.recording import FloatArray
 
 _WIDTH = 0.35         # of the frequency, either way
 _NEIGHBOURS = 8       # either way, at least

@@ -11,11 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.identify.lines.descent import Fit
-from tdhil.identify.lines.model import GaussianPrior
-from tdhil.identify.record_route import noise
-from tdhil.identify.record_route.bins import Bins
-from tdhil.identify.record_route.equation import (
+from tdhil.estimation.frequency_domain.model import GaussianPrior
+from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.time_domain.equation import (
     BACK,
     FORWARD,
     INERTIA,
@@ -26,8 +24,10 @@ from tdhil.identify.record_route.equation import (
     VISCOUS,
     evaluate,
 )
-from tdhil.identify.record_route.fitting import Problem, box, covariance, minimise
-from tdhil.record.recording import BoolArray, FloatArray
+from tdhil.estimation.time_domain.fit import Problem, box, covariance, minimise
+from tdhil.estimation.time_domain.windows import Bins
+from tdhil.identify.record_route import noise
+from tdhil.recording.recording import BoolArray, FloatArray
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
 _ROUNDS = 5

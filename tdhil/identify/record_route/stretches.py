@@ -14,8 +14,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.identify.samples import Samples
-from tdhil.record.recording import BoolArray, FloatArray
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import BoolArray, FloatArray
 
 _MOST_SAMPLES = 200_000
 _LEAST_RATE_HZ = 50.0

@@ -5,7 +5,7 @@ The taper is the smoothstep of degree 7, x⁴(35 − 84x + 70x² − 20x³); ris
 
 import numpy as np
 
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
 
 _STEP = np.polynomial.Polynomial([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])
 _SLOPES = (_STEP, _STEP.deriv(1), _STEP.deriv(2), _STEP.deriv(3))

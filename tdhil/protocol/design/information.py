@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
-from tdhil.identify.lines import reports
-from tdhil.identify.lines.shaft import VISCOUS
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.shafts import VISCOUS
 from tdhil.protocol.design.noise import RIGID, Noise
-from tdhil.protocol.excitation import Plan
-from tdhil.record.recording import FloatArray, LagPrior
+from tdhil.recording.recording import FloatArray, LagPrior
+from tdhil.run.excitation import Plan
 
 _SKEW_SD_S = 0.3
 _AVERAGE_SHARE = 4.0       # u of an average that delays as long as the longest lag τ: (2 τ)²
@@ -36,7 +36,7 @@ def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) ->
     if nu < 2.0:
         return math.inf
     amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
-    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(reports.SPEED_LAG)]))
+    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(signal_filters.SPEED_LAG)]))
     weight = 2.0 * (counts @ seen**2) / variance * (nu - 1.0) / nu
     fisher = np.einsum("k,ki,kj->ij", weight, columns.conj(), columns).real
     fisher[VISCOUS, VISCOUS] += _tie(plan, counts * period, float(noise.error_density(np.zeros(1), theta)[0]))
@@ -59,14 +59,14 @@ def _tie(plan: Plan, durations: FloatArray, density: float) -> float:
 
 def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
     """Standard deviations to begin with, of the reports' parameters: stated, or about the bounds of the fit."""
-    lags = theta[[RIGID.at(reports.SPEED_LAG), RIGID.at(reports.TORQUE_LAG)]]
+    lags = theta[[RIGID.at(signal_filters.SPEED_LAG), RIGID.at(signal_filters.TORQUE_LAG)]]
     longest = max(float(np.max(lags)), 1e-3)
     speed, torque = prior.speed_lag_s is not None, prior.torque_lag_s is not None
     return {
-        reports.SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else reports.LAG_BOUND_S,
-        reports.SPEED_SHAPE: _CERTAIN if speed else reports.SHAPE_BOUND,
-        reports.TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else reports.LAG_BOUND_S,
-        reports.TORQUE_SHAPE: _CERTAIN if torque else reports.SHAPE_BOUND,
-        reports.AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
-        reports.SKEW: _SKEW_SD_S,
+        signal_filters.SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else signal_filters.LAG_BOUND_S,
+        signal_filters.SPEED_SHAPE: _CERTAIN if speed else signal_filters.SHAPE_BOUND,
+        signal_filters.TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else signal_filters.LAG_BOUND_S,
+        signal_filters.TORQUE_SHAPE: _CERTAIN if torque else signal_filters.SHAPE_BOUND,
+        signal_filters.AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
+        signal_filters.SKEW: _SKEW_SD_S,
     }

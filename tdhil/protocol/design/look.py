@@ -5,23 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tdhil.identify.identify import identify
-from tdhil.identify.lines.friction import measure_levels, tie_viscous
-from tdhil.identify.lines.spectrum import period_lines, pooled_lines
+from tdhil.estimation.frequency_domain.friction_levels import measure_levels, tie_viscous
+from tdhil.estimation.frequency_domain.spectrum import period_lines, pooled_lines
+from tdhil.estimation.identify import identify
+from tdhil.estimation.samples import stretches, usable_samples
 from tdhil.identify.options import Options
-from tdhil.identify.samples import stretches, usable_samples
-from tdhil.protocol.design.expected import (
-    LEAST_NU,
-    Evidence,
-    Fitted,
-    fit,
-    half_width,
-    longer,
-    noise_free,
-    whole_periods,
-)
-from tdhil.protocol.design.stopping import aimed_scatter, least_scale
-from tdhil.record.recording import Recording
+from tdhil.recording.recording import Recording
+from tdhil.run.design.prediction import LEAST_NU, Evidence, Fitted, fit, half_width, longer, noise_free, whole_periods
+from tdhil.run.design.stopping_rule import aimed_scatter, least_scale
 
 
 @dataclass(frozen=True)

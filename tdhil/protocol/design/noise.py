@@ -17,11 +17,11 @@ from typing import Literal
 
 import numpy as np
 
-from tdhil.identify.lines.model import Model
-from tdhil.identify.lines.reports import SPEED_LAG, TORQUE_LAG
-from tdhil.identify.lines.spectrum import period_lines
-from tdhil.identify.samples import Samples, Stretch
-from tdhil.record.recording import FloatArray, LagPrior, Segment
+from tdhil.estimation.frequency_domain.model import Model
+from tdhil.estimation.frequency_domain.signal_filters import SPEED_LAG, TORQUE_LAG
+from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.samples import Samples, Stretch
+from tdhil.recording.recording import FloatArray, LagPrior, Segment
 
 RIGID = Model()
 """The model that plans are made with; theta (8,) = (J, B) and the six parameters of the reports."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from tdhil.identify.lines.friction import Levels
-from tdhil.identify.lines.reports import SPEED_LAG
-from tdhil.identify.lines.spectrum import Line
-from tdhil.protocol.design.expected import Evidence, Fitted, noise_free, safe_half_width
+from tdhil.estimation.frequency_domain.friction_levels import Levels
+from tdhil.estimation.frequency_domain.signal_filters import SPEED_LAG
+from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.protocol.design.noise import RIGID, Noise
-from tdhil.protocol.excitation import Plan
-from tdhil.record.recording import FloatArray, LagPrior
+from tdhil.recording.recording import FloatArray, LagPrior
+from tdhil.run.design.prediction import Evidence, Fitted, noise_free, safe_half_width
+from tdhil.run.excitation import Plan
 
 
 def predicted(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> Evidence:

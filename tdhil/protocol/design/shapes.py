@@ -8,9 +8,9 @@ from itertools import product
 
 import numpy as np
 
-from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, RigGuess
-from tdhil.protocol.excitation.shape import Shape, unit_peak
-from tdhil.record.recording import FloatArray
+from tdhil.recording.recording import FloatArray
+from tdhil.run.excitation.reference import DriveMode, MachineLimits, RigGuess
+from tdhil.run.excitation.signals import Shape, unit_peak
 
 HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, where τ is the longest lag that must be reckoned with
 LINES_LIMIT_HZ = (0.1, 2.0)

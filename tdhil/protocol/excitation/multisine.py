@@ -15,7 +15,7 @@ The phases minimise (crest of speed + crest of torque), found by a search over 6
 of torque is 1.31 (a single sine: 1.41), speed spans 3.13 times its rms from peak to peak (a sine: 2.83).
 """
 
-from tdhil.protocol.excitation.shape import Shape, unit_peak
+from tdhil.run.excitation.signals import Shape, unit_peak
 
 DEFAULT_FREQUENCY_HZ = 0.1   # of the lowest line
 DEFAULT_PERIODS = 11         # at each mean speed, the first of them for settling

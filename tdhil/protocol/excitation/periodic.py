@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from tdhil.protocol.excitation.limits import RigGuess
+from tdhil.run.excitation.reference import RigGuess
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ known.
 
 import math
 
-from tdhil.protocol.excitation.shape import Shape
+from tdhil.run.excitation.signals import Shape
 
 DEFAULT_FREQUENCY_HZ = 0.1   # lowest tone of the paper's field test (section 5.2)
 

@@ -8,7 +8,7 @@ in about a tenth of a period.
 
 import math
 
-from tdhil.protocol.excitation.shape import Shape, unit_peak
+from tdhil.run.excitation.signals import Shape, unit_peak
 
 DEFAULT_FREQUENCY_HZ = 0.05   # of the square wave: each level lasts 10 s
 _HARMONICS = (1, 3, 5, 7, 9)

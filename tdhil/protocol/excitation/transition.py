@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from tdhil.protocol.excitation.limits import DriveMode, MachineLimits, PlanRefused, RigGuess
+from tdhil.run.excitation.reference import DriveMode, MachineLimits, PlanRefused, RigGuess
 
 _SHORTEST_S = 2.0
 _TORQUE_SHARE = 0.5   # of what the limit leaves above friction: a transition is in no hurry

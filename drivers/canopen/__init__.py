@@ -1,0 +1,1 @@
+"""CiA 402 drives on CANopen: state machine, objects, I/O."""

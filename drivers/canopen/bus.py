@@ -1,0 +1,198 @@
+"""One thread on one CAN bus: every frame in and out passes here, in order.
+
+There is no Notifier and no other thread. Whoever waits, for a TPDO or for an SDO response, pulls frames off
+the bus himself and hands on those meant for others; so an error of the bus surfaces in the control loop
+that caused it, and nothing is ever sent behind the loop's back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from drivers.cia402.stamps import FrameStamps
+from drivers.cia402.trouble import Condition, condition, queue_is_full
+from drivers.clock import Clock
+from drivers.drive import FrameTap, RawFrame
+from drivers.errors import CommunicationLost
+from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
+
+if TYPE_CHECKING:
+    import can
+
+Handler = Callable[[bytes], None]
+LONGEST_DRAIN_S = 0.25
+"""Of wall time. A cycle must not be held up for ever by a bus on which something babbles."""
+PEER_DEAD_S = 4.0
+"""In stepped time a peer that has answered no question for so long, of wall time, is dead; nothing else ends a wait."""
+PEER_STILL_DEAD_S = 0.05
+"""A dead one is given so long from then on, until it is heard again."""
+ASK_S, ASK_SOON_S, ASK_AGAIN_S = 0.05, 0.002, 0.25
+"""It is asked after so long in which what is waited for didn't come; sooner if that was so the last time."""
+BABBLE_FRAMES = 2000
+"""More than a bus of 1 Mbit/s carries in that time: with fewer it was this computer that stood still."""
+
+
+class CanLink:
+    """Sends and receives on a python-can bus; ``tap`` sees every frame, ``handlers`` those of their identifier."""
+
+    def __init__(self, bus: can.BusABC, clock: Clock, tap: FrameTap | None = None) -> None:
+        from can import Message
+
+        self._message = Message
+        self._bus = bus
+        self._clock = clock
+        self._tap = tap
+        self.handlers: dict[int, Handler] = {}
+        self.remote_handlers: dict[int, Handler] = {}      # of remote frames, which carry no data
+        self._shut = ""                # why nothing is sent any more
+        self.error_frames = 0
+        self.passive = 0               # how often the adapter said that it is error-passive
+        self.stamps = FrameStamps()
+        self.name = str(bus.channel_info)
+        self.asks = False              # the peer is a simulated one in stepped time, and may be asked where a cycle is
+        self._question = 0
+        self._answered = self._in_vain = self._dead = False
+
+    def send(self, identifier: int, data: bytes, last_look: Callable[[], None] | None = None) -> None:
+        """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it.
+
+        ``last_look`` is called when nothing but sending is left to be done, and may raise to prevent it.
+        """
+        message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
+        if last_look is not None:
+            last_look()
+        self._put(message)
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), True, identifier, data))
+
+    def ask(self, identifier: int) -> None:
+        """Put a remote frame of one byte on the bus (node guarding); tapped as a frame without data."""
+        self._put(self._message(
+            arbitration_id=identifier, is_remote_frame=True, dlc=1, is_extended_id=False, check=False
+        ))
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), True, identifier, b""))
+
+    def _put(self, message: can.Message) -> None:
+        if self._shut:
+            raise CommunicationLost(
+                f"{self._shut}: nothing is sent any more",
+                where=self.name,
+                next_step="Mend the bus and start anew; the drive's own watchdog stops the shaft",
+            )
+        try:
+            self._bus.send(message)
+        except Exception as error:  # python-can's backends raise CanError, OSError, BrokenPipeError alike
+            if queue_is_full(error):
+                self._shut_up(f"the transmit queue is full ({error})")
+            raise CommunicationLost(
+                f"the bus did not take a frame: {error}",
+                where=self.name,
+                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+            ) from error
+
+    def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
+        """The next frame as (identifier, data), already handed on; None after ``timeout_s`` of wall time."""
+        try:
+            message = self._bus.recv(timeout_s)
+        except Exception as error:  # see send
+            raise CommunicationLost(
+                f"nothing can be received any more: {error}",
+                where=self.name,
+                next_step="Check adapter and cable; the drive's own watchdog stops the shaft",
+            ) from error
+        if message is None:
+            return None
+        if message.is_error_frame:
+            self._error_frame(message)
+            return -1, b""
+        if not self._clock.stepped:
+            self.stamps.take(message.timestamp, self._clock.now_s())
+        identifier, data = message.arbitration_id, bytes(message.data)
+        if identifier == CYCLE_ID and data[:1] == CYCLE_ANSWER:     # no part of the run: it may come or not
+            self._answered |= data[1:] == bytes((self._question,))
+            return identifier, data
+        if self._tap is not None:
+            self._tap(RawFrame(self._clock.now_s(), False, identifier, data))
+        # A remote frame (another master's node guarding) carries no state; 29-bit identifiers are no CANopen of ours.
+        handler = (self.remote_handlers if message.is_remote_frame else self.handlers).get(identifier)
+        if handler is not None and not message.is_extended_id:
+            handler(data)
+        return identifier, data
+
+    def _error_frame(self, message: can.Message) -> None:
+        """Raises CommunicationLost for a bus-off, from which the adapter may come back: not in this run."""
+        self.error_frames += 1
+        found = condition(message.arbitration_id, bytes(message.data))
+        if found is Condition.PASSIVE:
+            self.passive += 1
+        elif found is Condition.OFF and not self._shut:
+            self._shut_up("the adapter is bus-off")
+            raise CommunicationLost(
+                "the adapter went bus-off: too many errors on the bus",
+                where=self.name,
+                next_step="Check bit rate, termination and cable; the drive's own watchdog stops the shaft",
+            )
+
+    def _shut_up(self, why: str) -> None:
+        """What waits in a queue is old by the time it goes out, and so is what would be put behind it."""
+        self._shut = why
+        with contextlib.suppress(Exception):       # not every interface can
+            self._bus.flush_tx_buffer()
+
+    def drain(self) -> None:
+        """Handle all that has arrived, without waiting. Raises CommunicationLost if there is no end of it."""
+        deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 0
+        while self.receive(0.0) is not None:
+            taken += 1
+            if taken > BABBLE_FRAMES and time.monotonic() > deadline_s:
+                raise CommunicationLost(
+                    "frames come faster than they can be taken",
+                    where=self.name,
+                    next_step="Something babbles on the bus: look with candump, check bit rate and termination",
+                )
+
+    def await_answer(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Handle frames until ``done()``, or until it is clear that what is waited for was lost; whether it was done.
+
+        In real time that is so after ``timeout_s``; with a peer that may be asked (`asks`), as soon as it says that it
+        has nothing more to say: no clock decides then, but whether it is dead.
+        """
+        if not self.asks:
+            return self.pump_until(done, timeout_s)
+        begun_s = time.monotonic()
+        end_s = begun_s + (PEER_STILL_DEAD_S if self._dead else PEER_DEAD_S)
+        ask_s = begun_s + (ASK_SOON_S if self._in_vain else ASK_S)
+        self._question, self._answered = (self._question + 1) % 256, False
+        while not done():
+            now_s = time.monotonic()
+            if self._answered or now_s >= end_s:
+                self._in_vain, self._dead = True, not self._answered
+                return False
+            if now_s >= ask_s:
+                self._put(self._message(
+                    arbitration_id=CYCLE_ID, data=CYCLE_ASKED + bytes((self._question,)), is_extended_id=False,
+                    check=False,
+                ))
+                ask_s = now_s + ASK_AGAIN_S
+            self.receive(min(ask_s, end_s) - now_s)
+        self._in_vain = self._dead = False
+        return True
+
+    def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
+        """Handle frames until ``done()`` or until ``timeout_s`` of wall time has passed; whether it was done."""
+        deadline_s = time.monotonic() + timeout_s
+        while not done():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                return False
+            self.receive(left_s)
+        return True
+
+    def close(self) -> None:
+        """Shut the bus down; its errors no longer matter."""
+        with contextlib.suppress(Exception):
+            self._bus.shutdown()

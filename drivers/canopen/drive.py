@@ -1,0 +1,587 @@
+"""A CiA 402 drive on a CAN bus, as `drivers.drive.Drive` asks for it.
+
+One cycle, all of it sent by this loop and nothing by any other thread or by the kernel::
+
+    tick ─ heartbeat (when due) ─ RPDO2 (when the mode changes) ─ RPDO1 ─ SYNC ─► TPDO1 (─ TPDO2)
+           700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
+
+Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
+switch and the torque target that seeds it therefore act together. A drive that knows no heartbeat consumer is asked
+by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in `shape`.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from drivers.canopen import preflight as checks
+from drivers.canopen import watchdog as arming
+from drivers.canopen.bus import PEER_DEAD_S, CanLink
+from drivers.canopen.limits import note_temperature, set_limits
+from drivers.canopen.other_master import Strangers
+from drivers.canopen.pdo import shape_of
+from drivers.canopen.pdo_mapping import slow_syncs
+from drivers.canopen.position import Angle, find_angle
+from drivers.canopen.sdo import Objects
+from drivers.canopen.sdo_feedback import keep_stepping, look, push
+from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
+from drivers.canopen.supervision import STOPPED, Watch
+from drivers.cia402.feedback import Feedback
+from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_doubt
+from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
+from drivers.cia402.parameters import check_parameters
+from drivers.cia402.read_back import ReadBack
+from drivers.cia402.reported import Reported
+from drivers.cia402.sign_of_life import HEARTBEAT_S, SignOfLife
+from drivers.cia402.standing import Standing
+from drivers.cia402.units import find_units
+from drivers.clock import Clock
+from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PositionReading, Preflight, Sample
+from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
+from drivers.left_behind import LeftBehind
+from drivers.own_limits import OwnLimits
+from drivers.preflight import Table
+from drivers.ticks import RATES_HZ, Ticks, how_late
+from profiles.canopen import CanopenProfile
+from profiles.simulator_marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
+
+if TYPE_CHECKING:
+    import can
+
+HOST_NODE = 127
+SYNC = 0x080
+NMT = 0x000
+START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
+"""The first SYNCs, at standstill, are given so long: how soon this drive answers is then known, and what is late."""
+QUICK_STOP_OPTION = 0x605A
+DRIVE_SILENT_S = 0.5
+"""After so long without its heartbeat the drive counts as lost."""
+MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
+"""A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
+_NO_WORD = b""
+_OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
+_REPEAT_MODE_CYCLES = 25
+"""A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
+
+
+class Cia402Drive:
+    """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame;
+    ``left`` keeps what is changed in the drive, for whoever comes after a host that died.
+
+    ``stepped`` asks a simulated peer to let each SYNC advance its time; a real one is refused it.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        profile: CanopenProfile,
+        clock: Clock,
+        *,
+        node: int,
+        rate_hz: float | None = None,
+        rated_torque_nm: float | None = None,
+        host_node: int = HOST_NODE,
+        tap: FrameTap | None = None,
+        left: LeftBehind | None = None,
+    ) -> None:
+        self.clock = clock
+        self.period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
+        self._rate_is_named = rate_hz is not None
+        self._profile = profile
+        self._node = node
+        self._rated_torque_nm = rated_torque_nm
+        self._link = CanLink(bus, clock, tap)
+        self._objects = Objects(self._link, node)
+        self._left = left
+        self._watch = Watch(node, clock)
+        self._strangers = Strangers(self._link, self._watch, clock, node=node, number=host_node)
+        self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
+        if self._life.asks:
+            self._strangers.own_questions()
+        self._read_back = ReadBack(
+            self._watch, lambda request: self._link.send(0x600 + node, request), self._strangers.tell, node
+        )
+        self._objects.on_answer(self._read_back.take)
+        self._strangers.on_write = self._on_write
+        self._shape = shape_of(profile)
+        self._standing = Standing(self._objects, self._link, node, self.period_s, self._shape.target_speed)
+        self._fed = True
+        self._link.handlers[0x080 + node] = self._watch.on_emcy
+        self._rpdo1_id, self._tpdo1_id = 0x200 + node, 0x180 + node
+        self._rpdo2_id, self._tpdo2_id = 0x300 + node, 0x280 + node
+        self._link.handlers[self._tpdo2_id] = self._on_slow_feedback
+        self._identity: Identity | None = None
+        self._stage = ""               # as announced
+        self._taken = False
+        self._units = Units(1.0, 1.0)
+        self._codes: dict[Mode, int] = {}
+        self._modes: dict[int, Mode] = {}
+        self._layout = self._shape.feedback
+        self._wide = self._shape.wide
+        self._feedback = self._new_feedback()
+        self._strangers.own(SYNC, "SYNC", lambda data: self._feedback.on_foreign_sync())
+        for number in range(1, 5):
+            self._strangers.own(0x100 * (1 + number) + node, rpdo_kind(number, 0x100 * (1 + number) + node))
+        self._has_target = self._shape.target_torque
+        self._slow_layout = self._shape.slow(False)
+        self._watchdog_s = self._allowed_silence_s = 0.0
+        self._angle: Angle | None = None
+        self._shown_s = clock.now_s()  # when the mode was last displayed
+        self._wish = Wish.OFF
+        self._in_operation = False     # enabled, and seen enabled since
+        self._reported = Reported()
+        self._sent_code = 0
+        self._since_mode_sent = 0
+        self._mode_overwritten = False
+        self._contradictions = 0
+        self._ticks = Ticks(clock, self.period_s)
+        self._watch.host_stood_still = self._stood_still
+        self._cycles = self._missed = self._late = 0
+
+    def _new_feedback(self) -> Feedback:
+        feedback = Feedback(self._shape, None if self.clock.stepped else self.clock.now_s, self.period_s)
+        self._link.handlers[self._tpdo1_id] = feedback.on_tpdo1
+        if self.clock.stepped:
+            self._link.handlers[CYCLE_ID] = feedback.on_cycle_end
+        return feedback
+
+    def host_late(self) -> str:
+        """How late this computer or its adapter has been of late, in words; empty where it keeps up."""
+        begun = list(self._ticks.late_s)
+        since_s = self.clock.now_s() - len(begun) * self.period_s
+        # What an answer was late by comes in place of the cycle's own beginning, which was in time most often.
+        answered = [self.period_s + late_s for late_s in self._feedback.late_since(since_s)]
+        late_s = answered + begun[: max(0, len(begun) - len(answered))]
+        return self._stood_still() or how_late(late_s, self.period_s)
+
+    def _stood_still(self) -> str:
+        away_s = self._ticks.stood_still_s(DRIVE_SILENT_S + self._watchdog_s)
+        return f"this computer was late: its control loop stood still for {away_s:.2f} s" if away_s else ""
+
+    @property
+    def counters(self) -> Counters:
+        """What went wrong on the bus so far."""
+        stamps = self._link.stamps
+        return Counters(
+            self._cycles, self._missed, self._late + self._feedback.second + self._feedback.older,
+            self._ticks.overruns,
+            error_frames=self._link.error_frames, passive=self._link.passive,
+            wall_offset_s=stamps.offset_s, wall_jumps=stamps.jumps,
+        )
+
+    # -- before motion ---------------------------------------------------------------------------------------
+
+    def connect(self) -> Identity:
+        """Find the node, put it into pre-operational, read who it is (1018h) and whether it is simulated."""
+        find_free_node(self._objects)
+        self._taken = True
+        self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        self._identity = read_identity(self._objects)
+        refuse_in_doubt(self._objects, self._identity, self._node, self.clock.stepped)
+        self._link.asks = self.clock.stepped
+        self.announce(self._stage)
+        return self._identity
+
+    def announce(self, stage: str) -> None:
+        """Tell a simulated peer that a stage of the protocol begins (5FFEh:4); a real drive is told nothing.
+
+        An expedited SDO download (CiA 301) whose answer nobody waits for.
+        """
+        self._stage = stage
+        if self._identity is not None and self._identity.simulated and stage in STAGE_NUMBERS:
+            request = bytes((0x2F, MARKER_INDEX & 0xFF, MARKER_INDEX >> 8, MARKER_STAGE, STAGE_NUMBERS[stage], 0, 0, 0))
+            self._link.send(0x600 + self._node, request)
+
+    def preflight(self, limits: Limits) -> Preflight:
+        """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
+        if self._identity is None:
+            raise PreflightRefused("preflight before connect", where="driver")
+        table, objects, scaling = Table(), self._objects, Table()
+        self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
+        if self._left is not None:
+            checks.give_back_left(table, objects, self._left, self._identity)
+        checks.check_identity(table, self._identity, self._profile)
+        checks.check_state(table, objects, self._units, self._profile)
+        check_parameters(table, objects, self._profile)
+        self._codes = checks.choose_modes(table, objects, self._profile)
+        self._modes = {code: mode for mode, code in self._codes.items()}
+        table.checks += scaling.checks
+        self._angle = find_angle(table, objects, self._profile)
+        own = OwnLimits(limits.accept_wider)
+        set_limits(table, objects, self._profile, limits, rated_nm, own)
+        note_temperature(table, limits.temperature_c)
+        checks.clear_targets(table, objects, self._profile)
+        for code in self._codes.values():
+            checks.check_mode_display(table, objects, code, self._pause)
+        with_demand, others = arming.map_pdos(table, objects, self._node, self._profile, self._shape, self.period_s)
+        for number, cob_id in others.items():
+            self._strangers.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
+        self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.mode else {}), **others}
+        self._slow_layout = self._shape.slow(with_demand)
+        self._life.pace(limits.watchdog_s / 5.0)
+        self._life.host_node = self._strangers.settle_number(table)
+        heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
+        self._watchdog_s = limits.watchdog_s
+        feed_s = arming.arm_watchdog(
+            table,
+            objects,
+            self._profile.watchdog,
+            host_node=self._life.host_node,
+            watchdog_s=limits.watchdog_s,
+            period_s=self.period_s,
+            beat=self._life.feed,
+            answered=self._life.answered,
+            accept_none=limits.accept_no_watchdog,
+        )
+        self._life.keep_to(feed_s)
+        self._watch_settings(limits.watchdog_s if feed_s else 0.0)
+        found = checks.report(
+            table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
+            limits.watchdog_s if feed_s else 0.0, own.kept,
+        )
+        self._allowed_silence_s = limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0
+        self._start()
+        return found
+
+    @property
+    def rates_hz(self) -> tuple[float, ...]:
+        """The profile's rate and lower ones; none in stepped time, or where a rate was named."""
+        if self._rate_is_named or self.clock.stepped:
+            return ()
+        highest, lowest = self._profile.cyclic.rate_hz, arming.LEAST_CYCLES / (self._watchdog_s or math.inf)
+        return (highest, *(rate for rate in RATES_HZ if lowest <= rate < highest))
+
+    @property
+    def began_late_s(self) -> float:
+        """By how much the last cycle began late, s."""
+        return self._ticks.late_s[-1] if self._ticks.late_s else 0.0
+
+    def set_rate(self, rate_hz: float, *, measuring: bool = False) -> None:
+        """Another rate, after preflight and before anything is enabled: 1006h is written in pre-operational.
+
+        With ``measuring`` a loop that stands still is no error, as nothing can move.
+        """
+        self.period_s = round(1e6 / rate_hz) * 1e-6
+        self._watch.stop()
+        self._life.feed()
+        self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        with suppress(ObjectRefused):  # it follows the SYNC alone then
+            arming.set_period(self._objects, self._profile, self.period_s)
+        with suppress(ObjectRefused):
+            arming.set_slow_syncs(self._objects, self.period_s)
+        self._standing.set_period(self.period_s)
+        self._life.feed()
+        self._feedback = self._new_feedback()
+        self._cycles = self._missed = self._late = self._contradictions = 0
+        self._start(0.0 if measuring else 0.5)
+
+    def _watch_settings(self, watchdog_s: float) -> None:
+        """What preflight set stays as it is in motion: it is read back there."""
+        watchdog, back = self._profile.watchdog, self._read_back
+        back.clear()
+        reaction = watchdog.reaction_index, watchdog.reaction_sub
+        guards = [arming.GUARD_TIME, arming.LIFE_TIME_FACTOR] if self._life.asks else [watchdog.consumer_index]
+        for (index, sub), data in self._objects.stands.items():
+            if index in guards or (index, sub) == reaction:
+                if watchdog_s:
+                    title = "the watchdog's reaction" if (index, sub) == reaction else "the drive's watchdog"
+                    back.watch(title, index, sub, data, often=True)
+            elif 0x1400 <= index < 0x1600:
+                back.watch(f"the switch of RPDO{index - 0x1400 + 1}", index, sub, data)
+            elif index == QUICK_STOP_OPTION:
+                back.watch("the quick-stop option", index, sub, data, often=True)
+            elif index not in (0x1006, 0x1017, 0x6060, MARKER_INDEX):
+                back.watch("the drive's own limit", index, sub, data)
+        back.watch_setpoint("the target velocity", self._shape.target_speed[0])
+        if self._has_target:
+            back.watch_setpoint("the target torque", 0x6071)
+        if self._shape.mode:
+            back.watch_setpoint("the mode of operation", 0x6060)
+
+    def _start(self, stall_share: float = 0.5) -> None:
+        """Operational from now on, and watched. Standing still for this share of the watchdog's time is an error."""
+        try:
+            self._watch.check()        # nothing moves yet: what is wrong already is a refusal
+        except CommunicationLost as error:
+            raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
+        self._link.send(NMT, bytes((START, self._node)))
+        self._link.drain()
+        self._ticks = Ticks(self.clock, self.period_s, stall_share * self._watchdog_s)
+        self._shown_s = self.clock.now_s()
+        self._watch.start(self._allowed_silence_s)
+
+    def _pause(self) -> None:
+        """A short wait of wall time for a drive that needs it between two SDOs; feeds the watchdog if it is armed."""
+        if self._watchdog_s:
+            self._life.feed()
+        self._link.pump_until(lambda: False, 0.01)
+
+    # -- the cycle -------------------------------------------------------------------------------------------
+
+    def enable(self, mode: Mode) -> None:
+        """From the next cycle on move towards operation enabled in ``mode``."""
+        if mode not in self._codes:
+            raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
+        self._strangers.refuse_shared()
+        self._wish, self._in_operation = Wish.ENABLED, False
+
+    def quick_stop(self) -> None:
+        """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling.
+
+        Its option (605Ah) goes before it: somebody may have set that to coasting since it was read back last.
+        """
+        if self._wish is Wish.ENABLED and self._fed:
+            with suppress(CommunicationLost):      # the cycle that follows says so
+                self._read_back.put_back(QUICK_STOP_OPTION, 0)
+        self._wish = Wish.QUICK_STOP
+
+    def disable(self) -> None:
+        """From the next cycle on towards switch on disabled."""
+        self._wish = Wish.OFF
+
+    def reset_fault(self) -> None:
+        """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word."""
+        # Low first, so that the drive sees an edge whatever stood there before.
+        for word in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
+            self._objects.write(0x6040, 0, word, 16)
+            self._pause()
+
+    def exchange(self, command: Command) -> Sample:
+        """One cycle: wait for the tick, send, SYNC, take the feedback.
+
+        Raises CommunicationLost (bus, heartbeat, foreign NMT command, a loop that was frozen), DriveFault (EMCY,
+        restart) and CommandRejected; each trouble of the drive once, so that a stop can go on exchanging.
+        """
+        if command.mode not in self._codes:
+            raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
+        speed_raw = encode_speed(command.speed_rad_s, self._units, self._shape.target_speed)
+        torque_raw = encode_torque(command.torque_nm, self._units)
+        self._ticks.wait(self._listen_until)
+        # What came since the last cycle is looked at before this cycle's setpoint goes out.
+        self._check()
+        now_s = self.clock.now_s()
+        self._life.feed_when_due(now_s)
+        if self._standing.by_sdo or not self._fed:
+            return self._exchange_without_setpoints(now_s)
+        code, shown_code = self._codes[command.mode], self._reported.shown_code
+        self._since_mode_sent += 1
+        again = code != shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES
+        if code != self._sent_code or again or self._mode_overwritten:
+            if self._shape.mode:
+                self._link.send(self._rpdo2_id, RPDO2.pack(code))
+            self._sent_code, self._since_mode_sent, self._mode_overwritten = code, 0, False
+        word = controlword_towards(self._reported.state, self._wish)
+        self._link.send(self._rpdo1_id, self._shape.setpoints(word, torque_raw, speed_raw), self._ticks.check)
+        self._read_back.sent(self._shape.target_speed[0], speed_raw)
+        self._read_back.sent(0x6071, torque_raw)
+        self._read_back.sent(0x6060, code)
+        sample = self._finish(now_s)
+        if self._wish is not Wish.QUICK_STOP:
+            self._read_back.step(now_s)
+        elif (sample.fresh or self._others_drive) and self._standing.undone(
+            now_s, self._reported.state, self._others_drive
+        ):
+            self._stand()
+        return sample
+
+    def _exchange_without_setpoints(self, now_s: float) -> Sample:
+        """Of a drive whose RPDOs were switched off, or which is left to its own watchdog.
+
+        Then nothing goes out but, in stepped time, the SYNC that moves time on.
+        """
+        if self._fed:
+            self._standing.push(self._reported.state, self._wish)
+        return self._finish(now_s, self._fed or self.clock.stepped)
+
+    @property
+    def _others_drive(self) -> bool:
+        """Were setpoints of somebody else heard under our own RPDOs' identifiers?"""
+        foreign = self._watch.foreign
+        return any(foreign[rpdo_kind(n, 0x100 * (1 + n) + self._node)] for n in (1, 2))
+
+    def _stand(self) -> None:
+        """The quick stop is undone by somebody, or not taken: by SDO, then, and without any RPDO in the drive."""
+        done = self._standing.take_over(self._watchdog_s, self._life.feed)
+        self._strangers.tell(
+            f"the quick stop did not stand: {done} RPDOs were switched off in the drive, and it was asked for by SDO"
+        )
+        self._ticks.put_off()
+
+    def _finish(self, now_s: float, sync: bool = True) -> Sample:
+        """The SYNC, and what comes back for it."""
+        feedback = self._feedback
+        feedback.begin(now_s, sync=sync)
+        if sync:
+            self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
+        age_s = self._await_feedback(now_s)
+        self._cycles += 1
+        fresh = bool(feedback.data)
+        if not fresh:
+            self._missed += 1
+        if feedback.doubted() and self._wish is not Wish.ENABLED:
+            fresh = False
+        if fresh:
+            status, torque_raw, speed_raw = self._layout.unpack(feedback.data)
+            self._reported.take(status, speed_raw, torque_raw)
+            self._follow_state()
+        while self._contradictions < feedback.contradictions:
+            self._contradictions += 1
+            self._watch.on_contradiction()
+        self._ticks.check_end()
+        self._check()
+        if now_s - self._shown_s > max(MODE_STALE_S, MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s):
+            self._reported.shown_code = 0      # whatever it was, nobody knows any more
+        return self._sample(now_s, age_s, fresh)
+
+    def _check(self) -> None:
+        """Raise what is wrong with the drive; a sign of life that hasn't been read yet isn't missing."""
+        if self._watch.overdue:
+            self._link.drain()
+        self._watch.check()
+
+    def look(self) -> Sample | None:
+        """Status, speed and torque by SDO, for a stop whose cyclic feedback is not to be had; None without an answer.
+
+        Once something else than enabling was asked for, that goes out by SDO (6040h) too. Raises CommunicationLost.
+        """
+        if self._watch.nmt_state == STOPPED:
+            self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+        self._life.feed()
+        begun_s = self.clock.now_s()
+        found = look(self._objects, self._profile, self._watchdog_s)
+        if found is None:
+            return None
+        if self.clock.stepped:
+            keep_stepping(self._objects, self._profile, self.period_s)
+        half_s = 0.5 * (self.clock.now_s() - begun_s)
+        self._reported.take(found.status, found.speed, found.torque)
+        self._follow_state()
+        push(self._objects, found.status, self._wish, self._watchdog_s)
+        self._life.feed()
+        self._ticks.put_off()
+        return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
+
+    def read_position(self) -> PositionReading | None:
+        """The motor's angle by one SDO between two cycles; None where the drive has none, or didn't answer in time."""
+        if self._angle is None:
+            return None
+        self._life.feed_when_due(self.clock.now_s())
+        found = self._angle.read(self._objects, self.clock, self._watchdog_s)
+        self._ticks.put_off()
+        return found
+
+    def _follow_state(self) -> None:
+        """A drive that fell out of operation stays out until it is asked in again: whoever resets it isn't us.
+
+        Some drives leave by fault, some by quick stop, and some are simply found switched off, once their own watchdog
+        has brought the shaft to rest. Quick stop keeps each of them where it is, and does no harm to one that is still
+        in operation because the frame that said otherwise wasn't its own.
+        """
+        if self._wish is not Wish.ENABLED:
+            return
+        if self._reported.state is State.OPERATION_ENABLED:
+            self._in_operation = True
+        elif self._in_operation or self._reported.state in _OUT_OF_OPERATION:
+            self._wish = Wish.QUICK_STOP
+
+    def _listen_until(self, tick_s: float) -> None:
+        """Wait for the next tick, and take what comes meanwhile; feedback among it is late."""
+        clock, feedback = self.clock, self._feedback
+        before = feedback.arrived - feedback.older
+        if clock.stepped:
+            clock.wait_until(tick_s)
+        else:
+            while (left_s := tick_s - clock.now_s()) > 0.0:
+                if self._link.receive(left_s) is None:
+                    break
+        self._link.drain()
+        self._late += feedback.arrived - feedback.older > before
+
+    def _await_feedback(self, sync_s: float) -> float:
+        """Take frames until TPDO1 is there; its age in seconds of control time."""
+        clock = self.clock
+        link = self._link
+        if clock.stepped:
+            # In stepped time nothing is late, it is lost.
+            link.await_answer(lambda: self._feedback.done, PEER_DEAD_S)
+            return 0.0
+        feedback = self._feedback
+        first = not feedback.arrived and self._cycles < FIRST_ANSWERS
+        patience_s = min(FIRST_ANSWER_S, 0.1 * self._watchdog_s) if first else 0.0
+        deadline_s = sync_s + max(0.8 * self.period_s, patience_s)
+        while not feedback.done and (left_s := deadline_s - clock.now_s()) > 0.0:
+            link.receive(left_s)
+        if not feedback.done:
+            link.drain()               # a loop that comes back late finds in time what came in time
+            feedback.settle()
+        if first:
+            self._ticks.put_off()
+        return clock.now_s() - sync_s
+
+    def stop_feeding(self) -> None:
+        """No sign of life, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
+        self._fed = False
+        self._life.end()
+
+    def remarks(self) -> tuple[str, ...]:
+        """What others did on the bus since this was asked last; see `drivers.drive.Telling`."""
+        return self._strangers.remarks()
+
+    def summary(self) -> tuple[str, ...]:
+        """What others wrote to the drive in all of the run."""
+        return self._strangers.summary()
+
+    def keep_alive(self) -> None:
+        """A sign of life between two cycles, without a SYNC: in stepped time a peer takes a silent host for a dead one.
+
+        The heartbeats that are due in control time stay due.
+        """
+        self._life.feed_between()
+
+    def _on_write(self, index: int, sub: int) -> None:
+        """Somebody else wrote an object of the drive."""
+        self._mode_overwritten |= index == 0x6060
+        self._read_back.soon(index, sub)
+
+    def _on_slow_feedback(self, data: bytes) -> None:
+        if self._wide and len(data) == 2 + self._slow_layout.size:
+            self._feedback.on_status(data[:2])
+            data = data[2:]
+        if len(data) == self._slow_layout.size:
+            values = self._slow_layout.unpack(data)
+            self._shown_s = self.clock.now_s()
+            self._reported.take_slow(values[0], values[1] if len(values) > 1 else None)
+
+    def _sample(self, time_s: float, age_s: float, fresh: bool) -> Sample:
+        return self._reported.sample(time_s, age_s, fresh, self._units, self._modes)
+
+    # -- afterwards ------------------------------------------------------------------------------------------
+
+    def close(self) -> tuple[str, ...]:
+        """Give the drive its former settings back and let go of the bus; targets stay at zero.
+
+        Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that
+        follows makes it act. What could not be given back is returned.
+        """
+        self._watch.stop()
+        left: tuple[str, ...] = ()
+        try:
+            if self._taken and self._reported.state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+                self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
+                left = self._objects.restore()
+        except CommunicationLost as error:
+            left = (str(error),)
+        finally:
+            self._link.close()
+        return left
+
+
+def rpdo_kind(number: int, identifier: int) -> str:
+    """An RPDO of the drive, as it is named in messages."""
+    return f"setpoints (RPDO{number}, {identifier:03X}h)"
+
+
+__all__ = ["HOST_NODE", "Cia402Drive"]

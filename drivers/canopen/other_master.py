@@ -1,0 +1,182 @@
+"""Somebody else on the bus: a node that bears the host's number, another master's frames, a tool's SDO.
+
+What only this host sends to this drive, and comes in all the same, isn't ours::
+
+    700h + host      a heartbeat that would go on feeding the drive's watchdog (1016h) when this computer has died
+    700h + node      remote frame: so would another master's question, where the drive is watched by node guarding
+    080h             SYNC
+    RPDOs            setpoints
+    600h + node      SDO requests: a tool reads, which does no harm, or writes
+
+A frame or two by mistake is told (`remarks`); the second of a kind, however late in the run, ends it (`Watch`). A tool
+that writes what drives the shaft (6040h, 6060h, 6071h, 60FFh) again and again is a second master too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+
+from drivers.canopen.bus import CanLink, Handler
+from drivers.canopen.sdo import name
+from drivers.canopen.supervision import Watch
+from drivers.clock import Clock
+from drivers.errors import PreflightRefused
+from drivers.preflight import Table
+
+LISTEN_S = 3.0
+"""Before motion the bus is listened to for so long: heartbeats come every second, or sooner."""
+HIGHEST_NODE = 127
+FOREIGN_WRITES = 3
+"""So many writes of what drives the shaft, in one run, are a second master's."""
+DRIVING = frozenset({0x6040, 0x6042, 0x6060, 0x6071, 0x60FF})
+_SYNC = 0x080
+_MOST_REMARKS = 20
+_DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
+
+
+class Strangers:
+    """Listens from the beginning. ``number`` is the host's node number; ``on_write`` is told of written objects."""
+
+    def __init__(self, link: CanLink, watch: Watch, clock: Clock, *, node: int, number: int) -> None:
+        self._link = link
+        self._watch = watch
+        self._clock = clock
+        self._node = node
+        self._since_s = clock.now_s()
+        self._beats: Counter[int] = Counter()
+        self._writes: Counter[tuple[int, int]] = Counter()
+        self._last: dict[tuple[int, int], int | None] = {}
+        self._told: list[str] = []
+        self._said: set[str] = set()
+        self._armed = False
+        self.number = number
+        self.feeds_by_heartbeat = True             # does the drive's watchdog wait for one?
+        self.on_write: Callable[[int, int], None] = lambda index, sub: None
+        for other in range(1, HIGHEST_NODE + 1):
+            if other != node:
+                link.handlers[0x700 + other] = partial(self._on_beat, other)
+        link.handlers[0x600 + node] = self._on_request
+
+    def own(self, identifier: int, kind: str, then: Handler | None = None) -> None:
+        """Frames of this identifier are ours to send; ``then`` sees those of others too."""
+
+        def take(data: bytes) -> None:
+            if then is not None:
+                then(data)
+            self._foreign(kind)
+
+        self._link.handlers[identifier] = take
+
+    def own_questions(self) -> None:
+        """The drive is asked by node guarding, and the questions are ours."""
+        self.feeds_by_heartbeat = False
+        self._link.remote_handlers[0x700 + self._node] = lambda data: self._foreign("questions of node guarding")
+
+    # -- the host's number -----------------------------------------------------------------------------------
+
+    def settle_number(self, table: Table) -> int:
+        """Listen until it has been long enough, and take a number that nobody bears; the number.
+
+        In stepped time none goes by while nothing is sent: there what has come so far decides, and what comes later is
+        found before motion (`refuse_shared`) and in it. Raises PreflightRefused where no number is free.
+        """
+        left_s = self._since_s + LISTEN_S - self._clock.now_s()
+        if not self._clock.stepped and left_s > 0.0:
+            self._link.pump_until(lambda: False, left_s)
+        self._link.drain()
+        wanted, heard = self.number, self._beats[self.number]
+        if heard:
+            free = [n for n in range(HIGHEST_NODE, 0, -1) if n != self._node and not self._beats[n]]
+            if not free:
+                raise PreflightRefused(
+                    "every node number has a heartbeat already: none is left for this host", where="701h to 77Fh",
+                    next_step="Take a node off the bus",
+                )
+            self.number = free[0]
+            table.note(
+                "host's node number",
+                f"{self.number}, since another node bears {wanted}: its heartbeat ({0x700 + wanted:03X}h) was heard"
+                f" {heard} time{'s' * (heard > 1)}, and would feed the drive's watchdog for a dead host",
+                f"{0x700 + wanted:03X}h",
+            )
+        self._armed = True
+        return self.number
+
+    def refuse_shared(self) -> None:
+        """Before motion: has anybody else's heartbeat come under the host's number? Raises PreflightRefused."""
+        if self._beats[self.number] and self.feeds_by_heartbeat:
+            raise PreflightRefused(
+                f"another node bears this host's number {self.number}: its heartbeat would feed the drive's watchdog",
+                where=f"{0x700 + self.number:03X}h",
+                next_step="Give that node another number, or take it off the bus, and start anew",
+            )
+
+    def _on_beat(self, number: int, data: bytes) -> None:
+        self._beats[number] += 1
+        if self._armed and number == self.number:
+            kind = f"a heartbeat under this host's number {number} ({0x700 + number:03X}h)"
+            if self.feeds_by_heartbeat:
+                self._foreign(kind, f"another node sends {kind}: it would feed the drive's watchdog for a dead host")
+            else:
+                self.tell(f"another node sends {kind}")
+
+    def _foreign(self, kind: str, why: str = "") -> None:
+        self.tell(f"{kind} came from somebody else")
+        self._watch.on_foreign(kind, why)
+
+    # -- a tool's SDO ------------------------------------------------------------------------------------------
+
+    def _on_request(self, data: bytes) -> None:
+        """A request to this drive that isn't ours; downloads alone change anything (CiA 301, initiate download)."""
+        if len(data) != 8 or data[0] >> 5 != _DOWNLOAD:
+            return
+        index, sub = int.from_bytes(data[1:3], "little"), data[3]
+        key = (index, sub)
+        self._writes[key] += 1
+        value: int | None = None
+        if data[0] & _EXPEDITED:
+            size = 4 - (data[0] >> 2 & 3) if data[0] & _SIZED else 4
+            value = int.from_bytes(data[4 : 4 + size], "little")
+        self._last[key] = value
+        self.tell(f"somebody else wrote {_shown(index, sub, value)} by SDO")
+        self.on_write(index, sub)
+        driving = sum(count for (one, _), count in self._writes.items() if one in DRIVING)
+        if index in DRIVING and driving >= FOREIGN_WRITES:
+            self._watch.interference(
+                f"a second master writes setpoints by SDO: {driving} times, last {_shown(index, sub, value)}",
+                f"node {self._node}, {name(index, sub)}",
+                "Take it off the bus and start anew", kind="sdo setpoints",
+            )
+
+    # -- what is told -----------------------------------------------------------------------------------------
+
+    def tell(self, text: str) -> None:
+        """Once for each text."""
+        if text not in self._said and len(self._said) < _MOST_REMARKS:
+            self._said.add(text)
+            self._told.append(text)
+
+    def remarks(self) -> tuple[str, ...]:
+        """What was noticed since this was asked last, a line each."""
+        if not self._told:
+            return ()
+        told, self._told = tuple(self._told), []
+        return told
+
+    def summary(self) -> tuple[str, ...]:
+        """For the end of the run: what others wrote, and how often."""
+        written = [
+            f"{_shown(*key, self._last[key])} was written by somebody else, {count} time{'s' * (count > 1)}"
+            for key, count in sorted(self._writes.items())
+        ]
+        heard = [
+            f"{kind} came from somebody else, {count} time{'s' * (count > 1)}"
+            for kind, count in sorted(self._watch.foreign.items())
+        ]
+        return (*written, *heard)
+
+
+def _shown(index: int, sub: int, value: int | None) -> str:
+    return f"{name(index, sub)} = {value:X}h" if value is not None else name(index, sub)

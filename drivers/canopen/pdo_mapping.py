@@ -1,0 +1,146 @@
+"""PDO mapping and communication parameters, written by SDO (CiA 301, 1400h…1A03h).
+
+Real drives map 6040h alone, or 6040h with 60FFh, into their first RPDOs and none maps 6071h, so mapping is
+always written, in the order that the standard asks for: disable the PDO, empty the mapping, fill it, set the
+transmission type, enable.
+"""
+
+from dataclasses import dataclass
+
+from drivers.canopen.pdo import STANDARD, Shape
+from drivers.canopen.sdo import Objects, name
+from drivers.cia402.objects import (
+    CONTROLWORD,
+    MODE,
+    MODE_DISPLAY,
+    STATUSWORD,
+    TARGET_TORQUE,
+    TORQUE_DEMAND,
+    mapping_entry,
+)
+from drivers.errors import PreflightRefused
+
+DISABLED = 1 << 31
+SLOW_SYNCS, SLOW_S = 5, 0.1
+"""The second TPDO (mode display, torque demand) comes with every fifth SYNC: people, mode switches and
+the guard look at it, not the control, and the bus is short. On a slow cycle it comes sooner: a mode that was lost must
+show within a tenth of a second, or a cycle."""
+_LEAST_RPDOS, _MOST_RPDOS = 8, 64
+"""RPDOs that a drive is asked for: the first ones in any case, since some numbers may be left out, then while there are
+more."""
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """One PDO as it shall be: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
+
+    receive: bool                  # as the drive sees it
+    number: int
+    sync_type: int
+    mapped: tuple[tuple[int, int, int], ...]
+
+    @property
+    def communication(self) -> int:
+        return (0x1400 if self.receive else 0x1800) + self.number - 1
+
+    @property
+    def mapping(self) -> int:
+        return (0x1600 if self.receive else 0x1A00) + self.number - 1
+
+    def identifier(self, node: int) -> int:
+        """COB-ID of the predefined connection set (CiA 301): RPDO1 200h, TPDO1 180h, and 100h on for each further."""
+        return (0x200 if self.receive else 0x180) + 0x100 * (self.number - 1) + node
+
+
+def slow_syncs(period_s: float) -> int:
+    """With every how many SYNCs the second TPDO comes."""
+    return max(1, min(SLOW_SYNCS, round(SLOW_S / period_s)))
+
+
+def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
+    """RPDO1, TPDO1, RPDO2 (where the mode may change), TPDO2; ``with_demand`` adds 6074h where the drive has it.
+
+    ``slow``: see `slow_syncs`.
+    """
+    targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
+    shown = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
+    first: tuple[tuple[int, int, int], ...]
+    second: tuple[tuple[int, int, int], ...]
+    if shape.wide:
+        first, second, syncs = (shape.torque, shape.actual_speed), (STATUSWORD, *shown), 1
+    else:
+        first, second, syncs = (STATUSWORD, shape.torque, shape.actual_speed), shown, slow
+    modes = (Pdo(True, 2, 1, (MODE,)),) if shape.mode else ()
+    return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
+
+
+def written(pdo: Pdo) -> str:
+    """The objects in it, as people write them: 6040+6071+60FF."""
+    return "+".join(f"{index:04X}:{sub}" if sub else f"{index:04X}" for index, sub, _ in pdo.mapped)
+
+
+def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
+    """Map one PDO and read it back; `Objects.restore` gives the former mapping back.
+
+    Raises ObjectRefused, or PreflightRefused if it doesn't read back.
+    """
+    identifier = pdo.identifier(node)
+    wanted = [mapping_entry(mapped) for mapped in pdo.mapped]
+    former = (_entries(objects, pdo), objects.read(pdo.communication, 2), objects.read(pdo.communication, 1))
+    objects.on_restore(lambda: _write(objects, pdo, *former))
+    _write(objects, pdo, wanted, pdo.sync_type, identifier)
+    found = _entries(objects, pdo)
+    if found != wanted:
+        raise PreflightRefused(
+            f"the PDO mapping reads back as {[f'{entry:08X}h' for entry in found]}",
+            where=name(pdo.mapping),
+            next_step="Some drives fix their mapping: this one can't be driven with torque and speed of one instant",
+        )
+    # Bits 11 to 30 are the drive's own (bit 30: no remote frames).
+    cob_id, sync_type = objects.read(pdo.communication, 1), objects.read(pdo.communication, 2)
+    if cob_id & (DISABLED | 0x7FF) != identifier or sync_type != pdo.sync_type:
+        raise PreflightRefused(
+            f"the PDO reads back with COB-ID {cob_id:08X}h and transmission type {sync_type}",
+            where=name(pdo.communication),
+            next_step=f"It must be {identifier:X}h, enabled, and of type {pdo.sync_type} (synchronous)",
+        )
+
+
+def switch_off_others(objects: Objects, ours: tuple[Pdo, ...]) -> dict[int, int]:
+    """Every enabled RPDO that isn't ours is switched off (bit 31 of its COB-ID), and comes back with the rest.
+
+    Its number and the COB-ID that it had. Through it another master's setpoints would act beside ours (CiA 301, 1400h).
+    Raises ObjectRefused or PreflightRefused where it can't be switched off.
+    """
+    found: dict[int, int] = {}
+    own = {pdo.number for pdo in ours if pdo.receive}
+    for number in range(1, _MOST_RPDOS + 1):
+        index = 0x1400 + number - 1
+        cob_id = None if number in own else objects.read_if_there(index, 1)
+        if cob_id is None and number not in own and number > _LEAST_RPDOS:
+            break
+        if cob_id is None or cob_id & DISABLED:
+            continue
+        if not objects.change(index, 1, cob_id | DISABLED, 32) & DISABLED:
+            raise PreflightRefused(
+                f"RPDO{number} (COB-ID {cob_id & 0x7FF:X}h) stays on: another master's setpoints could act through it",
+                where=name(index, 1), next_step="Switch it off at the drive, by its own tool",
+            )
+        found[number] = cob_id
+    return found
+
+
+def _entries(objects: Objects, pdo: Pdo) -> list[int]:
+    """What is mapped; entries beyond the count are nobody's business."""
+    return [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
+
+
+def _write(objects: Objects, pdo: Pdo, entries: list[int], sync_type: int, cob_id: int) -> None:
+    objects.write(pdo.communication, 1, DISABLED | cob_id, 32)
+    objects.write(pdo.mapping, 0, 0, 8)
+    for position, entry in enumerate(entries, start=1):
+        objects.write(pdo.mapping, position, entry, 32)
+    objects.write(pdo.mapping, 0, len(entries), 8)
+    objects.write(pdo.communication, 2, sync_type, 8)
+    if not cob_id & DISABLED:
+        objects.write(pdo.communication, 1, cob_id, 32)

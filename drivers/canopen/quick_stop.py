@@ -1,0 +1,211 @@
+"""The bare quick stop of a CiA 402 drive (`drivers.quick_stop`): controlword 6040h, bit 2 low.
+
+By SDO, which needs no mapping and no SYNC. Another master that goes on sending enable operation in its RPDO undoes that
+with its next frame (transition 16 of the state machine). Then the same word goes out in that RPDO too, in a burst, so
+that one of them stands in the drive when the SYNC comes; a master that watches the state sees the stop and gives up.
+Where even that is undone, the RPDO that carries 6040h is switched off in the drive (bit 31 of 1400h:1).
+
+A drive whose quick stop is set to coast (605Ah = 0) gets another one first, or the halt bit if it refuses that. One
+that is in torque mode, and whose profile doesn't say that a quick stop decelerates there, gets speed mode at zero
+first, as a run does it: its quick stop would let a turning shaft go.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from drivers.canopen.bus import CanLink
+from drivers.canopen.pdo_mapping import DISABLED
+from drivers.canopen.sdo import Objects, name
+from drivers.canopen.state_machine import ENABLE_OPERATION, QUICK_STOP, TARGET_REACHED, State, decode, power_state
+from drivers.cia402.objects import VELOCITY_ACTUAL, VL_ACTUAL, mapping_entry
+from drivers.cia402.units import speed_unit
+from drivers.clock import Clock
+from drivers.drive import PowerState
+from drivers.errors import DriveFault, ObjectRefused
+from drivers.preflight import Table
+from drivers.quick_stop import Seen
+from profiles.canopen import CanopenProfile
+from profiles.simulator_marker import MARKER_INDEX
+
+if TYPE_CHECKING:
+    import can
+
+HALT = 0x0100
+BY_SDO_TRIES, BY_RPDO_TRIES = 3, 6
+"""So many attempts by SDO alone, then so many with a burst of RPDOs, then the RPDO is switched off."""
+BURST, BURST_PAUSE_S = 200, 0.0005
+NEAR_ZERO_RAD_S, NEAR_ZERO_LSB = 0.05, 3
+MODE_S, MODE_PAUSE_S = 0.5, 0.01
+"""A drive may take so long to change to speed mode, and is asked again after the second."""
+_RPDOS = 4
+_CONTROLWORD = 0x6040
+_COAST, _BRAKE_AND_HOLD = 0, 6
+
+
+class Cia402Target:
+    """One node on an open bus."""
+
+    def __init__(self, bus: can.BusABC, profile: CanopenProfile, clock: Clock, *, node: int) -> None:
+        self._link = CanLink(bus, clock)
+        self._objects = Objects(self._link, node)
+        self._node = node
+        self._profile = profile
+        self._clock = clock
+        self._stays_in_torque_mode = False
+        self._rad_s_per_lsb: float | None = None
+        self._speed_at = (VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0]
+        self._word = QUICK_STOP
+        self._prepared = False
+        self._foreign = 0
+        self._syncs = 0
+        self._said: list[str] = []
+        for identifier in (0x200, 0x300, 0x400, 0x500):
+            self._link.handlers[identifier + node] = self._on_foreign
+        self._link.handlers[0x600 + node] = self._on_foreign
+        self._link.handlers[0x080] = self._on_sync
+
+    def ask(self, attempt: int) -> None:
+        """SDO; then RPDOs; then without the other master's RPDO. Raises CommunicationLost or ObjectRefused."""
+        if not self._prepared:
+            self._prepare()
+        self._leave_torque_mode()
+        if attempt > BY_SDO_TRIES + BY_RPDO_TRIES:
+            self._switch_off_rpdos()
+        elif attempt > BY_SDO_TRIES:
+            self._burst()
+        self._objects.write(_CONTROLWORD, 0, self._word, 16)
+
+    def look(self) -> Seen:
+        """6041h and 606Ch."""
+        status = self._objects.read(0x6041)
+        raw = self._objects.read(self._speed_at, signed=True)
+        state = decode(status)
+        if self._rad_s_per_lsb is None:                # where the drive's own settings scale it, from there
+            self._rad_s_per_lsb = speed_unit(Table(), self._objects, self._profile)
+        speed = raw * self._rad_s_per_lsb
+        enabled = power_state(state) is PowerState.ENABLED
+        return Seen(
+            state=power_state(state),
+            text=f"{state.value} (statusword {status:04X}h)",
+            speed=speed,
+            unit="rad/s",
+            near_zero=abs(raw) <= NEAR_ZERO_LSB or abs(speed) <= NEAR_ZERO_RAD_S,
+            standstill=bool(status & TARGET_REACHED) and state in (State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED),
+            follows=enabled and not (self._word & HALT and status & TARGET_REACHED),
+        )
+
+    def remarks(self) -> tuple[str, ...]:
+        """Another master, and what was changed in the drive."""
+        heard: tuple[str, ...] = ()
+        if self._foreign or self._syncs:
+            heard = (f"another master is there: {self._foreign} of its frames to node {self._node} and {self._syncs}"
+                     " SYNC were heard; stop it too",)
+        return (*heard, *self._said)
+
+    def close(self) -> None:
+        """Let go of the bus."""
+        self._link.close()
+
+    def _prepare(self) -> None:
+        option = self._objects.read_if_there(0x605A, signed=True)
+        self._prepared = True
+        if option == _COAST:
+            try:
+                self._objects.write(0x605A, 0, _BRAKE_AND_HOLD, 16)
+                self._said.append("its quick stop was set to coast: 605Ah was changed from 0 to 6")
+            except ObjectRefused:
+                self._word = ENABLE_OPERATION | HALT
+                self._said.append("its quick stop is set to coast (605Ah = 0): the halt bit was used instead")
+        self._keep_time()
+
+    def _leave_torque_mode(self) -> None:
+        """Speed mode at zero (60FFh, then 6060h), and a moment for 6061h to follow; nothing where it isn't needed.
+
+        A drive that doesn't follow gets the quick stop all the same: there is nothing better to be had over the bus.
+        """
+        profile = self._profile
+        if profile.quick_stop.decelerates_in_torque_mode or self._stays_in_torque_mode:
+            return
+        speed_modes = [code for code in profile.modes.speed if self._supports(code)]
+        if self._shown() not in profile.modes.torque or not speed_modes:
+            return
+        if decode(self._objects.read(0x6041)) is not State.OPERATION_ENABLED:
+            return
+        self._objects.write(0x60FF, 0, 0, 32)
+        self._objects.write(0x6060, 0, speed_modes[0], 8)
+        deadline_s = self._clock.now_s() + MODE_S
+        while self._shown() not in profile.modes.speed:
+            if self._clock.now_s() > deadline_s:
+                self._stays_in_torque_mode = True
+                self._said.append("it stays in torque mode, where its quick stop may not brake the shaft")
+                return
+            self._link.pump_until(lambda: False, MODE_PAUSE_S)
+        said = "it was in torque mode, where its quick stop may not brake: speed mode at zero came first"
+        if said not in self._said:
+            self._said.append(said)
+
+    def _shown(self) -> int:
+        return self._objects.read(0x6061, signed=True)
+
+    def _supports(self, code: int) -> bool:
+        supported = self._objects.read_if_there(0x6502)
+        return supported is None or code < 1 or bool(supported >> code - 1 & 1)
+
+    def _keep_time(self) -> None:
+        """A simulated drive whose time a host used to step goes on by itself, or it would never come to rest."""
+        try:
+            stepped = self._objects.read_if_there(MARKER_INDEX, 2)
+            self._link.pump_until(lambda: self._syncs > 0, 0.2 if stepped else 0.0)
+            if stepped and not self._syncs:
+                self._objects.write(MARKER_INDEX, 2, 0, 8)
+        except ObjectRefused:
+            return
+
+    def _burst(self) -> None:
+        frames = [
+            (cob_id & 0x7FF, self._packed(offset, length))
+            for _, cob_id, offset, length in self._rpdos()
+        ]
+        if not frames:
+            raise DriveFault("no RPDO carries the controlword", where=name(0x1600))
+        for _ in range(BURST):
+            for identifier, data in frames:
+                self._link.send(identifier, data)
+            self._link.pump_until(lambda: False, BURST_PAUSE_S)
+
+    def _packed(self, offset: int, length: int) -> bytes:
+        """An RPDO of zeros with the word in its place; offset and length in bits."""
+        return (self._word << offset).to_bytes(length // 8, "little")
+
+    def _switch_off_rpdos(self) -> None:
+        for index, cob_id, _, _ in self._rpdos():
+            self._objects.write(index, 1, cob_id | DISABLED, 32)
+            self._said.append(
+                f"the other master's word was switched off: {name(index, 1)} = {cob_id | DISABLED:08X}h;"
+                " restart the drive, or start a run, to have it back"
+            )
+
+    def _rpdos(self) -> list[tuple[int, int, int, int]]:
+        """(1400h…, COB-ID, bit offset of 6040h, length in bits) of every enabled RPDO that carries it."""
+        found = []
+        for number in range(_RPDOS):
+            cob_id = self._objects.read_if_there(0x1400 + number, 1)
+            if cob_id is None or cob_id & DISABLED:
+                continue
+            count = self._objects.read_if_there(0x1600 + number, 0) or 0
+            at, place = 0, None
+            for sub in range(1, min(count, 8) + 1):
+                entry = self._objects.read(0x1600 + number, sub)
+                if entry == mapping_entry((_CONTROLWORD, 0, 16)):
+                    place = at
+                at += entry & 0xFF
+            if place is not None and at % 8 == 0 and at <= 64:
+                found.append((0x1400 + number, cob_id, place, at))
+        return found
+
+    def _on_foreign(self, data: bytes) -> None:
+        self._foreign += 1
+
+    def _on_sync(self, data: bytes) -> None:
+        self._syncs += 1

@@ -1,0 +1,195 @@
+"""PDOs, timing and the drive's watchdog: what preflight sets last, since the watchdog wants to be fed from then on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+from drivers.canopen.pdo import Shape
+from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
+from drivers.canopen.sdo import Objects, name
+from drivers.cia402.objects import consumer_heartbeat
+from drivers.errors import ObjectRefused, PreflightRefused
+from drivers.no_watchdog import DIES, settle
+from drivers.preflight import Table
+from profiles.canopen import CanopenProfile, Watchdog
+from profiles.simulator_marker import MARKER_INDEX
+
+GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
+LEAST_CYCLES = 5
+"""The watchdog must not bite on account of a lost frame or two."""
+
+
+def map_pdos(
+    table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape, period_s: float
+) -> tuple[bool, dict[int, int]]:
+    """Map both pairs of PDOs, and switch off what other RPDOs the drive has.
+
+    Whether the slow pair carries the torque demand 6074h too; and the COB-IDs that were switched off, by the RPDO's
+    number.
+    """
+    with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
+    pdos = layout(with_demand, shape, slow_syncs(period_s))
+    others: dict[int, int] = {}
+
+    def work() -> tuple[str, bool]:
+        for pdo in pdos:
+            write_pdo(objects, node, pdo)
+        return "as wanted", True
+
+    table.attempt("PDO mapping", ", ".join(map(written, pdos)), "1600h, 1A00h", work)
+    try:
+        others = switch_off_others(objects, pdos)
+    except PreflightRefused as error:
+        table.row("other RPDOs", "off", error.what, False, error.where, error.next_step)
+    if others:
+        on = ", ".join(f"RPDO{number} ({cob_id & 0x7FF:X}h)" for number, cob_id in others.items())
+        table.row("other RPDOs", "off", f"off (were on: {on})", True, "1400h and on")
+    return with_demand, others
+
+
+def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
+    """Cycle period 1006h; what it then reads, µs. Raises ObjectRefused where the drive has none."""
+    if not profile.cyclic.has_period:
+        raise ObjectRefused("not in the profile", where="1006h")
+    return objects.change(0x1006, 0, round(period_s * 1e6), 32)
+
+
+def set_slow_syncs(objects: Objects, period_s: float) -> None:
+    """With every how many SYNCs the second TPDO comes (1801h:2), at another rate. Raises ObjectRefused."""
+    if objects.read(0x1801, 2) > 1:            # with every SYNC anyway where it carries the statusword
+        objects.write(0x1801, 2, slow_syncs(period_s), 8)
+
+
+def set_timing(
+    table: Table, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
+) -> bool:
+    """Cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h; whether the drive produces one."""
+    period_us = round(period_s * 1e6)
+    try:
+        back = set_period(objects, profile, period_s)
+        table.row("cycle", f"{period_us} µs", f"{back} µs", back == period_us, "1006h")
+    except ObjectRefused:
+        table.note("cycle", f"{period_us} µs; the drive has no 1006h and follows the SYNC alone", "1006h")
+    if stepped:
+        if not profile.cyclic.has_period:
+            back = objects.change(MARKER_INDEX, 3, period_us, 32)
+            table.row("simulator's cycle", f"{period_us} µs", f"{back} µs", back == period_us, name(MARKER_INDEX, 3))
+        on = objects.change(MARKER_INDEX, 2, 1, 8)
+        table.row("stepped time", "on", "on" if on else "off", on == 1, name(MARKER_INDEX, 2))
+    # CiA 301 allows a node one of the two: while it produces a heartbeat it is not guarded.
+    time_ms = 0 if profile.watchdog.kind == "node_guarding" else round(heartbeat_s * 1000)
+    try:
+        back = objects.change(0x1017, 0, time_ms, 16)
+    except ObjectRefused:
+        if time_ms:
+            table.note(
+                "drive's heartbeat", "the drive produces none: its silence shows in missing feedback only", "1017h"
+            )
+        return False
+    good = table.row("drive's heartbeat", f"{time_ms} ms", f"{back} ms", back == time_ms, "1017h")
+    return good and time_ms > 0
+
+
+def arm_watchdog(
+    table: Table,
+    objects: Objects,
+    entry: Watchdog,
+    *,
+    host_node: int,
+    watchdog_s: float,
+    period_s: float,
+    beat: Callable[[], None],
+    answered: Callable[[], bool],
+    accept_none: bool,
+) -> float:
+    """The drive's watchdog and its reaction, written and read back; how often the host must feed it, in seconds.
+
+    Supervision begins with the first ``beat`` (heartbeat, or question of the node guarding), so one is sent before the
+    read-back; ``answered`` waits for the drive's answer to a question. 0 where it is not armed: refused, unless
+    ``accept_none`` and it is known to be off.
+    """
+    tried = Table()
+    if entry.kind == "none":
+        tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
+        settle(table, tried, accept_none, lambda: True)
+        return 0.0
+    index, sub, wanted = entry.reaction_index, entry.reaction_sub, entry.reaction_value
+    if index is not None and wanted is not None:
+
+        def react() -> tuple[str, bool]:
+            found = objects.change(index, sub, wanted, 16)
+            return str(found), found == wanted
+
+        tried.attempt("watchdog reaction", f"{wanted} ({entry.reaction})", name(index, sub), react)
+    time_ms = round(watchdog_s * 1000)
+    if not 1 <= time_ms <= 0xFFFF or watchdog_s < LEAST_CYCLES * period_s:
+        table.checks += tried.checks
+        table.row(
+            "watchdog time", f"{LEAST_CYCLES} cycles to 65 s", f"{time_ms} ms", False, "limits.watchdog_s",
+            f"Give it at least {LEAST_CYCLES * period_s:g} s, or a higher rate",
+        )
+        return 0.0
+    if entry.kind == "node_guarding":
+        feed_s = _arm_guarding(tried, objects, time_ms, entry.life_time_factor, beat, answered)
+    else:
+        feed_s = _arm_heartbeat(tried, objects, entry, host_node, time_ms, beat)
+    return feed_s if settle(table, tried, accept_none, lambda: _is_off(objects, entry)) else 0.0
+
+
+def _arm_heartbeat(
+    table: Table, objects: Objects, entry: Watchdog, host_node: int, time_ms: int, beat: Callable[[], None]
+) -> float:
+    """The consumer heartbeat time, 1016h in the standard: the drive acts where the host's heartbeat isn't heard."""
+    value = consumer_heartbeat(host_node, time_ms)
+
+    def arm() -> tuple[str, bool]:
+        objects.change(entry.consumer_index, entry.consumer_sub, value, 32)
+        beat()
+        found = objects.read(entry.consumer_index, entry.consumer_sub)
+        return f"node {found >> 16 & 0x7F}, {found & 0xFFFF} ms", found == value
+
+    table.attempt(
+        "watchdog", f"node {host_node}, {time_ms} ms", name(entry.consumer_index, entry.consumer_sub), arm, DIES,
+    )
+    return time_ms / 5000.0
+
+
+def _arm_guarding(
+    table: Table, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None], answered: Callable[[], bool]
+) -> float:
+    """100Ch guard time in ms x 100Dh factor = life time (CiA 301): the drive acts where it isn't asked for so long."""
+    factor = min(factor, time_ms)
+    guard_ms = time_ms // factor
+
+    def arm() -> tuple[str, bool]:
+        # 100Dh is one byte in the standard and two on some drives: it is written as long as it is read.
+        length = len(objects.read_bytes(LIFE_TIME_FACTOR))
+        objects.change_bytes(LIFE_TIME_FACTOR, 0, factor.to_bytes(length, "little"))
+        objects.change(GUARD_TIME, 0, guard_ms, 16)
+        ask()
+        if not answered():
+            raise PreflightRefused("no answer to the remote frame of node guarding", where="node guarding")
+        found = objects.read(GUARD_TIME), objects.read(LIFE_TIME_FACTOR)
+        return f"{found[0]} ms x {found[1]}, answered", found == (guard_ms, factor)
+
+    table.attempt(
+        "watchdog", f"{guard_ms} ms x {factor}", f"{name(GUARD_TIME)}, {name(LIFE_TIME_FACTOR)}", arm,
+        f"{DIES}. Node guarding needs remote frames: python-can's socketcand and some gateways don't carry them; use "
+        "the adapter's own interface",
+    )
+    return guard_ms / 1000.0
+
+
+def _is_off(objects: Objects, entry: Watchdog) -> bool:
+    """Does the drive supervise nobody? So where the object isn't there, or a node or time of 0 in it (CiA 301).
+
+    A guard time that was written although no question gets through would stop the shaft some time later: it is taken
+    back first.
+    """
+    if entry.kind == "node_guarding":
+        with suppress(ObjectRefused):
+            objects.change(GUARD_TIME, 0, 0, 16)
+        return not (objects.read_if_there(GUARD_TIME) and objects.read_if_there(LIFE_TIME_FACTOR))
+    value = objects.read_if_there(entry.consumer_index, entry.consumer_sub) or 0
+    return not (value >> 16 & 0x7F and value & 0xFFFF)

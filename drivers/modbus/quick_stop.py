@@ -1,0 +1,143 @@
+"""The bare quick stop of a Modbus drive (`drivers.quick_stop`): the profile's quick-stop word, again while it follows.
+
+Where a quick stop does not decelerate from torque mode, the drive is put into speed mode at zero speed first, as a run
+does; with torque off it would let the shaft coast. Nothing else of the drive is set or checked. The speed is told in
+rad/s where its scale can be read, else in counts.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from drivers.drive import FrameTap, Mode, PowerState
+from drivers.errors import PreflightRefused, TdhilError
+from drivers.modbus.access import Access
+from drivers.modbus.cycle import shown_mode
+from drivers.modbus.link import Link
+from drivers.modbus.scales import si_per_count
+from drivers.modbus.state_machine import decode, power_state, seen
+from drivers.quick_stop import Seen
+from profiles.modbus import ModbusProfile, StatusState
+
+NEAR_ZERO_RAD_S, NEAR_ZERO_COUNTS = 0.05, 5
+NEAR_ZERO_SHARE = 0.005
+"""Of the first speed that was seen, where its unit isn't known."""
+MODE_S, MODE_UNTOLD_S = 1.0, 0.3
+"""So long the drive may take over the change to speed mode; where it doesn't show its mode it is given so long."""
+_POWERED = (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.READY)
+
+
+class ModbusTarget:
+    """One unit on an open line."""
+
+    def __init__(self, link: Link, profile: ModbusProfile, *, unit: int, tap: FrameTap | None = None) -> None:
+        self._profile = profile
+        self._access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
+        self._scale: float | None = None
+        self._looked_for_scale = False
+        self._first = 0
+        self._driven = False
+        self._stops = 0
+        self._reverse: bool | None = None
+        self._switching_since_s: float | None = None
+        self._stayed_in_torque = False
+
+    def ask(self, attempt: int) -> None:
+        """The quick-stop word under speed control, where there is power to brake with. Raises TdhilError."""
+        control = self._profile.control
+        state = decode(control, self._access.read(self._profile.cycle.status.register_) & 0xFFFF)
+        power = power_state(state)
+        if power not in _POWERED:
+            return
+        if power is PowerState.ENABLED and state is not None and not self._stop_would_brake():
+            self._ask_for_speed_mode(state)
+            if not self._stop_would_brake():
+                return
+        self._stops += 1
+        self._driven = self._driven or (self._stops > 2 and power is PowerState.ENABLED)
+        self._access.write(self._profile.cycle.control.register_, control.quick_stop | self._speed_bits())
+
+    def _stop_would_brake(self) -> bool:
+        """Is it time for the quick stop: nothing to change, in speed mode now, or never to be?"""
+        modes, stop = self._profile.modes, self._profile.quick_stop
+        if not modes.torque or stop.decelerates_in_torque_mode or not modes.switch_while_enabled:
+            return True
+        since_s = self._switching_since_s
+        waited_s = 0.0 if since_s is None else self._access.clock.now_s() - since_s
+        if modes.display is None:
+            return since_s is not None and waited_s >= MODE_UNTOLD_S
+        shown = shown_mode(self._profile, self._access.read(modes.display.register_) & 0xFFFF)
+        self._stayed_in_torque = shown is not Mode.SPEED and waited_s > MODE_S
+        return shown is Mode.SPEED or self._stayed_in_torque
+
+    def _ask_for_speed_mode(self, state: StatusState) -> None:
+        """Setpoints of zero first, then the mode, in its register or by bits of an enabling control word."""
+        cycle, modes = self._profile.cycle, self._profile.modes
+        if self._switching_since_s is None:
+            self._switching_since_s = self._access.clock.now_s()
+        self._access.write(cycle.speed_setpoint.register_, 0)
+        if modes.register_ is not None and modes.speed_value is not None:
+            self._access.write(modes.register_, modes.speed_value)
+        if state.onward is not None:
+            self._access.write(cycle.control.register_, state.onward | self._speed_bits())
+
+    def _speed_bits(self) -> int:
+        """Of the control word; with the direction that stands in it, where that is a bit."""
+        control = self._profile.control
+        if self._reverse is None and control.reverse_bits is not None:
+            with suppress(PreflightRefused):
+                word = self._access.read(self._profile.cycle.control.register_) & 0xFFFF
+                self._reverse = bool(word & control.reverse_bits)
+        return control.speed_bits | ((control.reverse_bits or 0) if self._reverse else 0)
+
+    def look(self) -> Seen:
+        """Status word and speed.
+
+        While the shaft still turns under power the quick-stop word is written again: the drive's watchdog may be one
+        that lets go of it, and nobody else may be feeding that any more.
+        """
+        cycle, control = self._profile.cycle, self._profile.control
+        status = self._access.read(cycle.status.register_) & 0xFFFF
+        raw = self._access.read(cycle.speed.register_)
+        if not self._looked_for_scale:
+            self._looked_for_scale, self._first = True, abs(raw)
+            self._scale = self._find_scale()
+        power = power_state(decode(control, status))
+        near = abs(raw) <= max(NEAR_ZERO_COUNTS, NEAR_ZERO_SHARE * self._first)
+        if self._scale is not None:
+            near = abs(raw) <= 3 or abs(raw * self._scale) <= NEAR_ZERO_RAD_S
+        if not near and self._stops and power in (PowerState.QUICK_STOP, PowerState.READY):
+            self._access.write(cycle.control.register_, control.quick_stop | self._speed_bits())
+        return Seen(
+            state=power,
+            text=f"{power.value} (status word {status:04X}h)",
+            speed=float(raw) if self._scale is None else raw * self._scale,
+            unit="counts" if self._scale is None else "rad/s",
+            near_zero=near,
+            standstill=seen(control.standstill, status),
+            follows=power is PowerState.ENABLED,
+        )
+
+    def remarks(self) -> tuple[str, ...]:
+        """What to know."""
+        said = []
+        if self._switching_since_s is not None:
+            said.append("a quick stop doesn't decelerate from torque mode: speed mode at zero was asked for first")
+        if self._stayed_in_torque:
+            said.append(
+                "the drive did not change to speed mode, and its quick stop may let go of the shaft in torque mode"
+            )
+        if self._driven:
+            said.append("the drive went on following somebody: another master is there; stop it too")
+        return tuple(said)
+
+    def _find_scale(self) -> float | None:
+        signal = self._profile.cycle.speed
+        values = {}
+        try:
+            for parameter in self._profile.parameters:
+                if parameter.name == signal.times and parameter.register_ is not None and parameter.times is None:
+                    values[parameter.name] = self._access.read(parameter.register_) * parameter.per_lsb
+            return si_per_count(signal, values, 1.0) or None
+        except (KeyError, TdhilError):
+            return None

@@ -1,0 +1,66 @@
+"""The power states of a drive as its profile tells them, pure: status word in, control word out."""
+
+from enum import Enum
+
+from drivers.drive import Mode, PowerState
+from profiles.modbus import Bits, Control, StatusState
+
+_POWER = {
+    "not_ready": PowerState.NOT_READY,
+    "off": PowerState.OFF,
+    "ready": PowerState.READY,
+    "enabled": PowerState.ENABLED,
+    "quick_stop": PowerState.QUICK_STOP,
+    "fault": PowerState.FAULT,
+}
+
+
+class Wish(Enum):
+    """Where the caller wants the drive to be."""
+
+    OFF = "off"
+    ENABLED = "enabled"
+    QUICK_STOP = "quick stop"
+
+
+def seen(bits: Bits | None, status: int) -> bool:
+    """Does the status word show these bits? False where the profile names none."""
+    return bits is not None and status & bits.mask == bits.value
+
+
+def decode(control: Control, status: int) -> StatusState | None:
+    """The first state of the profile's list that fits; None where none does."""
+    return next((state for state in control.states if status & state.mask == state.value), None)
+
+
+def power_state(state: StatusState | None) -> PowerState:
+    """What callers above the driver see of it; a pattern of no state counts as not ready."""
+    return PowerState.NOT_READY if state is None else _POWER[state.means]
+
+
+def controlword_towards(
+    control: Control, state: StatusState | None, wish: Wish, mode: Mode, *, reverse: bool = False, turning: bool = False
+) -> int:
+    """The control word that brings the drive one step nearer to the wish.
+
+    A fault is never reset here, a quick stop never ended by enabling again, and a shaft that turns under power is
+    never disabled: it is braked instead.
+    """
+    power = power_state(state)
+    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP)
+    if wish is Wish.ENABLED:
+        if power is PowerState.QUICK_STOP:
+            word = control.quick_stop
+        elif state is not None and state.onward is not None and power is not PowerState.FAULT:
+            word = state.onward
+        else:
+            word = control.off
+    elif wish is Wish.QUICK_STOP:
+        # Also while it is merely ready: some drives show that while they still brake, and `off` would let them coast.
+        word = control.quick_stop if under_power or power is PowerState.READY else control.off
+    else:
+        word = control.quick_stop if under_power and turning else control.off
+    word |= control.torque_bits if mode is Mode.TORQUE else control.speed_bits
+    if reverse and control.reverse_bits is not None:
+        word |= control.reverse_bits
+    return word

@@ -1,0 +1,207 @@
+"""What preflight does last: measure what the line carries, and arm the watchdog, which wants feeding from then on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from drivers.drive import Limits
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus import pdu
+from drivers.modbus.access import Access
+from drivers.modbus.limits import write_setting
+from drivers.modbus.parameters import Parameters, show, where_of
+from drivers.modbus.rounds import Round
+from drivers.no_watchdog import ANY_CLIENT, DIES, SHARED_FLAG, settle
+from drivers.preflight import Table
+from profiles.modbus import ModbusProfile, Parameter
+
+LEAST_CYCLES = 5
+"""The watchdog must not bite on account of a lost reply or two."""
+MEASURED_ROUNDS = 20
+CARRIES, MARGIN = 1.02, 1.1
+"""The line carries a period that is this much longer than its slowest usual round; where it doesn't carry what was
+asked for, the period is longer by the second."""
+COUNT_S, COUNT_EVERY_S = 3.0, 0.2
+"""How long a drive that counts its requests is asked for other clients', and how often at least."""
+LEAST_TIMEOUT_S = 0.05
+"""For a reply in the cycle. A little late is better than lost: the sample then says how uncertain its time is."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast the cycle goes. ``timeout_s`` is for one transaction; ``usual_s`` is what a whole round takes."""
+
+    period_s: float
+    timeout_s: float
+    usual_s: float
+
+
+def measure_pace(
+    table: Table, line: str, asked_hz: float, watchdog_s: float, plan_text: str, go: Callable[[], Round],
+    now_s: Callable[[], float],
+) -> Pace:
+    """The longer of the asked period and what the line carries, measured over some rounds as they will be."""
+    took_s: list[float] = []
+    longest_s, failed = 0.0, 0
+    while len(took_s) < MEASURED_ROUNDS and failed < MEASURED_ROUNDS // 4:
+        begun_s = now_s()
+        try:
+            longest_s = max(longest_s, go().longest_s)
+        except CommunicationLost:
+            failed += 1
+            continue
+        took_s.append(now_s() - begun_s)
+    if len(took_s) < MEASURED_ROUNDS:
+        table.row(
+            "cycle rate", f"{asked_hz:g} Hz", f"{failed} of {failed + len(took_s)} cycles failed", False, line,
+            "The line is not good enough: check wiring, shielding, termination and baud rate",
+        )
+        return Pace(1.0 / asked_hz, LEAST_TIMEOUT_S, 1.0 / asked_hz)
+    # Four in five are faster: a few hiccups of the host must not slow the whole run down.
+    usual_s = sorted(took_s)[4 * len(took_s) // 5]
+    # To the µs; carried periods are rounded up, so that the line does carry them.
+    asked_us = round(1e6 / asked_hz)
+    slower = 1e6 * CARRIES * usual_s > asked_us
+    period_s = (math.ceil(1e6 * MARGIN * usual_s - 1e-6) if slower else asked_us) * 1e-6
+    text = f"{1.0 / period_s:.4g} Hz; {1e3 * usual_s:.3g} ms a cycle in {plan_text}"
+    if slower:
+        table.note("cycle rate", f"{text}: the line carries no {asked_hz:g} Hz", line)
+    else:
+        table.row("cycle rate", f"{asked_hz:g} Hz", text, True, line)
+    timeout_s = min(max(4.0 * longest_s, LEAST_TIMEOUT_S), 0.25 * watchdog_s)
+    return Pace(period_s, timeout_s, usual_s)
+
+
+def arm_watchdog(
+    table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float, found: Parameters,
+    period_s: float, feed: Callable[[], object],
+) -> bool:
+    """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back.
+
+    Whether it is armed. If not, that is refused, unless the operator accepts it and it is known to be off.
+    """
+    entry, accepted, tried = profile.watchdog, limits.accept_no_watchdog, Table()
+    if entry.kind == "none":
+        tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
+        return settle(table, tried, accepted, lambda: True)
+    table.note("watchdog reaction", entry.reaction.replace("_", " "), "profile, watchdog.reaction")
+    if limits.watchdog_s < LEAST_CYCLES * period_s:
+        table.row(
+            "watchdog time", f"at least {LEAST_CYCLES} cycles", f"{limits.watchdog_s:g} s", False, "limits.watchdog_s",
+            f"Give it at least {LEAST_CYCLES * period_s:.2g} s, or a faster line",
+        )
+        return False
+    if entry.parameter is None:
+        tried.row(
+            "watchdog", "armed and read back", "this profile doesn't say where its time stands", False, "profile",
+            "Name its parameter in the profile (watchdog.parameter): what can't be read back isn't known to be armed",
+        )
+        return settle(table, tried, accepted, lambda: True)
+    parameter = profile.parameter(entry.parameter)
+    value = found.values.get(parameter.name)
+    if value is None and not accepted:
+        return False        # refused already, where it was read
+    if value is None:
+        tried.row("watchdog", "armed and read back", "it can't be read", False, where_of(parameter))
+    elif parameter.set_to == "watchdog":
+        _write(tried, access, parameter, limits, rated_nm, found, feed)
+    else:
+        feed()
+        good = LEAST_CYCLES * period_s <= value <= limits.watchdog_s * (1.0 + 1e-9)
+        wanted = f"{LEAST_CYCLES * period_s:.2g} to {limits.watchdog_s:g} s"
+        tried.row("watchdog", wanted, show(value, parameter), good, where_of(parameter), parameter.advice or DIES)
+    return settle(table, tried, accepted, lambda: is_off(access, parameter, found.values))
+
+
+def check_who_feeds(
+    table: Table, access: Access, profile: ModbusProfile, limits: Limits, feed: Callable[[], object], *, simulated: bool
+) -> bool:
+    """A row of what feeds an armed watchdog; whether any other client does.
+
+    Then it is no answer to a dead host, so that is taken by name only: refused otherwise, but of a simulated peer.
+    Where the drive counts its requests, others' are told.
+    """
+    entry = profile.watchdog
+    sure = f"{entry.fed_by.replace('_', ' ')} ({entry.fed_by_confidence})"
+    if not entry.fed_by_any_client:
+        table.note("watchdog fed by", sure, "profile, watchdog.fed_by")
+        return False
+    accepted = limits.accept_shared_watchdog
+    others = _others_requests(access, profile, min(COUNT_EVERY_S, 0.25 * limits.watchdog_s), feed)
+    found = f"{sure}: {ANY_CLIENT}"
+    if others:
+        found += f". Another client is there: {others} requests of others in {COUNT_S:g} s"
+    elif others is None:
+        found += ". Whether one is there can't be known: this drive counts no requests"
+    else:
+        found += f". None asked it anything for {COUNT_S:g} s"
+    if accepted:
+        found += f"; accepted by {SHARED_FLAG}"
+    if simulated or accepted:
+        table.note("watchdog fed by", found, "profile, watchdog.fed_by")
+    else:
+        table.row(
+            "watchdog fed by", "this host alone, or its control word", found, False, "profile, watchdog.fed_by",
+            "Take every other client off the drive (PLC, panel, historian, gateway with several connections); then this"
+            f" drive is taken by name only: {SHARED_FLAG}. If its manual says what feeds its time-out, correct the"
+            " profile",
+        )
+    return True
+
+
+def _others_requests(
+    access: Access, profile: ModbusProfile, every_s: float, feed: Callable[[], object]
+) -> int | None:
+    """How many requests of others came in `COUNT_S`; None where the drive doesn't count them."""
+    def count() -> int:
+        register = profile.watchdog.request_counter
+        return access.read(register) if register is not None else access.once(pdu.count_requests(), 1.0).words[0]
+
+    try:
+        first, asked, clock = count(), access.asked, access.clock
+        last = first
+        until_s = clock.now_s() + COUNT_S
+        while clock.now_s() < until_s:
+            clock.wait_until(clock.now_s() + every_s)
+            feed()                     # it is armed already
+            last = count()
+    except (CommunicationLost, PreflightRefused):
+        return None
+    return max(0, (last - first) % 0x1_0000 - (access.asked - asked))
+
+
+def _write(
+    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, found: Parameters,
+    feed: Callable[[], object],
+) -> None:
+    if not write_setting(table, access, parameter, limits, rated_nm, found.values):
+        return
+    register = parameter.register_
+    assert register is not None
+    counts = access.read(register)
+
+    def fed() -> tuple[str, bool]:
+        feed()
+        back = access.read(register)
+        return f"{back} counts", back == counts and back > 0
+
+    wanted = f"{counts} counts, once it was fed"
+    table.attempt("watchdog", wanted, where_of(parameter), fed, parameter.advice or DIES)
+
+
+def is_off(access: Access, parameter: Parameter, told: Mapping[str, float]) -> bool:
+    """Does the time-out stand at 0, which switches it off, or does the drive refuse to tell it at all?
+
+    ``told``: values by name, for a time-out that has no register: a 0 that somebody has stated.
+    """
+    return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
+
+
+def counts_of(access: Access, parameter: Parameter) -> int | None:
+    """What stands in its register; None without one, or where the drive refuses to tell."""
+    try:
+        return None if parameter.register_ is None else access.read(parameter.register_)
+    except PreflightRefused:
+        return None

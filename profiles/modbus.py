@@ -1,0 +1,421 @@
+"""What a profile says of a drive on Modbus: registers, words, states, scales, what must be set, and how sure we are.
+
+Data only; the arithmetic stands in `drivers.modbus`, and once more, apart, in `sim_bus`. Addresses are those on the
+wire, counted from 0; ``reference`` repeats the manual's own way of writing them. A value in its unit is
+
+    raw x per_lsb [x value of the parameter named in ``times``]
+
+Every entry carries its ``source`` and its ``confidence``.
+"""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from profiles.entry import Confidence, Entry, Positive, ProfileName
+from profiles.model import DataModel, Finding, refuse_if
+from profiles.requirement import Require
+
+Address = Annotated[int, Field(ge=0, le=0xFFFF)]
+Word = Annotated[int, Field(ge=0, le=0xFFFF)]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+Unit = Literal["rpm", "rpm_s", "nm", "rated", "s", "hz", "kw", "none"]
+"""rated = share of the rated torque, which the parameter `ModbusProfile.rated_torque` or rig.yaml tells in N·m."""
+
+
+class Register(DataModel):
+    """Where a number stands. 32 bit: two registers, their order is `Line.word_order`."""
+
+    address: Address = Field(description="on the wire, counted from 0")
+    type: Literal["u16", "i16", "u32", "i32"] = Field(default="i16", description="how its bits are read")
+    table: Literal["holding", "input"] = Field(default="holding", description="function 3 or function 4")
+    reference: str | None = Field(default=None, description="as the manual writes it, such as 40111 or 16#2103")
+
+    @property
+    def count(self) -> int:
+        """How many registers it takes."""
+        return 2 if self.type in ("u32", "i32") else 1
+
+
+class Signal(Entry):
+    """One number of the cycle, with its unit."""
+
+    register_: Register = Field(alias="register")
+    per_lsb: Positive = Field(description="units for one count")
+    unit: Literal["rpm", "nm", "rated"]
+    times: Name | None = Field(default=None, description="parameter whose value multiplies it")
+    note: str | None = Field(default=None, description="what to know: why this one and not its smoothed twin, say")
+
+
+class Bits(DataModel):
+    """Bits of a word: they say yes where word & mask == value."""
+
+    mask: Word
+    value: Word
+
+
+class WordSignal(Entry):
+    """A word of bits in the cycle."""
+
+    register_: Register = Field(alias="register")
+
+
+class StatusState(DataModel):
+    """One state of the drive: seen where statusword & mask == value; the first of the list that fits counts."""
+
+    mask: Word
+    value: Word
+    means: Literal["not_ready", "off", "ready", "enabled", "quick_stop", "fault"] = Field(
+        description="off: no torque, nothing asked; ready: on the way; enabled: setpoints act; quick_stop: braking, "
+        "or holding afterwards"
+    )
+    onward: Word | None = Field(
+        default=None, description="controlword that leads from here towards enabled; null where none does"
+    )
+
+
+class Control(Entry):
+    """The words: what is sent towards each wish, and what the status means."""
+
+    family: Literal["cia402", "profidrive", "abb", "danfoss_fc", "yaskawa", "delta"] = Field(
+        description="whose bits these are; the simulator behaves as that family's manual says, not as this file does"
+    )
+    states: tuple[StatusState, ...] = Field(min_length=3)
+    off: Word = Field(description="disables a shaft at rest")
+    quick_stop: Word = Field(description="brakes to rest, under the drive's own speed control")
+    fault_reset: tuple[Word, ...] = Field(min_length=1, description="words sent one after the other to reset a fault")
+    speed_bits: Word = Field(default=0, description="set besides, in every word, while speed is regulated")
+    torque_bits: Word = Field(default=0, description="set besides, in every word, while torque is regulated")
+    reverse_bits: Word | None = Field(
+        default=None, description="set besides where the speed setpoint is negative and its register has no sign"
+    )
+    standstill: Bits | None = Field(default=None, description="statusword bits that say that the shaft is at rest")
+    limit_active: Bits | None = Field(default=None, description="statusword bits that say that a limit acts")
+    remote: Bits | None = Field(default=None, description="statusword bits that say that the field bus has control")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        seen = {state.means for state in self.states}
+        refuse_if(
+            [("states", f"none means {name}") for name in ("off", "enabled", "fault") if name not in seen]
+            + [("states", "none leads onward to enabled") for _ in [0] if all(s.onward is None for s in self.states)]
+        )
+        return self
+
+
+class ModeDisplay(DataModel):
+    """Where the drive says what it regulates."""
+
+    register_: Register = Field(alias="register")
+    mask: Word = 0xFFFF
+    speed: Word = Field(description="value under the mask in speed control")
+    torque: Word = Field(description="value under the mask in torque control")
+
+
+class ModeSwitch(Entry):
+    """Speed or torque."""
+
+    torque: bool = Field(description="can torque be regulated over the bus? false: speed-mode variant of the protocol")
+    by: Literal["control_bits", "register", "none"] = Field(
+        description="control_bits: speed_bits and torque_bits of `control`; register: write speed_value or torque_value"
+    )
+    register_: Register | None = Field(default=None, alias="register")
+    speed_value: Word | None = None
+    torque_value: Word | None = None
+    display: ModeDisplay | None = Field(default=None, description="null: the drive does not tell")
+    switch_while_enabled: bool = Field(description="may it change while operation is enabled?")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        findings: list[Finding] = []
+        if self.torque != (self.by != "none"):
+            findings.append(("by", "none where torque is false, and only there"))
+        given = [value is not None for value in (self.register_, self.speed_value, self.torque_value)]
+        if any(given) != (self.by == "register") or any(given) != all(given):
+            findings.append(("register", "register, speed_value and torque_value belong to by: register, all three"))
+        refuse_if(findings)
+        return self
+
+
+class QuickStop(Entry):
+    """What the quick-stop word does."""
+
+    decelerates_in_torque_mode: bool = Field(description="false: the host asks for speed mode at zero speed first")
+    ends: Literal["quick_stop", "off"] = Field(description="the state in which the drive is left once at rest")
+
+
+class Parameter(Entry):
+    """A setting of the drive: read in preflight, and checked, written, or used as a scale.
+
+    Without ``register`` it can't be read over the bus: rig.yaml must state it (drive_data.parameters.<name>).
+    """
+
+    name: Name
+    title: str = Field(min_length=3, description="the manual's number and name, such as '46.01 Speed scaling'")
+    register_: Register | None = Field(default=None, alias="register")
+    per_lsb: Positive = Field(default=1.0, description="units for one count")
+    times: Name | None = Field(default=None, description="parameter whose value multiplies it")
+    unit: Unit = "none"
+    default: float | None = Field(
+        default=None, description="factory setting, in its unit; what a simulated drive starts with"
+    )
+    require: Require | None = Field(
+        default=None, description="preflight refuses anything else; set by hand at the drive, this program never does"
+    )
+    set_to: Literal["speed_limit", "speed_limit_reverse", "torque_limit", "torque_limit_reverse", "watchdog",
+                    "quick_stop_time", "quick_stop_deceleration", "ramp_up_time"] | None = Field(
+        default=None,
+        description="limit of rig.yaml written here in preflight and read back; quick_stop_time: s from the speed "
+        "that 'times' names down to zero; ramp_up_time: s from rest up to it, as steep as the quick stop",
+    )
+    writable_in_operation: bool = Field(default=True, description="false: takes effect after a restart only")
+    advice: str | None = Field(default=None, description="what to do at the drive where it reads wrong")
+
+    @property
+    def factor(self) -> str | None:
+        """The parameter that multiplies this one: not the speed that a ramp time counts from or to."""
+        return None if self.set_to in ("quick_stop_time", "ramp_up_time") else self.times
+
+    @model_validator(mode="after")
+    def _one_use(self) -> Self:
+        findings: list[Finding] = []
+        if self.require is not None and self.set_to is not None:
+            findings.append(("set_to", "is checked by reading back already; leave 'require' out"))
+        if self.set_to is not None and self.register_ is None:
+            findings.append(("set_to", "needs a register"))
+        refuse_if(findings)
+        return self
+
+
+class ModbusWatchdog(Entry):
+    """What stops the drive when the host falls silent."""
+
+    kind: Literal["timeout", "none"]
+    parameter: Name | None = Field(default=None, description="the time-out; a parameter with set_to: watchdog, or one "
+                                   "that is read and must not be longer than rig.yaml's watchdog_s")
+    fed_by: Literal["any_request", "requests_of_this_connection", "writes", "writes_of_this_connection",
+                    "control_word", "control_word_of_this_connection", "unknown"] = Field(
+        default="unknown",
+        description="what restarts the time: any_request = whatever any client asks, reading included; writes = to any "
+        "register; control_word = to it or a setpoint; of_this_connection = only of the client that commands; "
+        "unknown counts as any_request",
+    )
+    fed_by_confidence: Confidence = Field(
+        default="unverified", description="of fed_by alone: while nobody has verified it, it counts as any_request"
+    )
+    reaction: Literal["quick_stop", "ramp_stop", "fault_reaction", "coast", "none"] = Field(
+        description="what the drive then does; coast = torque off and the shaft runs out"
+    )
+    reaction_parameter: Name | None = Field(default=None, description="parameter that chooses it, with 'require'")
+
+    request_counter: Register | None = Field(
+        default=None, description="counts the requests to this drive, whoever makes them; function 8 is tried besides"
+    )
+
+    @property
+    def fed_by_any_client(self) -> bool:
+        """Would a client that merely reads keep the drive running when this host has died, as far as anybody knows?"""
+        return self.kind != "none" and (
+            self.fed_by in ("any_request", "unknown") or self.fed_by_confidence == "unverified"
+        )
+
+    @property
+    def fed_by_us_alone(self) -> bool:
+        """Does this host's silence make it act, whatever other clients send?"""
+        return self.fed_by.endswith("_of_this_connection") and self.fed_by_confidence != "unverified"
+
+
+class ModbusFilter(Entry):
+    """The smoothing on a reported signal: read from a parameter, or as documented."""
+
+    signal: Literal["speed", "torque"]
+    parameter: Name | None = Field(default=None, description="parameter that holds it, in s or in hz (cut-off)")
+    documented_s: float | None = Field(default=None, ge=0, description="time constant in s, where it can't be changed")
+    advice: str | None = Field(default=None, description="the parameter to change for a better result")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.parameter is None) == (self.documented_s is None):
+            refuse_if([("parameter", "give this or documented_s, one of the two")])
+        return self
+
+
+class NamePlate(Entry):
+    """Three parameters that must fit P = T·ω: a wrong address, scale or word order in any of them doesn't."""
+
+    power: Name
+    speed: Name
+    torque: Name
+    tolerance: float = Field(default=0.1, gt=0, lt=1, description="relative; name plates are rounded")
+
+
+class Echo(Entry):
+    """A register of the drive's own in which a setpoint shows up again, written at standstill, disabled.
+
+    Worth most where it has a unit and a scale of its own: one that shares them with the setpoint can't tell them wrong.
+    """
+
+    setpoint: Literal["speed", "torque"]
+    register_: Register = Field(alias="register")
+    per_lsb: Positive
+    unit: Literal["rpm", "nm", "rated"]
+    times: Name | None = None
+
+
+class Temperature(Entry):
+    """Where the drive tells that something gets hot: warning bits, or a number with a limit."""
+
+    title: str = Field(min_length=3, description="the manual's number and name")
+    register_: Register = Field(alias="register")
+    too_hot: Bits | None = Field(default=None, description="bits that say so; the status word costs no request")
+    per_lsb: Positive = Field(default=1.0, description="units for one count")
+    unit: Literal["celsius", "share"] = Field(
+        default="celsius", description="celsius: held below limits.temperature_c of rig.yaml; share: of what is allowed"
+    )
+    at_most: Positive | None = Field(default=None, description="in its unit; with celsius, rig.yaml's may be lower")
+
+    @model_validator(mode="after")
+    def _limited(self) -> Self:
+        if self.unit == "share" and self.too_hot is None and self.at_most is None:
+            refuse_if([("at_most", "a share needs its limit")])
+        return self
+
+
+_NO_ECHO = Entry(
+    source="no register shows before motion what the drive has made of this setpoint; look its address, type, scale "
+    "and sign up in the manual",
+    confidence="unverified",
+)
+"""Stands where an echo is missing: no check at standstill can find that setpoint's entry wrong, so a person answers."""
+
+
+class Position(Entry):
+    """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right. Read only."""
+
+    register_: Register = Field(alias="register")
+    counts_per_turn: Positive = Field(description="counts for one turn of the motor; 1 for a counter of turns")
+    wrap_counts: Positive | None = Field(
+        default=None, description="counts after which it starts over; null = when its register is full"
+    )
+
+
+class ModbusCycle(Entry):
+    """The numbers of every cycle."""
+
+    control: WordSignal
+    status: WordSignal
+    speed_setpoint: Signal
+    torque_setpoint: Signal | None = None
+    speed: Signal
+    torque: Signal
+    torque_demand: Signal | None = None
+    functions: tuple[Literal[3, 4, 6, 8, 16, 23], ...] = Field(
+        min_length=1, description="function codes the drive knows"
+    )
+    largest_gap: int = Field(
+        default=0, ge=0, le=60, description="registers between two wanted ones that may be read along"
+    )
+    largest_read: int = Field(default=125, ge=1, le=125, description="registers in one read")
+    largest_write: int = Field(default=123, ge=1, le=123, description="registers in one write")
+    rate_hz: float = Field(default=20.0, gt=0, le=1000, description="cycles a second unless told otherwise")
+
+
+class Line(Entry):
+    """How the drive is reached, as it leaves the factory."""
+
+    transports: tuple[Literal["tcp", "rtu"], ...] = Field(min_length=1)
+    port: int = Field(default=502, ge=1, le=65535)
+    baud: int = Field(default=19200, ge=1200, le=1_000_000)
+    parity: Literal["N", "E", "O"] = "E"
+    stop_bits: Literal[1, 2] = 1
+    unit: int = Field(default=1, ge=0, le=247)
+    word_order: Literal["high_first", "low_first"] = "high_first"
+    turn_around_s: float = Field(default=0.005, ge=0, le=1, description="from the end of a request to its reply")
+
+
+class ModbusProfile(DataModel):
+    """One drive on Modbus."""
+
+    name: ProfileName = Field(description="vendor/model, as in --profile")
+    title: str = Field(min_length=3, description="one line for tables and reports")
+    bus: Literal["modbus"]
+    experimental: bool = Field(default=False, description="from second-hand sources throughout")
+    line: Line
+    control: Control
+    modes: ModeSwitch
+    quick_stop: QuickStop
+    cycle: ModbusCycle
+    position: Position | None = Field(
+        default=None,
+        description="the motor's angle, held against the reported speed; null = none, and the operator is asked what "
+        "he sees",
+    )
+    rated_torque: Name | None = Field(
+        default=None, description="parameter in nm that is 100 % torque; null: rig.yaml drive_data.rated_torque_nm"
+    )
+    watchdog: ModbusWatchdog
+    parameters: tuple[Parameter, ...] = ()
+    filters: tuple[ModbusFilter, ...] = ()
+    name_plate: NamePlate | None = None
+    echoes: tuple[Echo, ...] = ()
+    temperatures: tuple[Temperature, ...] = ()
+    hints: tuple[str, ...] = Field(default=(), description="what else to set or know, a line each, for `profiles show`")
+
+    @model_validator(mode="after")
+    def _refers(self) -> Self:
+        names = [parameter.name for parameter in self.parameters]
+        known = set(names)
+        findings: list[Finding] = [
+            ("parameters", f"'{name}' stands there twice") for name in sorted({n for n in names if names.count(n) > 1})
+        ]
+        wanted: list[tuple[str, str | None]] = [
+            ("rated_torque", self.rated_torque),
+            ("watchdog.parameter", self.watchdog.parameter),
+            ("watchdog.reaction_parameter", self.watchdog.reaction_parameter),
+        ]
+        for at in ("speed_setpoint", "torque_setpoint", "speed", "torque", "torque_demand"):
+            signal = getattr(self.cycle, at)
+            wanted.append((f"cycle.{at}.times", signal.times if signal else None))
+        wanted += [(f"filters.{number}.parameter", one.parameter) for number, one in enumerate(self.filters)]
+        wanted += [(f"parameters.{number}.times", one.times) for number, one in enumerate(self.parameters)]
+        wanted += [(f"echoes.{number}.times", one.times) for number, one in enumerate(self.echoes)]
+        if self.name_plate is not None:
+            wanted += [(f"name_plate.{part}", getattr(self.name_plate, part)) for part in ("power", "speed", "torque")]
+        findings += [(at, f"no parameter '{name}'") for at, name in wanted if name is not None and name not in known]
+        if self.modes.torque and self.cycle.torque_setpoint is None:
+            findings.append(("cycle.torque_setpoint", "needed where modes.torque is true"))
+        for number, one in enumerate(self.echoes):
+            setpoint = self.cycle.speed_setpoint if one.setpoint == "speed" else self.cycle.torque_setpoint
+            if setpoint is None:
+                findings.append((f"echoes.{number}.setpoint", f"this profile has no {one.setpoint} setpoint"))
+            elif setpoint.register_.type[0] == "i" and one.register_.type[0] == "u":
+                findings.append((f"echoes.{number}.register", "has no sign, and the setpoint that it shows has one"))
+        refuse_if(findings)
+        return self
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter of that name; KeyError if there is none (references are checked on loading)."""
+        return next(one for one in self.parameters if one.name == name)
+
+    def entries(self) -> tuple[tuple[str, Entry], ...]:
+        """(name, entry) of everything that carries a source and a confidence; a missing echo is one, unverified."""
+        found: list[tuple[str, Entry]] = [(name, part) for name, part in self if isinstance(part, Entry)]
+        found += [(f"cycle.{name}", part) for name, part in self.cycle if isinstance(part, Entry)]
+        found += [(f"parameters.{part.name}", part) for part in self.parameters]
+        found += [(f"filters.{part.signal}", part) for part in self.filters]
+        found += [(f"echoes.{part.setpoint}", part) for part in self.echoes]
+        found += [(f"temperatures.{number}", part) for number, part in enumerate(self.temperatures)]
+        found += [(f"echoes.{setpoint}", _NO_ECHO) for setpoint in self.unseen]
+        return tuple(found)
+
+    @property
+    def unseen(self) -> tuple[Literal["speed", "torque"], ...]:
+        """Setpoints of which the drive doesn't show, before motion, what it has made of them."""
+        used: tuple[Literal["speed", "torque"], ...] = ("speed", "torque") if self.modes.torque else ("speed",)
+        shown = {echo.setpoint for echo in self.echoes}
+        return tuple(setpoint for setpoint in used if setpoint not in shown)
+
+    def below(self, confidence: Confidence) -> tuple[str, ...]:
+        """Names of the entries of exactly this confidence."""
+        return tuple(name for name, part in self.entries() if part.confidence == confidence)

@@ -1,0 +1,167 @@
+"""Which CiA 402 object is what in the drive, and in which unit: of our own EDS unless a profile says otherwise.
+
+==========  =======================================================  ======================
+606B 606C 60FF 606D 606F   velocities and their windows                0.1 rpm (60A9h)
+6083 6084 6085             accelerations                               0.1 rpm/s
+6080                       max motor speed                             rpm
+6071 6072 6074 6077 60E0 60E1   torques                                ‰ of 6076h
+6064 · 608F                angle · its counts a turn                   increments
+6076 · 6075                rated torque · rated current                mN·m · mA
+6087                       torque slope                                ‰ of 6076h per second
+606E 6070                  times                                       ms
+==========  =======================================================  ======================
+"""
+
+from collections.abc import Callable
+from math import floor
+
+from canopen.sdo import SdoAbortedError
+
+from sim_bus.canopen.objects import ABORT_VALUE, ObjectStore, key_of
+from sim_bus.cia402 import Application, Settings
+from sim_bus.object_units import TURN, ObjectUnits, standard_units
+from sim_bus.reporting import RPM
+
+
+def clamped(value: float, bits: int) -> int:
+    """Rounded to the nearest integer that a signed field of ``bits`` can hold."""
+    top = (1 << bits - 1) - 1
+    return max(-top - 1, min(top, round(value)))
+
+
+def wrapped(counts: float, bits: int = 32, *, signed: bool = True) -> int:
+    """A counter of so many bits, which starts over when it is full."""
+    seen = floor(counts) % (1 << bits)
+    return seen - (1 << bits) if signed and seen >> (bits - 1) else seen
+
+
+def counts_per_turn(store: ObjectStore) -> float:
+    """608Fh as it stands once the drive has put its profile on, which may bring an encoder of its own."""
+    return store.default(key_of(0x608F, 1)) / max(1, store.default(key_of(0x608F, 2)))
+
+
+class ApplicationObjects:
+    """Binds an application's quantities to a store; ``setters`` are the fast ways in for RPDOs."""
+
+    def __init__(self, store: ObjectStore, application: Application, units: ObjectUnits | None = None) -> None:
+        self._application = application
+        self._units = units or standard_units(application.inverter.params.drive)
+        self._usual = standard_units(application.inverter.params.drive)
+        self._store = store
+        self.setters: dict[int, Callable[[int], None]] = {
+            key_of(0x6040): application.write_controlword,
+            key_of(0x6060): self._mode_by_pdo,
+            key_of(0x6071): self._set_target_torque,
+            key_of(0x60FF): self._set_target_velocity,
+            key_of(0x6042): self._set_target_velocity,
+        }
+        self._ratings()
+        self._bind_process_data()
+        self._bind_settings()
+        self._bind_limits()
+
+    def _ratings(self) -> None:
+        """The defaults that depend on the rig; the drive's own limits are also the highest that may be written."""
+        drive, store, units = self._application.inverter.params.drive, self._store, self._units
+        torque = min(65535, round(drive.torque_limit_nm / units.max_torque))
+        speed = max(1, round(drive.speed_limit_rpm * RPM / units.motor_speed))
+        store.set_default(0x6075, 0, round(1000.0 * drive.rated_current_a))
+        store.set_default(0x6076, 0, round(drive.rated_torque_nm / units.rated_torque))
+        store.set_default(0x6072, 0, torque)
+        store.set_default(0x6080, 0, speed)
+        store.variable(0x6072, 0).max = torque
+        store.variable(0x6080, 0).max = speed
+
+    def _bind_process_data(self) -> None:
+        application, store = self._application, self._store
+        live, hooks = store.live, store.hooks
+        control, reporting = application.inverter.control, application.inverter.reporting
+        units = self._units
+        velocity, target, actual = units.velocity, units.target_torque, units.actual_torque
+        live[key_of(0x6040)] = lambda: application.controlword
+        live[key_of(0x6041)] = application.statusword
+        live[key_of(0x6060)] = live[key_of(0x6061)] = lambda: application.mode.value
+        live[key_of(0x606B)] = self._velocity_demand
+        live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / velocity, 32)
+        live[key_of(0x6064)] = lambda: wrapped(application.inverter.state.angle_rad / TURN * counts_per_turn(store))
+        live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
+        live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
+        live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)
+        live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / velocity, 32)
+        live[key_of(0x6042)] = lambda: clamped(application.target_speed_rad_s / velocity, 16)
+        live[key_of(0x6044)] = lambda: clamped(reporting.speed_rad_s / velocity, 16)
+        hooks.update(self.setters)
+        hooks[key_of(0x6060)] = self._mode_by_sdo
+
+    def _bind_settings(self) -> None:
+        units, usual = self._units, self._usual
+        self._setting(0x6007, "connection_option", {0, 1, 2, 3})
+        self._setting(0x605A, "quick_stop_option", {0, 1, 2, 3, 5, 6, 7})
+        self._setting(0x605B, "shutdown_option", {0, 1})
+        self._setting(0x605C, "disable_option", {0, 1})
+        self._setting(0x605D, "halt_option", {1, 2, 3})
+        self._setting(0x605E, "fault_option", {0, 1, 2, 3})
+        self._scaled(0x606D, "window_rad_s", units.velocity, usual.velocity)
+        self._scaled(0x606E, "window_s", 0.001, 0.001)
+        self._scaled(0x606F, "standstill_rad_s", units.velocity, usual.velocity)
+        self._scaled(0x6070, "standstill_s", 0.001, 0.001)
+        self._scaled(0x6083, "accel_rad_s2", units.acceleration, usual.acceleration)
+        self._scaled(0x6084, "decel_rad_s2", units.deceleration, usual.deceleration)
+        self._scaled(0x6085, "quick_stop_rad_s2", units.quick_stop, usual.quick_stop)
+        self._scaled(0x6087, "torque_slope_nm_s", units.torque_slope, usual.torque_slope)
+
+    def _bind_limits(self) -> None:
+        """6072h bounds both directions, 60E0h and 60E1h one each; 6080h is the speed."""
+        store, limits, unit = self._store, self._application.inverter.control.limits, self._units.max_torque
+        speed_unit = self._units.motor_speed
+        present = {0x6072: 65535, 0x60E0: 65535, 0x60E1: 65535}
+
+        def torque(index: int) -> Callable[[int], None]:
+            def write(value: int) -> None:
+                present[index] = value
+                limits.torque_forward_nm = unit * min(present[0x6072], present[0x60E0])
+                limits.torque_reverse_nm = unit * min(present[0x6072], present[0x60E1])
+
+            return write
+
+        def speed(value: int) -> None:
+            limits.speed_rad_s = value * speed_unit
+
+        for index in present:
+            store.hooks[key_of(index)] = torque(index)
+        store.hooks[key_of(0x6080)] = speed
+
+    def _setting(self, index: int, name: str, allowed: set[int]) -> None:
+        settings: Settings = self._application.settings
+
+        def write(value: int) -> None:
+            if value not in allowed:
+                raise SdoAbortedError(ABORT_VALUE)
+            setattr(settings, name, value)
+
+        self._store.hooks[key_of(index)] = write
+
+    def _scaled(self, index: int, name: str, unit: float, usual: float) -> None:
+        """One rate or window; its default is that of our own EDS, in another unit another number, at least 1."""
+        settings: Settings = self._application.settings
+        if unit != usual:
+            counts = self._store.default(key_of(index)) * usual / unit
+            self._store.set_default(index, 0, max(1, min(0xFFFF, round(counts))))
+        self._store.hooks[key_of(index)] = lambda value: setattr(settings, name, value * unit)
+
+    def _velocity_demand(self) -> int:
+        control = self._application.inverter.control
+        return clamped(control.speed_reference_rad_s / self._units.velocity, 32)
+
+    def _mode_by_sdo(self, code: int) -> None:
+        if not self._application.set_mode(code):
+            raise SdoAbortedError(ABORT_VALUE)
+
+    def _mode_by_pdo(self, code: int) -> None:
+        self._application.set_mode(code)      # an unsupported one is ignored: 6061h keeps showing the old one
+
+    def _set_target_torque(self, counts: int) -> None:
+        self._application.target_torque_nm = counts * self._units.target_torque
+
+    def _set_target_velocity(self, counts: int) -> None:
+        self._application.target_speed_rad_s = counts * self._units.velocity

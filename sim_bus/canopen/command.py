@@ -1,0 +1,125 @@
+"""The command ``simulate canopen``: its options, and running it."""
+
+import argparse
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from sim_bus.command_arguments import (
+    EXIT_OK,
+    Unusable,
+    add_fault_argument,
+    add_rig_arguments,
+    host_and_port,
+    never_came,
+    number_from,
+    ready,
+    until_stopped,
+)
+
+if TYPE_CHECKING:
+    import can
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of a simulated CANopen drive; python-can's bus options among them."""
+    from can.cli import add_bus_arguments
+
+    add_bus_arguments(parser)
+    group = parser.add_argument_group("simulated drive")
+    group.add_argument("--hub", metavar="HOST:PORT", type=host_and_port,
+                       help="open a socketcand hub there and be on it; port 0 takes any free one")
+    group.add_argument("--node", metavar="N", type=number_from(1, 127, "a node ID"), default=1,
+                       help="node ID, 1 to 127 (default 1)")
+    group.add_argument("--profile", metavar="NAME",
+                       help="the drive to be: a profile that ships, or a YAML file (default: our own EDS)")
+    add_rig_arguments(group)
+    add_fault_argument(group, "heartbeat-lost@hold+2s")
+    group.add_argument("--stepped", action="store_true", help="plant time moves with SYNC, by the period of 1006h")
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    if "list" in namespace.fault:
+        from sim_bus.fault_catalogue import listing
+
+        print(listing())  # noqa: T201
+        return EXIT_OK
+
+    def simulate(stop: threading.Event) -> None:
+        from profiles.library import load_canopen_profile
+        from sim_bus.canopen.simulator import Simulator
+        from sim_bus.fault_catalogue import parse_all
+        from sim_bus.params import RigParams, load_rig
+
+        faults = parse_all(namespace.fault)
+        profile = load_canopen_profile(namespace.profile) if namespace.profile is not None else None
+        params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+        with _open_bus(namespace) as (bus, reached_by):
+            simulator = Simulator(
+                bus, params, node_id=namespace.node, seed=namespace.seed, trace=namespace.trace,
+                stepped=namespace.stepped, profile=profile, faults=faults,
+            )
+            worn = f" profile {profile.name}" if profile is not None else ""
+            ready(f"{reached_by} node {namespace.node}{worn}")
+            simulator.run(stop)
+            never_came(simulator.faults_waiting)
+
+    return until_stopped(simulate)
+
+
+@contextlib.contextmanager
+def _open_bus(namespace: argparse.Namespace) -> Iterator[tuple["can.BusABC", str]]:
+    """The bus, and how others reach it."""
+    bus, reached_by = _hub_bus(*namespace.hub) if namespace.hub is not None else _can_bus(namespace)
+    try:
+        yield bus, reached_by
+    finally:
+        bus.shutdown()
+
+
+def _hub_bus(host: str, port: int) -> tuple["can.BusABC", str]:
+    from sim_bus.canopen.socketcand import Hub
+    from sim_bus.hub_port import HubPort
+
+    try:
+        hub = Hub(host, port)
+    except OSError as error:
+        raise Unusable(f"can't open a hub at {host}:{port}: {error.strerror or error}") from error
+    return HubPort(hub), f"socketcand {hub.host}:{hub.port} channel {hub.channel}"
+
+
+def _can_bus(namespace: argparse.Namespace) -> tuple["can.BusABC", str]:
+    from can.cli import create_bus_from_namespace
+
+    if not hasattr(namespace, "interface") and not hasattr(namespace, "channel") and not _configured():
+        raise Unusable("no bus: give -i and -c, or --hub HOST:PORT, or configure python-can")
+    given = dict(getattr(namespace, "bus_kwargs", None) or {})
+    if getattr(namespace, "interface", None) == "socketcand" and {"host", "port"} <= given.keys():
+        _probe(str(given["host"]), int(given["port"]))
+    try:
+        bus = create_bus_from_namespace(namespace)
+    except argparse.ArgumentError as error:
+        raise Unusable(f"can't open the bus: {error.__cause__ or error}") from error
+    return bus, bus.channel_info
+
+
+def _configured() -> bool:
+    """python-can finds an interface in its files or in CAN_* variables."""
+    import can.util
+
+    try:
+        can.util.load_config()
+    except can.CanInterfaceNotImplementedError:
+        return False
+    return True
+
+
+def _probe(host: str, port: int) -> None:
+    """python-can would try for ten seconds, at full load, to reach a server that isn't there."""
+    try:
+        socket.create_connection((host, port), timeout=2.0).close()
+    except OSError as error:
+        raise Unusable(f"no socketcand server at {host}:{port}: {error.strerror or error}") from error

@@ -1,0 +1,160 @@
+"""A stepped simulator in the host's own thread: no other thread, and no wait for one.
+
+::
+
+    host   bus.send(SYNC) ──► the drive hears it, answers, and moves on by a period
+                          ◄── returns
+           bus.recv()     ◄── TPDO1, TPDO2, heartbeat …, in the order in which the drive said them
+
+All that a frame makes the drive say lies in the stations' queues when `send` returns. Which cycle an answer belongs to
+then doesn't depend on how a computer shares its time, and a run repeats to the last frame of its log. The drive is
+that of `sim_bus.canopen.simulator.EmbeddedSimulator`: it says the same in the same order.
+
+Plant time moves with the SYNC alone, and a host that pauses, however long, changes nothing, as there: nobody else is
+here to move time on. A drive that is taken out of stepped time (5FFEh:2) catches up with the wall clock whenever it
+hears something.
+"""
+
+import time
+import uuid
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Lock
+from typing import Self
+
+import can
+
+from profiles.canopen import CanopenProfile
+from sim_bus.canopen.simulator import Embedded, Simulator
+from sim_bus.fault_script import Scripted
+from sim_bus.params import RigParams
+
+
+class InlineBus(can.BusABC):
+    """A station on the line of an `InlineSimulator`, which makes it."""
+
+    def __init__(self, channel: str, stations: "list[InlineBus]", hear: Callable[[can.Message], None]) -> None:
+        super().__init__(channel)
+        self.channel_info = f"Virtual bus channel {channel}"
+        self._stations = stations
+        self._hear = hear
+        self.heard: SimpleQueue[can.Message] = SimpleQueue()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """The other stations have it and the drive has answered it. CanOperationError on a bus that is shut down."""
+        self._refuse_shut()
+        if len(self._stations) > 1:
+            for station in self._stations:
+                if station is not self:
+                    station.heard.put(_stamped(deepcopy(msg)))
+        self._hear(msg)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The next frame; None after ``timeout`` s of wall time. CanOperationError on a bus that is shut down."""
+        if self._filters is None and not self._is_shutdown:
+            if not self.heard.empty():
+                return self.heard.get_nowait()
+            if timeout is not None and timeout <= 0.0:
+                return None
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        self._refuse_shut()
+        try:
+            return self.heard.get(timeout=None if timeout is None else max(0.0, timeout)), False
+        except Empty:
+            return None, False
+
+    def shutdown(self) -> None:
+        """Nothing comes or goes any more; safe to repeat."""
+        super().shutdown()
+        if self in self._stations:
+            self._stations.remove(self)
+
+    def _refuse_shut(self) -> None:
+        if self._is_shutdown:
+            raise can.CanOperationError("Cannot operate on a closed bus")
+
+
+class _DrivesEnd(InlineBus):
+    """Where the drive sends. It hears nothing here: a frame is handed to it as it is sent."""
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """All stations have it; the first one itself, as the drive makes a frame for one sending only."""
+        for number, station in enumerate(self._stations):
+            station.heard.put(_stamped(deepcopy(msg) if number else msg))
+
+
+def _stamped(message: can.Message) -> can.Message:
+    message.timestamp = time.time()
+    return message
+
+
+class InlineSimulator(Embedded):
+    """A stepped simulator that acts whenever a station sends; ``bus`` is one, and `station` makes more.
+
+    What fails in it leaves it silent, as a thread is that has ended, and is raised by `check` and `close`. An exception
+    from outside (KeyboardInterrupt) goes on its way, and nothing more is taken then: it may have come in the middle of
+    a step.
+    """
+
+    def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
+                 profile: CanopenProfile | None = None, faults: tuple[Scripted, ...] = ()) -> None:
+        super().__init__()
+        self.channel = f"tdhil-{uuid.uuid4().hex}"
+        self._stations: list[InlineBus] = []
+        self._drives_end = _DrivesEnd(self.channel, self._stations, self._hear)
+        self.simulator = Simulator(
+            self._drives_end, params or RigParams(), node_id=node_id, seed=seed, trace=trace, stepped=True,
+            profile=profile, faults=faults,
+        )
+        self._one_at_a_time = Lock()
+        self._on = self._cut_short = False
+        self.bus = self.station()
+
+    def station(self) -> InlineBus:
+        """Another bus to it; what was said before isn't heard there."""
+        bus = InlineBus(self.channel, self._stations, self._hear)
+        self._stations.append(bus)
+        return bus
+
+    def open(self) -> Self:
+        """Powers the drive on; frames sent before are lost."""
+        with self._one_at_a_time:
+            self._on = True
+            self._do(self.simulator.begin)
+        return self
+
+    def _end(self) -> None:
+        try:
+            with self._one_at_a_time:
+                if self._on:
+                    self._do(self.simulator.end)
+                self._off()
+        finally:
+            for bus in (*self._stations, self._drives_end):
+                bus.shutdown()
+
+    def _hear(self, message: can.Message) -> None:
+        with self._one_at_a_time:
+            if self._on:
+                self._do(self.simulator.hear, message)
+            elif self._cut_short:
+                raise can.CanOperationError("the simulated drive was interrupted")
+
+    def _do(self, act: Callable[..., None], *what: can.Message) -> None:
+        try:
+            act(*what)
+        except Exception as error:
+            self._failure = error
+            self._off()
+        except BaseException:
+            self._cut_short = True
+            self._off()
+            raise
+
+    def _off(self) -> None:
+        self._on = False
+        self.simulator.close_trace()

@@ -1,0 +1,309 @@
+"""The drive's CANopen face: NMT, SYNC, PDOs, heartbeat, EMCY, marker, and plant time.
+
+One thread calls `on_frame` and `advance_us`; nothing here waits or reads a clock. In stepped time a SYNC
+
+1. lets latched synchronous RPDOs act, 2. samples the reported values, 3. sends the synchronous TPDOs,
+4. advances the plant by exactly 1006h (µs), in equal steps of at most the control period.
+"""
+
+from collections.abc import Callable
+from importlib.resources import files
+from struct import error as StructError
+
+import numpy as np
+from canopen.objectdictionary import datatypes
+
+from profiles.canopen import CanopenProfile
+from profiles.simulator_marker import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
+from sim_bus import emergency as emcy
+from sim_bus.canopen.application_objects import ApplicationObjects
+from sim_bus.canopen.objects import ObjectStore, key_of
+from sim_bus.canopen.pdo import ReceivePdo, TransmitPdo
+from sim_bus.canopen.profile_emulation import WornProfile
+from sim_bus.canopen.sender import PassiveNetwork, Sender
+from sim_bus.canopen.services import Nmt, NmtCommand, NmtState
+from sim_bus.cia402 import Application
+from sim_bus.emergency import Emergency
+from sim_bus.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from sim_bus.inverter import Inverter
+from sim_bus.node_guarding import LifeGuard
+from sim_bus.params import RigParams
+from sim_bus.trace import ROW_PERIOD_US, Trace
+
+SYNC = 0x080
+COMMUNICATION_AREA = (0x1000, 0x1FFF)
+PROFILE_AREA = (0x6000, 0x9FFF)
+MANUFACTURER_AREA = (0x2000, 0x5FFD)      # the marker stays as it is
+Route = Callable[[bytes | bytearray], None]
+
+
+def _ignore(_number: int) -> None:
+    pass
+
+
+def generic_eds() -> str:
+    """The path of our own EDS."""
+    return str(files("profiles") / "generic" / "cia402.eds")
+
+
+class Cia402Node:
+    """A CiA 402 slave over a simulated inverter; of our own EDS, or wearing a ``profile``."""
+
+    def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: Trace,
+                 stepped: bool, profile: CanopenProfile | None = None) -> None:
+        self.id = node_id
+        self.time_us = 0
+        self.stepped = stepped
+        self.sync_seen = False
+        self.trace = trace
+        self.on_time: Callable[[int], None] = _ignore       # plant time in µs, before each piece of it
+        self.on_stage: Callable[[int], None] = _ignore      # the host says that a stage begins
+        self._send = sender.send
+        self._next_row_us = 0
+        self.inverter = Inverter(params, np.random.default_rng(seed))
+        self.application = Application(self.inverter)
+        self.store = ObjectStore(node_id, generic_eds())
+        self.network = PassiveNetwork(sender)
+        self.network.add_node(self.store)
+        self.emergency = Emergency(self.store, lambda data: sender.send(0x080 + node_id, data))
+        self.worn = WornProfile(profile, self.application) if profile is not None else None
+        self._guard = LifeGuard()
+        self._objects = ApplicationObjects(self.store, self.application, self.worn.units if self.worn else None)
+        if self.worn is not None:
+            self.worn.dress(self.store, self._guard, self._set_period)
+        self._receive = [
+            ReceivePdo(self.store, n, self._objects.setters, self._route, self._short_pdo) for n in range(4)
+        ]
+        self._transmit = [TransmitPdo(self.store, n, self._route) for n in range(4)]
+        self.nmt = Nmt()
+        self._operational = False
+        self._producer = HeartbeatProducer()
+        self._consumer = HeartbeatConsumer()
+        self._routes: dict[int, Route] = {}
+        self._sync_receive: list[ReceivePdo] = []
+        self._sync_transmit: list[TransmitPdo] = []
+        self._event_transmit: list[TransmitPdo] = []
+        self._period_us = 0
+        self._bind()
+        self.application.on_event = self.note
+        self.application.on_fault_reset = self.emergency.reset
+
+    # -- frames ------------------------------------------------------------------------------------------
+
+    def on_frame(self, can_id: int, data: bytes | bytearray) -> None:
+        """One data frame with an 11-bit identifier."""
+        if can_id == SYNC:
+            self._on_sync()
+            return
+        route = self._routes.get(can_id)
+        if route is not None:
+            route(data)
+
+    def on_remote(self, can_id: int) -> None:
+        """One remote frame: node guarding is answered by a drive that has it and produces no heartbeat of its own."""
+        guarded = self.worn is not None and self.worn.profile.watchdog.kind == "node_guarding"
+        if can_id != 0x700 + self.id or not guarded or self._producer.active:
+            return
+        self._send(can_id, self._guard.answer(self.nmt.state.value))
+        if self._guard.asked(self.time_us):
+            self._supervised("node guarding began")
+
+    def boot(self) -> None:
+        """Power-on: everything at its defaults, boot-up message, pre-operational."""
+        self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
+        self.note("power on")
+        self.on_time(self.time_us)
+        self._send(0x700 + self.id, b"\0")
+        self.nmt.state = NmtState.PRE_OPERATIONAL
+        self._changed_state()
+
+    def pass_cycle(self) -> None:
+        """A SYNC that the drive did not hear: nothing happens, but in stepped time it is one period later."""
+        self.sync_seen = True
+        if self.stepped and self._period_us:
+            self.advance_us(self._period_us)
+
+    def _on_sync(self) -> None:
+        self.sync_seen = True
+        if self._operational:
+            for receive in self._sync_receive:
+                receive.on_sync()
+            for transmit in self._sync_transmit:
+                data = transmit.at_sync()
+                if data is not None:
+                    self._send(transmit.can_id, data)
+        if self.stepped and self._period_us:
+            self.advance_us(self._period_us)
+
+    def _on_nmt(self, data: bytes | bytearray) -> None:
+        if len(data) < 2 or data[1] not in {0, self.id}:
+            return
+        before = self.nmt.state
+        command = self.nmt.obey(data[0])
+        if command is None:
+            return
+        if command in {NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION}:
+            if command is NmtCommand.RESET_NODE:
+                self.application.power_off()
+                self._restore(COMMUNICATION_AREA, MANUFACTURER_AREA, PROFILE_AREA)
+            else:
+                self._connection_lost()
+                self._restore(COMMUNICATION_AREA)
+            self._guard.reset()
+            self.note(f"NMT {command.name.lower().replace('_', ' ')}")
+            self._send(0x700 + self.id, b"\0")
+            self.nmt.state = NmtState.PRE_OPERATIONAL
+        elif self.nmt.state is before:
+            return
+        elif self.nmt.state is NmtState.STOPPED:
+            self._connection_lost()
+        self._changed_state()
+
+    def _on_sdo(self, data: bytes | bytearray) -> None:
+        if self.nmt.state is NmtState.STOPPED:
+            return
+        try:
+            self.network.notify(0x600 + self.id, bytearray(data), 0.0)
+        except (StructError, IndexError, TypeError) as error:     # malformed: canopen fails while aborting
+            self.note(f"SDO request not understood: {error}")
+        self._send_events()
+
+    def _on_heartbeat(self, _data: bytes | bytearray) -> None:
+        if self._consumer.beat(self.time_us):
+            self._supervised("heartbeat supervision began")
+
+    def _supervised(self, event: str) -> None:
+        """The host is there, for the first time or again."""
+        self.note(event)
+        if self.application.warning:
+            self.application.warning = False
+            if not self._faulted():
+                self.emergency.reset()
+
+    # -- time --------------------------------------------------------------------------------------------
+
+    def advance_us(self, duration_us: int) -> None:
+        """The plant, and all that is timed, moves on."""
+        application, inverter = self.application, self.inverter
+        self.on_time(self.time_us)
+        application.regulate()
+        count, dt_s = inverter.steps(duration_us * 1e-6)
+        begin_us = self.time_us
+        for number in range(1, count + 1):
+            application.step(dt_s)
+            self.time_us = begin_us + duration_us * number // count
+            if self.time_us >= self._next_row_us:
+                self._next_row_us = (self.time_us // ROW_PERIOD_US + 1) * ROW_PERIOD_US
+                self.trace.row(
+                    self.time_us * 1e-6, inverter.state.speed_rad_s, inverter.torque_nm, application.state.value,
+                )
+        if self._consumer.expired(self.time_us):
+            self._host_lost("host heartbeat lost")
+        if self._guard.expired(self.time_us):
+            self._host_lost("host's node guarding lost")
+        if self._producer.due(self.time_us) and self.nmt.state is not NmtState.INITIALISING:
+            self._send(0x700 + self.id, bytes([self.nmt.state.value]))
+        self._send_events()
+
+    def note(self, event: str) -> None:
+        """An event, or a change of state where ``event`` is empty, for the trace."""
+        self.trace.row(
+            self.time_us * 1e-6, self.inverter.state.speed_rad_s, self.inverter.torque_nm,
+            self.application.state.value, event or f"state: {self.application.state.value}",
+        )
+
+    def _send_events(self) -> None:
+        if self._operational:
+            for transmit in self._event_transmit:
+                data = transmit.on_event(self.time_us)
+                if data is not None:
+                    self._send(transmit.can_id, data)
+
+    # -- the connection ----------------------------------------------------------------------------------
+
+    def _host_lost(self, event: str) -> None:
+        """The host fell silent: EMCY 8130h, the reaction of 6007h, and 1029h:1 for the NMT state."""
+        self.note(event)
+        self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
+        self.application.warning = True
+        self.application.abort_connection()
+        behaviour = self.store.number(key_of(0x1029, 1))
+        if self.nmt.state is NmtState.OPERATIONAL and behaviour != 1:
+            self.nmt.state = NmtState.STOPPED if behaviour == 2 else NmtState.PRE_OPERATIONAL
+            self._changed_state()
+
+    def _connection_lost(self) -> None:
+        """NMT took the connection away: the reaction of 6007h where torque may flow, no EMCY beside that of a fault."""
+        if not self.application.energised:
+            return
+        self.application.abort_connection()
+        if self._faulted():
+            self.emergency.report(emcy.HEARTBEAT_LOST, emcy.COMMUNICATION)
+
+    def _faulted(self) -> bool:
+        return self.application.state.name.startswith("FAULT")
+
+    def _short_pdo(self) -> None:
+        self.emergency.report(emcy.PDO_TOO_SHORT, emcy.COMMUNICATION, lasting=False)
+
+    # -- configuration -----------------------------------------------------------------------------------
+
+    def _bind(self) -> None:
+        hooks, live = self.store.hooks, self.store.live
+        hooks[key_of(0x1006)] = self._set_period
+        hooks[key_of(0x1016, 1)] = self._set_consumer
+        hooks[key_of(0x1017)] = self._producer.configure
+        hooks[key_of(MARKER_INDEX, 2)] = self._set_stepped
+        live[key_of(MARKER_INDEX, 2)] = lambda: int(self.stepped)
+        self.store.add(MARKER_INDEX, MARKER_STAGE, datatypes.UNSIGNED8, writable=True, mappable=False, name="Stage")
+        self.store.values[key_of(MARKER_INDEX, MARKER_STAGE)] = 0
+        hooks[key_of(MARKER_INDEX, MARKER_STAGE)] = self._set_stage
+        self.store.values[key_of(MARKER_INDEX, 0)] = max(self.store.object_dictionary[MARKER_INDEX].subindices)
+        self.store.values[key_of(MARKER_INDEX, 1)] = MARKER_TEXT
+
+    def _set_period(self, period_us: int) -> None:
+        self._period_us = period_us
+
+    def _set_stepped(self, value: int) -> None:
+        if bool(value) is not self.stepped:
+            self.stepped = bool(value)
+            self.note("stepped time" if value else "own time")
+
+    def _set_stage(self, number: int) -> None:
+        self.note(f"stage {number}")
+        self.on_stage(number)
+
+    def _set_consumer(self, value: int) -> None:
+        self._consumer.configure(value)
+        self._route()
+
+    def _restore(self, *areas: tuple[int, int]) -> None:
+        for pdo in (*self._receive, *self._transmit):
+            pdo.clear()
+        for first, last in areas:
+            self.store.restore(first, last)
+        for pdo in (*self._receive, *self._transmit):
+            pdo.load()
+        if PROFILE_AREA in areas:
+            self.application.warning = False
+            self.emergency.forget()
+
+    def _changed_state(self) -> None:
+        self._operational = self.nmt.state is NmtState.OPERATIONAL
+        self.note(f"NMT {self.nmt.state.name.lower().replace('_', '-')}")
+        self._route()
+        self._send_events()
+
+    def _route(self) -> None:
+        """Which identifier goes where; built anew whenever a PDO, the consumer or the NMT state changes."""
+        routes: dict[int, Route] = {}
+        if self._consumer.cob_id >= 0:
+            routes[self._consumer.cob_id] = self._on_heartbeat
+        if self._operational:
+            routes.update({pdo.can_id: pdo.receive for pdo in self._receive if pdo.valid})
+        routes[0x600 + self.id] = self._on_sdo
+        routes[0x000] = self._on_nmt
+        self._routes = routes
+        self._sync_receive = [pdo for pdo in self._receive if pdo.valid and pdo.synchronous]
+        self._sync_transmit = [pdo for pdo in self._transmit if pdo.valid and pdo.synchronous]
+        self._event_transmit = [pdo for pdo in self._transmit if pdo.valid and not pdo.synchronous]

@@ -1,0 +1,266 @@
+"""PDOs of the drive: configuration by SDO (CiA 301, 14xxh to 1Axxh) and a compiled fast path for the data.
+
+::
+
+    COB-ID (sub 1)     bit 31: 1 = PDO does not exist · bit 30: no RTR (TPDO) · bit 29: must be 0 · bits 0..10 CAN-ID
+    type (sub 2)       0 at the next SYNC after a change · 1..240 every n-th SYNC · 254, 255 by event
+    mapping entry      index << 16 | subindex << 8 | bits
+
+Remapping as CiA 301 asks: bit 31 set, count 0, entries, count, bit 31 cleared; everything else is refused.
+"""
+
+from collections.abc import Callable
+from struct import Struct
+
+from canopen.objectdictionary import datatypes
+from canopen.sdo import SdoAbortedError
+
+from sim_bus.canopen import objects as od
+from sim_bus.canopen.objects import ObjectStore, key_of
+
+INVALID = 1 << 31
+EXTENDED = 1 << 29
+_FORMATS = {
+    datatypes.INTEGER8: "b", datatypes.UNSIGNED8: "B", datatypes.INTEGER16: "h", datatypes.UNSIGNED16: "H",
+    datatypes.INTEGER32: "i", datatypes.UNSIGNED32: "I", datatypes.REAL32: "f",
+}
+_LAST_DUMMY = 0x0007
+Setter = Callable[[int], None]
+Getter = Callable[[], float]
+
+
+class Pdo:
+    """One PDO's configuration; a subclass compiles it."""
+
+    receives = False
+
+    def __init__(self, store: ObjectStore, communication: int, mapping: int, on_change: Callable[[], None]) -> None:
+        self.store = store
+        self.cob_id = INVALID
+        self.transmission = 255
+        self.count = 0
+        self.entries = [0] * 8
+        self._on_change = on_change
+        live, hooks = store.live, store.hooks
+        live[key_of(communication, 1)] = lambda: self.cob_id
+        live[key_of(communication, 2)] = lambda: self.transmission
+        live[key_of(mapping, 0)] = lambda: self.count
+        hooks[key_of(communication, 1)] = self._set_cob_id
+        hooks[key_of(communication, 2)] = self._set_transmission
+        hooks[key_of(mapping, 0)] = self._set_count
+        for number in range(8):
+            self._bind_entry(key_of(mapping, number + 1), number)
+        self._communication, self._mapping = communication, mapping
+
+    def _bind_entry(self, key: int, number: int) -> None:
+        self.store.live[key] = lambda: self.entries[number]
+        self.store.hooks[key] = lambda value: self._set_entry(number, value)
+
+    @property
+    def valid(self) -> bool:
+        """It exists: bit 31 of its COB-ID is clear."""
+        return not self.cob_id & INVALID
+
+    @property
+    def can_id(self) -> int:
+        """Its CAN identifier."""
+        return self.cob_id & 0x7FF
+
+    @property
+    def synchronous(self) -> bool:
+        """It acts at SYNC."""
+        return self.transmission <= 240
+
+    def clear(self) -> None:
+        """Makes it not exist, with nothing mapped."""
+        self.cob_id, self.count = INVALID, 0
+        self.compile()
+
+    def load(self) -> None:
+        """Takes the defaults of the object dictionary."""
+        default = self.store.default
+        self.entries = [default(key_of(self._mapping, number + 1)) for number in range(8)]
+        self.count = default(key_of(self._mapping, 0))
+        self.transmission = default(key_of(self._communication, 2))
+        self.cob_id = default(key_of(self._communication, 1))
+        self.compile()
+        self._on_change()
+
+    def compile(self) -> None:
+        """Builds the fast path from the mapping."""
+        raise NotImplementedError
+
+    def _set_cob_id(self, value: int) -> None:
+        if value & EXTENDED or value & 0x1FFFF800 or not value & (INVALID | 0x7FF):
+            raise SdoAbortedError(od.ABORT_VALUE)
+        if self.valid and not value & INVALID and value & 0x7FF != self.can_id:
+            raise SdoAbortedError(od.ABORT_VALUE)      # an existing PDO must be switched off to get another ID
+        self.cob_id = value
+        self.compile()
+        self._on_change()
+
+    def _set_transmission(self, value: int) -> None:
+        if 240 < value < 254:
+            raise SdoAbortedError(od.ABORT_VALUE)
+        self.transmission = value
+        self.compile()
+        self._on_change()
+
+    def _set_count(self, value: int) -> None:
+        if self.valid and value != self.count:
+            raise SdoAbortedError(od.ABORT_STATE)
+        bits = 0
+        for entry in self.entries[:value]:
+            self._check(entry)
+            bits += entry & 0xFF
+        if bits > 64:
+            raise SdoAbortedError(od.ABORT_PDO_TOO_LONG)
+        self.count = value
+        self.compile()
+
+    def _set_entry(self, number: int, value: int) -> None:
+        if self.valid or self.count:
+            raise SdoAbortedError(od.ABORT_STATE)
+        if value:
+            self._check(value)
+        self.entries[number] = value
+
+    def _check(self, entry: int) -> None:
+        index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
+        variable = self.store.variable(index, subindex)
+        if index <= _LAST_DUMMY:
+            mappable = self.receives
+        else:
+            mappable = variable.pdo_mappable and (variable.writable if self.receives else variable.readable)
+        if not mappable or variable.data_type not in _FORMATS or bits != len(variable):
+            raise SdoAbortedError(od.ABORT_NOT_MAPPABLE)
+
+    def _layout(self) -> tuple[Struct, list[int]]:
+        """The frame's layout and the keys in it."""
+        keys = [entry >> 8 for entry in self.entries[: self.count]]
+        formats = [_FORMATS[self.store.variable(key >> 8, key & 0xFF).data_type] for key in keys]
+        return Struct("<" + "".join(formats)), keys
+
+
+class ReceivePdo(Pdo):
+    """Host to drive. ``setters`` are the fast ways in; other objects are written through the store."""
+
+    receives = True
+
+    def __init__(self, store: ObjectStore, number: int, setters: dict[int, Setter], on_change: Callable[[], None],
+                 on_short: Callable[[], None]) -> None:
+        self._fast = setters
+        self._setters: list[Setter] = []
+        self._struct = Struct("<")
+        self._on_short = on_short
+        self._latched: bytes | bytearray | None = None
+        self._acts_at_sync = False
+        super().__init__(store, 0x1400 + number, 0x1600 + number, on_change)
+
+    def compile(self) -> None:
+        self._struct, keys = self._layout()
+        self._setters = [self._setter(key) for key in keys]
+        self._acts_at_sync = self.synchronous
+        self._latched = None
+
+    def receive(self, data: bytes | bytearray) -> None:
+        """A frame has come: it acts now, or at the next SYNC."""
+        if len(data) < self._struct.size:
+            self._on_short()
+        elif self._acts_at_sync:
+            self._latched = data
+        else:
+            self._apply(data)
+
+    def on_sync(self) -> None:
+        """Lets the latched frame act."""
+        data = self._latched
+        if data is not None:
+            self._latched = None
+            self._apply(data)
+
+    def _apply(self, data: bytes | bytearray) -> None:
+        for setter, value in zip(self._setters, self._struct.unpack_from(data), strict=True):
+            setter(value)
+
+    def _setter(self, key: int) -> Setter:
+        if key >> 8 <= _LAST_DUMMY:
+            return _discard
+        return self._fast.get(key) or (lambda value: self._write(key, value))
+
+    def _write(self, key: int, value: int) -> None:
+        """A value out of range is dropped: a PDO has no way to say no."""
+        try:
+            self.store.write(key, value)
+        except SdoAbortedError:
+            return
+
+
+class TransmitPdo(Pdo):
+    """Drive to host."""
+
+    def __init__(self, store: ObjectStore, number: int, on_change: Callable[[], None]) -> None:
+        self.inhibit_us = 0
+        self.event_us = 0
+        self._getters: list[Getter] = []
+        self._struct = Struct("<")
+        self._syncs = 0
+        self._sent = b""
+        self._sent_us = 0
+        communication = 0x1800 + number
+        super().__init__(store, communication, 0x1A00 + number, on_change)
+        store.hooks[key_of(communication, 3)] = self._set_inhibit
+        store.hooks[key_of(communication, 5)] = self._set_event
+
+    def compile(self) -> None:
+        self._struct, keys = self._layout()
+        self._getters = [self._getter(key) for key in keys]
+        self._syncs = 0
+        self._sent = b""
+
+    def pack(self) -> bytes:
+        """The frame's data at this instant."""
+        return self._struct.pack(*[getter() for getter in self._getters])
+
+    def at_sync(self) -> bytes | None:
+        """What to send at this SYNC, if anything."""
+        every = self.transmission
+        if every == 1:
+            return self.pack()
+        if every > 240:
+            return None
+        self._syncs += 1
+        if every and self._syncs < every:
+            return None
+        self._syncs = 0
+        data = self.pack()
+        if every == 0 and data == self._sent:
+            return None
+        self._sent = data
+        return data
+
+    def on_event(self, now_us: int) -> bytes | None:
+        """What to send by event: changed data (not within the inhibit time), or the event timer ran out."""
+        since = now_us - self._sent_us
+        if self._sent and since < self.inhibit_us:
+            return None
+        data = self.pack()
+        if data == self._sent and not (self.event_us and since >= self.event_us):
+            return None
+        self._sent, self._sent_us = data, now_us
+        return data
+
+    def _getter(self, key: int) -> Getter:
+        return self.store.live.get(key) or (lambda: self.store.number(key))
+
+    def _set_inhibit(self, value: int) -> None:
+        if self.valid:
+            raise SdoAbortedError(od.ABORT_STATE)
+        self.inhibit_us = 100 * value
+
+    def _set_event(self, value: int) -> None:
+        self.event_us = 1000 * value
+
+
+def _discard(_value: int) -> None:
+    """Where a dummy entry's value goes."""

@@ -1,0 +1,256 @@
+"""The loop that owns the bus: frames in, plant time on. And the same in a thread, for one process.
+
+Stepped time moves with the SYNC alone, but for a host that has fallen silent: after ``silence_s`` of wall time in which
+the simulator itself was awake and no frame came, or at once when the bus reports its end, the simulator runs on in its
+own time, so that the drive's watchdog acts and the shaft comes to rest. Frames that come again make it go on stepped.
+Before the first SYNC there is nothing to run on from, and time stands still.
+"""
+
+import math
+import threading
+import time
+import uuid
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import can
+
+from profiles.canopen import CanopenProfile
+from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
+from sim_bus.canopen.faults import Faults
+from sim_bus.canopen.node import Cia402Node
+from sim_bus.canopen.sender import BUS_ERRORS, Sender
+from sim_bus.fault_script import Scripted
+from sim_bus.params import RigParams
+from sim_bus.trace import Trace
+
+_CHUNK_US = 2_000
+_POLL_OWN_TIME_S = 0.005
+_POLL_STEPPED_S = 0.05
+_RETRY_S = 0.05
+_RUN_OUT_US = 120_000_000
+_REST_US = 1_500_000
+_AT_REST_RAD_S = 0.02
+
+
+class Simulator:
+    """A simulated drive on a bus that somebody else opens and shuts down."""
+
+    def __init__(self, bus: can.BusABC, params: RigParams, *, node_id: int = 1, seed: int = 0,
+                 trace: Path | None = None, stepped: bool = False, silence_s: float = 1.0,
+                 profile: CanopenProfile | None = None, faults: tuple[Scripted, ...] = ()) -> None:
+        self._bus = bus
+        self._silence_s = silence_s
+        self._sender = Sender(bus, self._on_send_failed)
+        self._trace = Trace(trace)
+        self.node = Cia402Node(
+            self._sender, params, node_id=node_id, seed=seed, trace=self._trace, stepped=stepped, profile=profile,
+        )
+        self._faults = Faults(faults, seed) if faults else None
+        if self._faults is not None:
+            self._faults.attach(self.node, self._sender)
+        self._wall_s = 0.0                 # wall time up to which the plant has run, in its own time
+        self._running_on = False           # stepped, but the host is silent
+        self._silent_s = 0.0
+
+    @property
+    def speed_rad_s(self) -> float:
+        """The true shaft's speed."""
+        return self.node.inverter.speed_rad_s
+
+    @property
+    def time_s(self) -> float:
+        """Plant time."""
+        return self.node.time_us * 1e-6
+
+    @property
+    def faults_waiting(self) -> tuple[str, ...]:
+        """Scripted faults whose moment hasn't come, as they were written."""
+        return self._faults.waiting if self._faults is not None else ()
+
+    def run(self, stop: threading.Event) -> None:
+        """Serves the bus until ``stop`` is set. The trace is closed at the end."""
+        with self._trace:
+            self.begin()
+            while not stop.is_set():
+                own_time = self._running_on or not self.node.stepped
+                timeout_s = _POLL_OWN_TIME_S if own_time else min(_POLL_STEPPED_S, self._silence_s)
+                before_s = time.monotonic() if own_time or self._silent_s else 0.0
+                try:
+                    message = self._bus.recv(timeout_s)
+                except BUS_ERRORS as error:
+                    self._bus_ended(error, stop)
+                    continue
+                if message is None:
+                    self._nothing_came(timeout_s, before_s, stop)
+                else:
+                    self.hear(message)
+            self.end()
+
+    def begin(self) -> None:
+        """Power-on, with its boot-up message."""
+        self.node.boot()
+        self._wall_s = time.monotonic()
+
+    def hear(self, message: can.Message) -> None:
+        """One frame from the bus; what it makes the drive say has been sent when this returns."""
+        if not (message.is_extended_id or message.is_error_frame):
+            self._frame_came(message)
+
+    def end(self) -> None:
+        """The host is gone for good: a rehearsal is played to its end."""
+        if self._faults is not None and self.node.stepped and self.node.sync_seen:
+            self._run_out()
+
+    def close_trace(self) -> None:
+        """Closes the trace; safe to repeat."""
+        self._trace.close()
+
+    def _run_out(self) -> None:
+        """After a rehearsal the host is gone: what the drive then does by itself belongs to the trace."""
+        end_us = self.node.time_us + _RUN_OUT_US
+        quiet_us = 0
+        while quiet_us < _REST_US and self.node.time_us < end_us:
+            self.node.advance_us(_CHUNK_US)
+            turning = abs(self.node.inverter.speed_rad_s) > _AT_REST_RAD_S
+            quiet_us = 0 if turning else quiet_us + _CHUNK_US
+
+    def _frame_came(self, message: can.Message) -> None:
+        node = self.node
+        self._silent_s = 0.0
+        if self._sender.lost:
+            self._sender.revive()
+        if self._running_on:
+            self._follow_wall_clock()
+            self._running_on = False
+            node.note("frames are back: stepped again")
+        elif not node.stepped:
+            self._follow_wall_clock()
+        was_stepped = node.stepped
+        if message.is_remote_frame:
+            node.on_remote(message.arbitration_id)
+        elif message.arbitration_id == CYCLE_ID:
+            if node.stepped and message.data[:1] == CYCLE_ASKED:
+                self._sender.put(CYCLE_ID, CYCLE_ANSWER + message.data[1:2])
+        elif self._faults is not None:
+            self._faults.came(message.arbitration_id, bytes(message.data))
+        else:
+            node.on_frame(message.arbitration_id, bytes(message.data))
+        if was_stepped and not node.stepped:
+            self._wall_s = time.monotonic()
+
+    def _nothing_came(self, timeout_s: float, before_s: float, stop: threading.Event) -> None:
+        self._trace.flush()
+        if self._running_on or not self.node.stepped:
+            if time.monotonic() - before_s < 0.5 * timeout_s:
+                stop.wait(timeout_s)          # a bus that returns at once, as a closed socketcand client does
+            self._follow_wall_clock()
+            return
+        # The first empty wait counts as a whole one; from then on it is measured, a dead bus returns at once.
+        waited_s = time.monotonic() - before_s if self._silent_s else timeout_s
+        if waited_s < 0.5 * timeout_s:
+            stop.wait(timeout_s)
+            waited_s += timeout_s
+        # Whoever doesn't get the processor himself doesn't know that others are silent: no wait counts for more.
+        self._silent_s += min(waited_s, timeout_s)
+        if self._silent_s >= self._silence_s:
+            self._run_on("host silent: running on in own time")
+
+    def _run_on(self, why: str) -> None:
+        self._silent_s = 0.0
+        if self.node.stepped and self.node.sync_seen and not self._running_on:
+            self._running_on = True
+            self._wall_s = time.monotonic()
+            self.node.note(why)
+
+    def _bus_ended(self, error: BaseException, stop: threading.Event) -> None:
+        self._run_on(f"bus lost ({error}): running on in own time")
+        stop.wait(_POLL_OWN_TIME_S if self._running_on or not self.node.stepped else _RETRY_S)
+        if self._running_on or not self.node.stepped:
+            self._follow_wall_clock()
+
+    def _on_send_failed(self, error: BaseException) -> None:
+        self.node.note(f"sending failed: {error}")
+
+    def _follow_wall_clock(self) -> None:
+        """The plant catches up with the monotonic clock, in whole chunks."""
+        behind = int((time.monotonic() - self._wall_s) * 1e6) // _CHUNK_US
+        for _ in range(behind):
+            self.node.advance_us(_CHUNK_US)
+        self._wall_s += behind * _CHUNK_US * 1e-6
+
+
+class Embedded:
+    """A simulator in this process; how frames reach it is a subclass's. What fails in it is raised by `check`."""
+
+    def __init__(self) -> None:
+        self._failure: BaseException | None = None
+
+    def open(self) -> Self:
+        """Powers the drive on."""
+        raise NotImplementedError
+
+    def _end(self) -> None:
+        """Ends the simulation and gives the bus back; safe to repeat."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raises RuntimeError for what failed in the simulation."""
+        if self._failure is not None:
+            raise RuntimeError("the simulated drive failed") from self._failure
+
+    def close(self) -> None:
+        """Ends the simulation, gives the bus back and raises what failed; safe to repeat."""
+        self._end()
+        self.check()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 where: TracebackType | None) -> None:
+        self._end()
+        if error is None:
+            self.check()
+
+
+class EmbeddedSimulator(Embedded):
+    """A simulator in a daemon thread of this process, on a python-can ``virtual`` channel of its own.
+
+    ``with EmbeddedSimulator(params) as simulated: bus = can.Bus(interface="virtual", channel=simulated.channel)``.
+    ``profile`` is what the simulated drive wears. By default stepped, and a pause of the host, however long, changes
+    nothing: host and simulator share a fate, and a run must repeat on a slow machine. In stepped time
+    `sim_bus.canopen.inline.InlineSimulator` says the same, several times as fast.
+    """
+
+    def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,
+                 stepped: bool = True, silence_s: float = math.inf, profile: CanopenProfile | None = None,
+                 faults: tuple[Scripted, ...] = ()) -> None:
+        super().__init__()
+        self.channel = f"tdhil-{uuid.uuid4().hex}"
+        self._bus = can.Bus(interface="virtual", channel=self.channel)
+        self.simulator = Simulator(
+            self._bus, params or RigParams(),
+            node_id=node_id, seed=seed, trace=trace, stepped=stepped, silence_s=silence_s, profile=profile,
+            faults=faults,
+        )
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="simulated drive", daemon=True)
+
+    def open(self) -> Self:
+        """Starts the thread."""
+        self._thread.start()
+        return self
+
+    def _end(self) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._bus.shutdown()
+
+    def _run(self) -> None:
+        try:
+            self.simulator.run(self._stop)
+        except BaseException as error:        # kept for the host's thread, which raises it
+            self._failure = error

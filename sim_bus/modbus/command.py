@@ -1,0 +1,87 @@
+"""The command ``simulate modbus``: its options, and running it."""
+
+import argparse
+import threading
+
+from sim_bus.command_arguments import (
+    EXIT_OK,
+    Unusable,
+    add_fault_argument,
+    add_rig_arguments,
+    host_and_port,
+    never_came,
+    number_from,
+    ready,
+    until_stopped,
+)
+
+DEFAULT_PROFILE = "generic/modbus"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of a simulated Modbus drive."""
+    parser.set_defaults(complain=parser.error)
+    group = parser.add_argument_group("simulated drive")
+    group.add_argument("--profile", metavar="NAME", default=DEFAULT_PROFILE,
+                       help=f"the drive to be: a profile that ships, or a YAML file (default {DEFAULT_PROFILE})")
+    line = group.add_mutually_exclusive_group()
+    line.add_argument("--tcp", metavar="HOST:PORT", type=host_and_port,
+                      help="listen there; port 0 takes any free one, without a host only this machine reaches it")
+    line.add_argument("--rtu", metavar="DEVICE", nargs="?", const="",
+                      help="listen on a serial device; without one on a pseudo terminal, named on the ready line")
+    group.add_argument("--unit", metavar="N", type=number_from(1, 247, "a unit"),
+                       help="unit, 1 to 247 (default: the profile's)")
+    add_rig_arguments(group)
+    group.add_argument("--wrong", metavar="NAME", action="append", default=[],
+                       help="be wired otherwise than the profile says: word_order, scale_10, address_off_by_one, sign, "
+                       "unsigned, write_not_applied, reads_back_something_else:PARAMETER; may be given again")
+    add_fault_argument(group, "no-reply@hold+2s")
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
+    if "list" in namespace.fault:
+        from sim_bus.modbus.fault_catalogue import listing
+
+        print(listing())  # noqa: T201
+        return EXIT_OK
+
+    def simulate(stop: threading.Event) -> None:
+        from profiles.library import load_modbus_profile
+        from sim_bus.modbus.fault_catalogue import parse_all, wrongs_of
+        from sim_bus.modbus.faults import Faults
+        from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
+        from sim_bus.modbus.machine import Machine
+        from sim_bus.modbus.server import Server
+        from sim_bus.modbus.wrong_maps import parse
+        from sim_bus.params import RigParams, load_rig
+
+        if namespace.tcp is None and namespace.rtu is None:
+            namespace.complain("one of the arguments --tcp --rtu is required")
+        script = parse_all(namespace.fault, "rtu" if namespace.tcp is None else "tcp")
+        params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+        profile = load_modbus_profile(namespace.profile)
+        line = profile.line
+        names = [one.name for one in profile.parameters]
+        wrongs = (*(parse(text, names) for text in namespace.wrong), *wrongs_of(script, names))
+        unit = namespace.unit if namespace.unit is not None else line.unit
+        if unit == 0:
+            raise Unusable(f"{profile.name} leaves the factory without a unit number. Give --unit")
+        with Machine(params, profile, seed=namespace.seed, trace=namespace.trace, wrongs=wrongs,
+                     stepped=False) as machine:
+            listener: Listener
+            if namespace.tcp is not None:
+                listener = TcpListener(*namespace.tcp)
+            else:
+                listener = RtuListener(namespace.rtu or None, baud=line.baud, parity=line.parity,
+                                       stop_bits=line.stop_bits)
+            faults = Faults(machine, profile, script, namespace.seed)
+            try:
+                server = Server(machine, unit, listener, gateway=namespace.tcp is not None, faults=faults)
+                ready(f"modbus {listener.reached_by} unit {unit} profile {profile.name}")
+                server.run(stop)
+                never_came(faults.waiting)
+            finally:
+                listener.close()
+
+    return until_stopped(simulate)

@@ -1,0 +1,46 @@
+"""Dry friction of one shaft: a file for each model, with its equation, units and source.
+
+Each has the same two functions, of a `Shaft` and its state, under a torque ``drive`` that is constant over the step::
+
+    advance(shaft, speed, bristle, drive, dt) -> (speed, bristle, travel)      rad/s, rad, rad
+    torque(shaft, speed, bristle, drive)      -> N·m against motion, viscous friction not in it
+
+| model | state | sticks | source |
+|---|---|---|---|
+| coulomb | – | exactly, to F_c | Coulomb 1785 |
+| stribeck | – | exactly, to F_s | Stribeck 1902, Armstrong-Hélouvry 1991 |
+| dahl | bristle | as a spring | Dahl 1968 |
+| lugre | bristle | as a damped spring | Canudas de Wit, Olsson, Åström, Lischinsky 1995 |
+"""
+
+from collections.abc import Callable
+
+from sim_bus.plant.friction import coulomb, dahl, lugre, stribeck
+from sim_bus.plant.friction.shaft import Shaft
+
+__all__ = ["Advance", "Shaft", "advance", "advance_of", "torque"]
+
+Advance = Callable[[Shaft, float, float, float, float], tuple[float, float, float]]
+
+_ADVANCE: dict[str, Advance] = {
+    "coulomb": coulomb.advance, "stribeck": stribeck.advance, "dahl": dahl.advance, "lugre": lugre.advance,
+}
+_TORQUE: dict[str, Callable[[Shaft, float, float, float], float]] = {
+    "coulomb": coulomb.torque, "stribeck": stribeck.torque, "dahl": dahl.torque, "lugre": lugre.torque,
+}
+
+
+def advance_of(shaft: Shaft) -> Advance:
+    """The function that moves this shaft on; without dry friction it is Coulomb's, with F_c = 0."""
+    return _ADVANCE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.advance
+
+
+def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+    """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
+    return advance_of(shaft)(shaft, speed, bristle, drive, dt_s)
+
+
+def torque(shaft: Shaft, speed: float, bristle: float, drive: float = 0.0) -> float:
+    """Dry friction in N·m, as it acts against motion; where the model sticks, at rest it balances ``drive``."""
+    of_model = _TORQUE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.torque
+    return of_model(shaft, speed, bristle, drive)

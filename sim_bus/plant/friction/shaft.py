@@ -1,0 +1,39 @@
+"""What one inertia is: its moment, its friction, its constant load. A rig has one, or one at each end of a string."""
+
+from typing import Literal, Self
+
+from pydantic import model_validator
+
+from profiles.model import refuse_if
+from sim_bus.validated import NonNegative, Positive, Validated
+
+
+class Shaft(Validated):
+    """One inertia with viscous friction and one model of dry friction; parameters of other models are not looked at.
+
+    ``coulomb_nm`` of 0 switches dry friction off, whatever the model.
+    """
+
+    inertia_kg_m2: Positive = 104.0
+    viscous_nm_s_rad: NonNegative = 8.0
+    coulomb_nm: NonNegative = 60.0
+    """F_c, dry friction of a shaft that slides."""
+    friction: Literal["coulomb", "stribeck", "dahl", "lugre"] = "coulomb"
+    static_nm: NonNegative = 80.0
+    """F_s, breakaway torque; Stribeck and LuGre."""
+    stribeck_speed_rad_s: Positive = 0.1
+    """ω_s, over which friction falls from F_s to F_c; Stribeck and LuGre."""
+    dahl_stiffness_nm_rad: Positive = 5000.0
+    lugre_stiffness_nm_rad: Positive = 20000.0
+    """σ0, of the bristle."""
+    lugre_damping_nm_s_rad: NonNegative = 500.0
+    """σ1, of the bristle while it bends; σ2 is ``viscous_nm_s_rad``."""
+    load_nm: float = 0.0
+    """A constant load, against positive speed."""
+
+    @model_validator(mode="after")
+    def _breakaway_is_not_below_sliding(self) -> Self:
+        if self.friction in {"stribeck", "lugre"} and self.static_nm < self.coulomb_nm:
+            refuse_if([("static_nm", f"breakaway torque can't be below coulomb_nm ({self.coulomb_nm:g}) "
+                                     f"with friction: {self.friction}")])
+        return self

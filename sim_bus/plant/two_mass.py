@@ -1,0 +1,112 @@
+r"""Two masses on a torsion spring: the paper's figure 7, friction at both ends.
+
+::
+
+    J_r dω_r/dt = u − B_r ω_r − T_r − τ        motor: top drive
+    J_L dω_L/dt = τ − load_L − B_L ω_L − T_L   bottom: collars and bit
+    τ = k (θ_r − θ_L) + c (ω_r − ω_L)
+
+    J kg·m², k N·m/rad, c and B N·m·s/rad, T dry friction and τ N·m
+
+Source: the paper, section 2.3, which draws the model and drops it for equations 4 to 6.
+
+A step of h is the mid-point rule on the spring alone: τ is taken with the twist at mid-step and the mean of the
+speed differences before and after, which two passes find; then each end moves as if alone, exactly as its friction
+model does, so that an end sticks exactly while the spring can't tear it loose. Second order: a swing of natural
+frequency Ω = √(k (1/J_r + 1/J_L)) is fast by (Ωh)²/24 of it, and keeps its energy. Steps are cut to Ωh ≤ 0.1 and
+c (1/J_r + 1/J_L) h ≤ 0.1.
+"""
+
+from math import sqrt
+from typing import Literal, NamedTuple, Self
+
+from pydantic import model_validator
+
+from profiles.model import refuse_if
+from sim_bus.plant.friction import advance_of
+from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.validated import NonNegative, Positive
+
+FASTEST_RAD_S = 1000.0
+"""Swings beyond this would take hundreds of pieces per step."""
+_CUT = 0.1
+
+
+class Bottom(Shaft):
+    """What turns at the lower end."""
+
+    inertia_kg_m2: Positive = 374.0
+    viscous_nm_s_rad: NonNegative = 4.0
+    coulomb_nm: NonNegative = 30.0
+    static_nm: NonNegative = 40.0
+
+
+class TwoMassParams(Shaft):
+    """The motor's end, as a rigid shaft has it, the spring, and the bottom."""
+
+    kind: Literal["two_mass"] = "two_mass"
+    inertia_kg_m2: Positive = 1500.0
+    stiffness_nm_rad: Positive = 473.0
+    damping_nm_s_rad: NonNegative = 23.2
+    bottom: Bottom = Bottom()
+
+    @property
+    def mobility_1_kg_m2(self) -> float:
+        """1/J_r + 1/J_L."""
+        return 1.0 / self.inertia_kg_m2 + 1.0 / self.bottom.inertia_kg_m2
+
+    @model_validator(mode="after")
+    def _slow_enough(self) -> Self:
+        swing = sqrt(self.stiffness_nm_rad * self.mobility_1_kg_m2)
+        decay = self.damping_nm_s_rad * self.mobility_1_kg_m2
+        cure = f"more than {FASTEST_RAD_S:g} can't be simulated; that is one rigid shaft (kind: rigid)"
+        refuse_if(
+            [("stiffness_nm_rad", f"the two ends would swing at {swing:.4g} rad/s; {cure}")] * (swing > FASTEST_RAD_S)
+            + [("damping_nm_s_rad", f"it would damp at a rate of {decay:.4g} 1/s; {cure}")] * (decay > FASTEST_RAD_S)
+        )
+        return self
+
+
+class TwoMassState(NamedTuple):
+    """Motor end first; the twist is ``angle_rad − bottom_angle_rad``."""
+
+    speed_rad_s: float = 0.0
+    angle_rad: float = 0.0
+    bristle_rad: float = 0.0
+    bottom_speed_rad_s: float = 0.0
+    bottom_angle_rad: float = 0.0
+    bottom_bristle_rad: float = 0.0
+
+
+def step(params: TwoMassParams, state: TwoMassState, torque_nm: float, dt_s: float,
+         load_nm: float = 0.0) -> TwoMassState:
+    """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed."""
+    mobility = params.mobility_1_kg_m2
+    fastest = max(sqrt(params.stiffness_nm_rad * mobility), params.damping_nm_s_rad * mobility)
+    count = 1 + int(fastest * dt_s / _CUT)
+    drive = torque_nm - load_nm - params.load_nm
+    for _ in range(count):
+        state = _piece(params, state, drive, dt_s / count)
+    return state
+
+
+def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
+    """τ, what the string takes from the motor, N·m."""
+    return (params.stiffness_nm_rad * (state.angle_rad - state.bottom_angle_rad)
+            + params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s))
+
+
+def _piece(params: TwoMassParams, state: TwoMassState, drive: float, dt_s: float) -> TwoMassState:
+    bottom, damping = params.bottom, params.damping_nm_s_rad
+    speed, angle, bristle, low_speed, low_angle, low_bristle = state
+    move, low_move = advance_of(params), advance_of(bottom)
+    difference = speed - low_speed
+    spring = params.stiffness_nm_rad * (angle - low_angle + 0.5 * dt_s * difference)
+    torque = spring + damping * difference
+    end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
+    low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - bottom.load_nm, dt_s)
+    if damping > 0.0:
+        torque = spring + 0.5 * damping * (difference + end - low_end)
+        end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
+        low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - bottom.load_nm, dt_s)
+    return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)

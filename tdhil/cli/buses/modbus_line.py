@@ -1,0 +1,136 @@
+"""Where a Modbus drive is reached, with the place that each value came from.
+
+Command line, then rig.yaml's ``modbus:``, then the profile's ``line:``, which says how the drive leaves the factory.
+A host means TCP, a serial device means RTU; the command line's word for one of them undoes rig.yaml's for the other.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Literal, cast
+
+from pydantic import ValidationError
+
+from profiles.modbus import Line, ModbusProfile
+from profiles.yaml_messages import messages_of
+from tdhil.config.options import Origin, Setting
+from tdhil.config.rig import Modbus, Rig
+from tdhil.errors import UsageError
+
+FLAGS = {
+    "host": "--host",
+    "port": "--port",
+    "serial": "--serial",
+    "baud": "--baud",
+    "parity": "--parity",
+    "stop_bits": "--stop-bits",
+    "unit": "--unit",
+}
+TCP, RTU = ("host", "port", "unit"), ("serial", "baud", "parity", "stop_bits", "unit")
+
+
+@dataclass(frozen=True)
+class ModbusConfig:
+    """Each value and its origin; only those that the way to the drive (TCP or RTU) knows."""
+
+    settings: Mapping[str, Setting]
+
+    @property
+    def configured(self) -> bool:
+        """Has anybody named a host or a serial device? If not, the embedded simulator is meant."""
+        return self.host is not None or self.serial is not None
+
+    @property
+    def host(self) -> str | None:
+        return cast("str | None", self._value("host"))
+
+    @property
+    def port(self) -> int:
+        return cast(int, self._value("port"))
+
+    @property
+    def serial(self) -> str | None:
+        return cast("str | None", self._value("serial"))
+
+    @property
+    def baud(self) -> int:
+        return cast(int, self._value("baud"))
+
+    @property
+    def parity(self) -> Literal["N", "E", "O"]:
+        return cast(Literal["N", "E", "O"], self._value("parity"))
+
+    @property
+    def stop_bits(self) -> Literal[1, 2]:
+        return cast(Literal[1, 2], self._value("stop_bits"))
+
+    @property
+    def unit(self) -> int:
+        return cast(int, self._value("unit"))
+
+    def source(self, name: str) -> str:
+        return self.settings[name].source if name in self.settings else ""
+
+    def origin(self, name: str) -> Origin | None:
+        """Who said it, None where nobody did."""
+        return self.settings[name].origin if name in self.settings else None
+
+    def rows(self) -> Iterator[tuple[str, str, str]]:
+        """(option, value, source) to print."""
+        for name, setting in self.settings.items():
+            yield name, str(setting.value), setting.source
+
+    def _value(self, name: str) -> Any:
+        return self.settings[name].value if name in self.settings else None
+
+
+def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfile | None) -> ModbusConfig:
+    """The line as configured from everywhere; ``cli`` is keyed by the names in `FLAGS`.
+
+    UsageError where a value can't be used. Without a profile what it would say is left as the standard has it.
+    """
+    given = {name: Setting.by_flag(cli[name], flag) for name, flag in FLAGS.items() if cli.get(name) is not None}
+    _check(given)
+    settings = dict(given)
+    for name in FLAGS:
+        if rig is not None and (value := getattr(rig.modbus, name)) is not None:
+            settings.setdefault(name, Setting.by_rig(value, rig, f"modbus.{name}"))
+    for one, other in (("host", "serial"), ("serial", "host")):
+        if one in given and other not in given:
+            settings.pop(other, None)
+    line, source, origin = _STANDARD, "default", Origin.BUILT_IN
+    if profile is not None:
+        line, source, origin = profile.line, f"profile {profile.name}", Origin.PROFILE
+    for name in FLAGS:
+        if name not in ("host", "serial"):
+            settings.setdefault(name, Setting(getattr(line, name), source, origin))
+    known = RTU if "serial" in settings else TCP if "host" in settings else ("unit",)
+    found = ModbusConfig(MappingProxyType({name: settings[name] for name in known if name in settings}))
+    for name in given:
+        if name not in known:
+            needs = "--serial" if name in RTU else "--host"
+            raise UsageError(f"means nothing without {needs}", where=FLAGS[name], next_step="See tdhil identify --help")
+    if found.serial is not None and not 1 <= found.unit <= 247:
+        raise UsageError(
+            f"a serial line has units 1 to 247, not {found.unit}", where=found.source("unit"),
+            next_step="Give the drive's own with --unit",
+        )
+    return found
+
+
+def asked_for(cli: Mapping[str, Any]) -> str | None:
+    """The flag on the command line that only a Modbus drive has; None if there is none."""
+    return next((flag for name, flag in FLAGS.items() if cli.get(name) is not None), None)
+
+
+_STANDARD = Line(transports=("tcp", "rtu"), source="the Modbus specification", confidence="verified")
+
+
+def _check(given: Mapping[str, Setting]) -> None:
+    """The same rules as for rig.yaml, in terms of the flags."""
+    data = {name: setting.value for name, setting in given.items()}
+    try:
+        Modbus.model_validate(data)
+    except ValidationError as error:
+        wrong = [f"{FLAGS.get('.'.join(map(str, at)), '')}: {text}" for at, text in messages_of(error, data, Modbus)]
+        raise UsageError("; ".join(wrong), next_step="See tdhil identify --help") from None

@@ -1,0 +1,126 @@
+"""How the drive is spoken to: which bus, which profile, and where on that bus; each with who had the say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from drivers.errors import DataFileError, Problem
+from profiles.library import load_canopen_profile, load_modbus_profile, load_profile
+from profiles.modbus import ModbusProfile
+from tdhil.cli.buses.can_bus import BusConfig, bus_config
+from tdhil.cli.buses.modbus_line import ModbusConfig, asked_for, modbus_config
+from tdhil.config.options import Origin, RunOptions, Setting
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    from profiles.library import Profile
+    from tdhil.config.rig import Rig
+
+MODBUS_PROFILE = "generic/modbus"
+"""Worn and spoken where nobody names another; for CANopen it is `tdhil.config.options`' default."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """One of ``bus`` and ``modbus`` counts, as the profile's bus says."""
+
+    profile: Profile
+    bus: BusConfig
+    modbus: ModbusConfig
+
+    @property
+    def drive(self) -> str:
+        """``canopen`` or ``modbus``."""
+        return self.profile.bus
+
+    @property
+    def configured(self) -> bool:
+        """Has anybody said where the drive is? If not, the embedded simulator is meant."""
+        return self.modbus.configured if self.drive == "modbus" else self.bus.configured
+
+    @property
+    def nothing_there(self) -> str:
+        """Why the embedded simulator runs although nobody asked for it."""
+        return "no Modbus host and no serial device is named" if self.drive == "modbus" else "no CAN bus is configured"
+
+    def rows(self) -> Iterator[tuple[str, str, str]]:
+        """(option, value, source) to print and to log."""
+        return self.modbus.rows() if self.drive == "modbus" else self.bus.rows()
+
+
+def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> tuple[RunOptions, Connection]:
+    """The options with drive and profile decided, and the way to the drive.
+
+    UsageError for options of the other bus, DataFileError for a profile that can't be used.
+    """
+    options = choose_drive(cli, rig, options)
+    if options.drive == "modbus":
+        profile = load_modbus_profile(options.profile)
+        _refuse_canopen_flags(cli)
+        found = Connection(profile, NO_BUS, modbus_config(cli, rig, profile))
+        _refuse_the_other_bus(found, rig, options)
+        return options, found
+    flag = asked_for(cli)
+    if flag is not None:
+        raise UsageError("belongs to Modbus", where=flag, next_step="Add --drive modbus, or leave it out")
+    found = Connection(load_canopen_profile(options.profile), bus_config(cli, rig), NO_MODBUS)
+    _refuse_the_other_bus(found, rig, options)
+    return options, found
+
+
+def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
+    """A rig.yaml that says where a drive is, but on the other bus: nobody meant the simulator. Raises DataFileError."""
+    if rig is None or found.configured or options.simulate:
+        return
+    if found.drive == "canopen" and (rig.modbus.host or rig.modbus.serial):
+        section, missing = "modbus", "bus: (interface, channel)"
+    elif found.drive == "modbus" and rig.bus.interface:
+        section, missing = "bus", "modbus: (host or serial)"
+    else:
+        return
+    raise DataFileError((Problem(
+        rig.file or "rig.yaml", rig.line(section),
+        f"{section}: says where a drive is, but the drive is on {found.drive} ({options.source('drive')}), and nothing"
+        f" says where; give {missing}, name the other drive, or take the simulated one with --simulate",
+    ),))
+
+
+def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> RunOptions:
+    """Who doesn't name the bus has named it by the profile, or by saying where the drive is."""
+    if not options.given("drive"):
+        if options.given("profile"):
+            profile = load_profile(options.profile)
+            options = options.replaced(drive=Setting(profile.bus, f"profile {profile.name}", Origin.PROFILE))
+        elif (flag := asked_for(cli)) is not None:
+            options = options.replaced(drive=Setting.by_flag("modbus", flag))
+        elif rig is not None and rig.bus.interface is None and (rig.modbus.host or rig.modbus.serial):
+            options = options.replaced(drive=Setting.by_rig("modbus", rig, "modbus"))
+    if options.drive == "modbus" and not options.given("profile"):
+        options = options.replaced(profile=Setting(MODBUS_PROFILE, "default", Origin.BUILT_IN))
+    return options
+
+
+def simulated_canopen(options: RunOptions) -> Connection:
+    """The way to an embedded CANopen drive."""
+    return Connection(load_canopen_profile(options.profile), NO_BUS, NO_MODBUS)
+
+
+def can_torque(profile: Profile) -> bool:
+    """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+    has = profile.modes.torque if isinstance(profile, ModbusProfile) else bool(profile.modes.torque)
+    return has and profile.modes.switch_while_enabled
+
+
+NO_BUS = BusConfig(MappingProxyType({}))
+NO_MODBUS = ModbusConfig(MappingProxyType({}))
+_CANOPEN_FLAGS = {"node": "--node", "interface": "--interface", "channel": "--channel", "bitrate": "--bitrate"}
+
+
+def _refuse_canopen_flags(cli: Mapping[str, Any]) -> None:
+    for name, flag in _CANOPEN_FLAGS.items():
+        if cli.get(name) is not None:
+            step = "A Modbus drive is named by --host or --serial, and --unit; for CANopen say --drive canopen"
+            raise UsageError("belongs to CANopen", where=flag, next_step=step)

@@ -1,0 +1,220 @@
+"""`tdhil doctor`: is everything there that a run needs? Read only, and it works with nothing connected.
+
+Each check is one line: ok, note, or bad with what to do. Exit 0 when nothing is bad, else 4.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tdhil.cli.buses.modbus_doctor import RegisterSeen
+    from tdhil.cli.connection import Connection
+    from tdhil.cli.finding import Finding
+    from tdhil.config.options import RunOptions
+    from tdhil.config.rig import Rig
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The drive and the line, as for identify."""
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments
+
+    drive = add_drive_arguments(parser)
+    drive.add_argument("--simulate", action="store_const", const=True, help="look at the embedded simulator")
+    drive.add_argument("--log", metavar="run.mcap", help="where a run would write its log")
+    parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    add_line_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """0 when nothing is bad, else 4. Raises UsageError and DataFileError for options and a rig.yaml that are wrong."""
+    from tdhil.config.options import resolve
+    from tdhil.config.rig import load_rig
+    from tdhil.errors import ExitCode
+
+    rig = load_rig(namespace.rig) if namespace.rig else None
+    options = resolve(vars(namespace), rig)
+    if options.json is True:
+        namespace.json = True
+    registers: list[RegisterSeen] = []
+    found: list[Finding] = []
+    for one in findings(vars(namespace), rig, options, registers):
+        found.append(one)
+        if not namespace.json:
+            print(one.text, flush=True)  # noqa: T201
+    code = ExitCode.REFUSED if any(one.grade == "bad" for one in found) else ExitCode.OK
+    if namespace.json:
+        _dump(found, registers, code)
+    else:
+        _show_registers(registers)
+        bad = sum(one.grade == "bad" for one in found)
+        print("nothing stands in the way" if not bad else f"{bad} to mend, see 'bad'")  # noqa: T201
+    return int(code)
+
+
+def findings(
+    cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[RegisterSeen]
+) -> Iterator[Finding]:
+    """From the computer to the drive; ``registers`` is filled with those of a Modbus drive."""
+    from drivers.errors import DataFileError
+    from tdhil.cli.connection import connection_of
+    from tdhil.cli.finding import note, of_error
+    from tdhil.commands.doctor_host import host_findings
+
+    yield from host_findings(Path(options.log))
+    yield from _left(Path(options.log).parent)
+    try:
+        options, connection = connection_of(cli, rig, options)
+    except DataFileError as error:
+        yield of_error("profile", error)
+        return
+    yield from _profile(options, connection)
+    yield from _limits(rig)
+    if not (options.simulate or connection.configured):
+        yield note("drive", f"{connection.nothing_there}: no drive was looked at",
+                   "Name it, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0")
+    elif connection.drive == "modbus":
+        yield from _modbus(options, connection, rig, registers)
+    else:
+        yield from _canopen(options, connection, rig)
+
+
+def _left(folder: Path) -> Iterator[Finding]:
+    """What runs that died have left in their drives."""
+    from drivers.errors import TdhilError
+    from drivers.left_behind import PREFIX, SUFFIX, read
+    from tdhil.cli.finding import bad, of_error
+
+    for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
+        try:
+            drive, settings = read(path)
+        except TdhilError as error:
+            yield of_error("left in a drive", error)
+            continue
+        yield bad("left in a drive", f"{drive}: {', '.join(one.text for one in settings)} ({path.name})",
+                  "A run is under way, or one died: the next run on that drive gives them back; or set them by hand, "
+                  "and remove the file")
+
+
+def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
+    from tdhil.cli.finding import note, ok
+    from tdhil.cli.profile_text import sure_text
+    from tdhil.commands.unverified import doubtful, is_accepted
+
+    profile = connection.profile
+    yield ok("profile", f"{profile.name} ({options.source('profile')}): {sure_text(profile)}")
+    accepted = options.accept_unverified
+    open_questions = [name for name, entry in doubtful(profile) if not is_accepted(name, entry, accepted)]
+    if open_questions:
+        yield note("profile", f"not verified: {', '.join(open_questions)}",
+                   f"A run on a real drive is refused until they are: tdhil profiles show {profile.name}")
+
+
+def _limits(rig: Rig | None) -> Iterator[Finding]:
+    from tdhil.cli.finding import note, ok
+
+    if rig is not None and rig.limits is not None:
+        limits = rig.limits
+        yield ok("limits", f"{limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m ({rig.source('limits')})")
+    else:
+        step = "Add a section limits: to rig.yaml, and name the file with --rig"
+        yield note("limits", "none: nothing real will be moved", step)
+
+
+def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
+    from drivers.errors import TdhilError
+    from profiles.canopen import CanopenProfile
+    from tdhil import bus_open
+    from tdhil.cli.buses import canopen_doctor
+    from tdhil.cli.buses.canopen import open_can, rated_torque_nm
+    from tdhil.cli.finding import attempted, of_error, ok
+    from tdhil.cli.open_drive import plan_peer
+    from tdhil.config.rig import DriveData
+
+    profile, bus = connection.profile, connection.bus
+    assert isinstance(profile, CanopenProfile)
+    plan = plan_peer(options, connection)
+    node = options.node if options.node is not None else profile.node
+    if not plan.embedded and bus.interface == "socketcan" and bus.channel:
+        found = attempted("link", lambda: canopen_doctor.link_findings(bus_open.link_report(bus.channel), bus.channel))
+        yield from found
+        if found and found[-1].name == "link" and found[-1].grade == "bad":
+            return                                     # there is no such link: opening it would say the same
+    elif not plan.embedded:
+        yield canopen_doctor.rate_finding(bus.bitrate, bus.source("bitrate"))
+    try:
+        with open_can(plan, connection, node) as channel:
+            yield ok("adapter", f"opened: {channel.channel_info}")
+            rated_nm = rated_torque_nm(plan, profile, rig.drive_data if rig is not None else DriveData())
+            yield from attempted("drive", lambda: canopen_doctor.drive_findings(channel, profile, node, rated_nm))
+    except TdhilError as error:
+        yield of_error("adapter", error)
+
+
+def _modbus(
+    options: RunOptions, connection: Connection, rig: Rig | None, registers: list[RegisterSeen]
+) -> Iterator[Finding]:
+    from drivers.clock import Clock, MonotonicClock, SteppedClock
+    from drivers.errors import TdhilError
+    from tdhil.cli.buses import modbus_doctor
+    from tdhil.cli.buses.modbus import open_line
+    from tdhil.cli.finding import attempted, of_error, ok
+    from tdhil.cli.open_drive import plan_peer
+    from tdhil.config.rig import DriveData
+
+    plan = plan_peer(options, connection)
+    clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
+    unit = connection.modbus.unit
+    try:
+        with open_line(plan, connection, rig.drive_data if rig is not None else DriveData(), clock) as line:
+            yield ok("line", f"open: {line.link.description}")
+            access = modbus_doctor.access_of(line.link, line.profile, unit)
+            yield from attempted(
+                "drive",
+                lambda: modbus_doctor.drive_findings(
+                    access, line.profile, unit, dict(line.given), line.rated_torque_nm, registers.extend
+                ),
+            )
+    except TdhilError as error:
+        yield of_error("line", error)
+
+
+def _show_registers(registers: list[RegisterSeen]) -> None:
+    """Beside each register what it is taken for: people compare it with the drive's panel."""
+    if not registers:
+        return
+    from rich.table import Table
+
+    from tdhil.report.console import PlainConsole
+
+    table = Table(title="registers, as read; compare them with the drive's panel", title_justify="left")
+    for heading in ("address", "counts", "is", "meaning"):
+        table.add_column(heading, overflow="fold")
+    for one in registers:
+        counts = "-" if one.counts is None else str(one.counts)
+        table.add_row(one.use.address, counts, one.shown, one.use.meaning)
+    PlainConsole().print(table)
+
+
+def _dump(found: list[Finding], registers: list[RegisterSeen], code: int) -> None:
+    document = {
+        "checks": [asdict(one) for one in found],
+        "registers": [
+            {
+                "name": one.use.name, "address": one.use.register.address, "table": one.use.register.table,
+                "meaning": one.use.meaning, "counts": one.counts, "value": one.value, "unit": one.use.unit,
+                "error": one.error or None,
+            }
+            for one in registers
+        ],
+        "exit_code": int(code),
+    }
+    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+    sys.stdout.write("\n")

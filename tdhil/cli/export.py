@@ -1,0 +1,155 @@
+"""`tdhil export`: the CAN frames of a log for CAN tools, or its samples as a table."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from drivers.drive import RawFrame
+
+SUFFIXES: Final = {"candump": ".log", "asc": ".asc", "csv": ".csv", "parquet": ".parquet"}
+COLUMNS: Final = (
+    "time_s", "speed_rad_s", "torque_nm", "torque_demand_nm", "commanded_speed_rad_s", "commanded_torque_nm",
+    "mode", "state", "status", "fresh", "limit_active", "standstill", "age_s", "half_width_s",
+    "simulated",
+)
+"""Of a table; the first three are what `tdhil replay` reads of a CSV."""
+
+_ROWS: Final = 65_536         # of a parquet file that are laid out at once
+_CAN_ONLY: Final = ("candump", "asc")
+_LARGEST_STANDARD: Final = 0x7FF
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of export."""
+    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of a run, whole or cut short")
+    parser.add_argument("--to", required=True, choices=tuple(SUFFIXES), help="candump and asc: the raw CAN frames, as "
+                        "can-utils and CANalyzer read them; csv and parquet: every sample with its command, SI units")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: the log's name with another ending")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Exit 0: all of it; 3: the log is not whole, and what there is was written; 10: nothing can be read."""
+    from tdhil.record.errors import LogError, NothingRecoverable
+    from tdhil.recording.log_reader import read_run
+    from tdhil.report.document import SIMULATED
+    from tdhil.report.live import stderr_console
+
+    path: Path = namespace.log
+    target: Path = namespace.output or path.with_suffix(SUFFIXES[namespace.to])
+    if not path.is_file():
+        raise UsageError("there is no such log", where=str(path), next_step="Name a run.mcap of this tool")
+    if target.exists():
+        raise UsageError("is there already, and is left as it is", where=str(target), next_step="Name another with -o")
+    if namespace.to == "parquet" and find_spec("pyarrow") is None:
+        raise UsageError("parquet needs pyarrow, not installed here", where="--to parquet",
+                         next_step="Install it into this environment: pip install pyarrow. Or take --to csv")
+    try:
+        found = read_run(path)
+        if namespace.to in _CAN_ONLY:
+            written = _write_frames(namespace.to, path, target, found.epoch_ns)
+        else:
+            write = _write_csv if namespace.to == "csv" else _write_parquet
+            written = write(path, target, int(found.recording.simulated))
+    except LogError as error:
+        raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target)) from error
+    console = stderr_console()
+    for problem in found.problems:
+        console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False, soft_wrap=True)
+    what = "CAN frames" if namespace.to in _CAN_ONLY else "samples"
+    simulated = f"{SIMULATED}: " if found.recording.simulated else ""
+    console.print(f"{simulated}{target}: {written} {what}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK if found.complete else ExitCode.PARTIAL)
+
+
+def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
+    """By python-can's own writers. Raises UsageError where there are no CAN frames in the log."""
+    import can
+
+    frames = _can_frames(path)
+    first = next(frames, None)
+    if first is None:
+        raise UsageError("has no CAN frames in it; that of a run on Modbus has none", where=str(path),
+                         next_step="Its samples: --to csv")
+    count = 0
+    writer: Any = can.ASCWriter(target) if to == "asc" else can.CanutilsLogWriter(target, channel="can0")
+    with writer:
+        frame: RawFrame | None = first
+        while frame is not None:
+            writer.on_message_received(can.Message(
+                timestamp=epoch_ns / 1e9 + frame.time_s, arbitration_id=frame.identifier, data=frame.data,
+                is_extended_id=frame.identifier > _LARGEST_STANDARD, is_rx=not frame.outgoing, check=False,
+            ))
+            count += 1
+            frame = next(frames, None)
+    return count
+
+
+def _can_frames(path: Path) -> Iterator[RawFrame]:
+    """Of a run on Modbus none: older logs have its bytes on the topic of CAN frames."""
+    from tdhil.recording.log_reader import read_frames, read_run
+
+    if read_run(path).configuration.get("drive") == "modbus":
+        return iter(())
+    return read_frames(path)
+
+
+def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:
+    from tdhil.recording.log_reader import read_cycles
+
+    for command, one in read_cycles(path):
+        speed, torque = (None, None) if command is None else (command.speed_rad_s, command.torque_nm)
+        yield (
+            one.time_s, one.speed_rad_s, one.torque_nm, one.torque_demand_nm, speed, torque,
+            None if one.mode is None else one.mode.value, one.state.value, one.status, int(one.fresh),
+            int(one.limit_active), int(one.standstill), one.age_s, one.half_width_s, simulated,
+        )
+
+
+def _write_csv(path: Path, target: Path, simulated: int) -> int:
+    """Numbers to their last digit: read again, they are the same."""
+    count = 0
+    with target.open("x", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(COLUMNS)
+        for row in _rows(path, simulated):
+            table.writerow(["" if cell is None else cell for cell in row])
+            count += 1
+    return count
+
+
+def _write_parquet(path: Path, target: Path, simulated: int) -> int:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    texts, counts = {"mode", "state"}, {"status", "fresh", "limit_active", "standstill", "simulated"}
+    schema = pa.schema([
+        (name, pa.string() if name in texts else pa.int64() if name in counts else pa.float64()) for name in COLUMNS
+    ])
+    count = 0
+    with target.open("xb") as file, pq.ParquetWriter(file, schema) as writer:
+        rows: list[tuple[Any, ...]] = []
+
+        def flush() -> None:
+            columns = zip(*rows, strict=True) if rows else ((),) * len(COLUMNS)
+            arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
+            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
+            rows.clear()
+
+        for row in _rows(path, simulated):
+            rows.append(row)
+            count += 1
+            if len(rows) >= _ROWS:
+                flush()
+        flush()
+    return count

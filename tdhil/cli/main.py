@@ -1,0 +1,143 @@
+"""The command line: which command, with which options. Imports what a command needs only once it is chosen."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import logging
+import sys
+from collections.abc import Callable, Sequence
+
+from tdhil import __version__
+from tdhil.cli.streams import sheltered
+
+_COMMANDS = {
+    "identify": "put a drive into motion and identify its moment of inertia",
+    "replay": "identify again from a log, or from a trace that a drive's own tool exported",
+    "export": "a log's CAN frames or samples in another program's format",
+    "profiles": "what is known of which drive, what it needs set, and how sure that is",
+    "scan": "find out who is on the bus; writes nothing to any drive",
+    "doctor": "check adapter, permissions, bus, computer, profile and drive; writes nothing",
+    "recover": "say what a damaged log still holds, and make a clean copy of it",
+    "stop": "stop a drive from outside of any run: best effort, no emergency stop",
+    "simulate": "run the simulated rig as a process of its own",
+    "rig": "write a rig.yaml to fill in, with no drive at hand",
+    "support": "put a log and what is around it into one archive, for a support case",
+    "docs": "where the documentation and the examples are",
+    "study": "run the paper's experiments again, beside what it published",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
+    namespace = argparse.Namespace()
+    with sheltered():
+        try:
+            code = _main(list(sys.argv[1:] if argv is None else argv), namespace)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
+            return 130
+        except BrokenPipeError:
+            return 141      # whoever read our output has gone
+        except Exception as error:
+            return _report(error, getattr(namespace, "json", None) is True)
+    return code
+
+
+def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
+    # Libraries log what we report ourselves, with where and what next.
+    for library in ("can", "canopen"):
+        logging.getLogger(library).addHandler(logging.NullHandler())
+        logging.getLogger(library).propagate = False
+    parser = build_parser(_chosen(arguments))
+    parser.parse_args(arguments, namespace)
+    if namespace.command is None:
+        parser.print_help(sys.stderr)
+        return 2
+    return int(namespace.run(namespace))
+
+
+def build_parser(chosen: str | None) -> argparse.ArgumentParser:
+    """The parser; only the chosen command's options are built, since python-can's alone cost 150 ms to import."""
+    parser = argparse.ArgumentParser(
+        prog="tdhil",
+        description="Identifies the moment of inertia of a top drive, or of any inverter-driven machine, "
+        "with an interval that holds.",
+        epilog="tdhil COMMAND --help tells more. Ctrl-C stops the shaft, but it is no emergency stop: "
+        "keep the hard-wired one within reach.",
+    )
+    parser.add_argument("--version", action="version", version=f"tdhil {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    for name, summary in _COMMANDS.items():
+        # Options are written out in full: no `--y` may stand for --yes.
+        sub = commands.add_parser(
+            name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
+        )
+        if name == chosen:
+            _builder(name)(sub)
+    return parser
+
+
+def _chosen(arguments: Sequence[str]) -> str | None:
+    return next((argument for argument in arguments if not argument.startswith("-")), None)
+
+
+def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
+    if name == "identify":
+        from tdhil.cli.identify import add_arguments
+    elif name == "replay":
+        from tdhil.cli.replay import add_arguments
+    elif name == "stop":
+        from tdhil.cli.stop import add_arguments
+    elif name == "study":
+        from tdhil.cli.study import add_arguments
+    elif name == "export":
+        from tdhil.cli.export import add_arguments
+    elif name == "recover":
+        from tdhil.cli.recover import add_arguments
+    elif name == "profiles":
+        from tdhil.cli.profiles import add_arguments
+    elif name == "scan":
+        from tdhil.cli.scan import add_arguments
+    elif name == "rig":
+        from tdhil.cli.rig_new import add_arguments
+    elif name == "support":
+        from tdhil.cli.support import add_arguments
+    elif name == "docs":
+        from tdhil.cli.docs import add_arguments
+    elif name == "doctor":
+        from tdhil.cli.doctor import add_arguments
+    else:
+        from tdhil.cli.simulate import add_arguments
+    return add_arguments
+
+
+_THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOMEM, errno.EIO, errno.EROFS})
+"""Its state, not a mistake of ours: open files, disk, memory, a terminal that is gone."""
+
+
+def _report(error: Exception, as_json: bool) -> int:
+    """One message for an error of the tree; a traceback only for what is a mistake of ours."""
+    from tdhil.errors import ExitCode, TdhilError, exit_code
+
+    code = exit_code(error)
+    if isinstance(error, TdhilError):
+        print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
+    elif isinstance(error, OSError) and error.errno in _THE_SYSTEM_S:
+        print(f"tdhil: the system refused: {error.strerror or error}", file=sys.stderr)  # noqa: T201
+    else:
+        import traceback
+
+        traceback.print_exception(error, file=sys.stderr)
+        print("tdhil: internal error; please report it with the lines above", file=sys.stderr)  # noqa: T201
+        code = ExitCode.INTERNAL
+    if as_json:
+        document = {"error": {"kind": type(error).__name__, "message": str(error)}, "exit_code": int(code)}
+        print(json.dumps(document, ensure_ascii=False))  # noqa: T201
+    return int(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

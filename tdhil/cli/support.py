@@ -1,0 +1,199 @@
+"""`tdhil support run.mcap`: one archive for a support case, with nothing in it that tells of its sender."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import json
+import os
+import platform
+import re
+import socket
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from tdhil import __version__
+from tdhil.errors import ExitCode, UsageError
+from tdhil.record.errors import LogError
+
+LIBRARIES = (
+    "numpy", "scipy", "python-can", "canopen", "pymodbus", "pyserial", "mcap", "protobuf", "pydantic", "rich", "PyYAML",
+    "matplotlib", "jinja2",
+)
+VARIABLES = (
+    "LANG", "LC_ALL", "LC_CTYPE", "TERM", "PYTHONIOENCODING", "PYTHONUTF8", "CAN_INTERFACE", "CAN_CHANNEL",
+    "CAN_BITRATE", "OPENBLAS_CORETYPE", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS",
+)
+"""Of the environment only these: what else stands there is nobody's business."""
+
+_SECRET = re.compile(r"pass(word|wd|phrase)?|secret|token|api_?key|credential|authori[sz]ation|private", re.IGNORECASE)
+_PERSON = frozenset({"operator"})
+_HOMES = re.compile(r"((?:/home|/Users|[A-Za-z]:\\+Users)[/\\]+)[^/\\\s'\":;,]+")
+_LOGIN = re.compile(r"(\w+://)[^/@\s]+@")
+_ASSIGNED = re.compile(rf"((?:{_SECRET.pattern})\w*\s*[:=]\s*)[^\s,}}]+", re.IGNORECASE)
+_GONE = "<removed>"
+_SHORTEST_NAME = 4
+"""Characters; a shorter user name stands in words that mean something else."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of support."""
+    parser.add_argument("log", type=Path, metavar="run.mcap", help="the log of the run that it is about")
+    parser.add_argument("--rig", type=Path, metavar="rig.yaml", help="its rig.yaml, comments and all")
+    parser.add_argument("-o", "--output", type=Path, metavar="support.zip",
+                        help="default: beside the log; never over a file")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Exit 0: all of it; 3: the log could be read in part, or not at all. UsageError for files that can't be used."""
+    log: Path = namespace.log
+    target: Path = namespace.output or log.with_name(f"{log.stem}.support.zip")
+    if not log.is_file():
+        raise UsageError("there is no such log", where=str(log), next_step="Name a run.mcap of this tool")
+    if namespace.rig is not None and not namespace.rig.is_file():
+        raise UsageError("there is no such file", where=f"--rig {namespace.rig}")
+    scrub = Scrub.of_this_computer()
+    whole = True
+    try:
+        with target.open("xb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, text in about(log):
+                archive.writestr(name, scrub.text(text))
+            if namespace.rig is not None:
+                archive.writestr("rig.yaml", scrub.text(namespace.rig.read_text("utf-8", errors="replace")))
+            whole = _add_log(archive, log, scrub)
+            names = archive.namelist()
+    except FileExistsError:
+        raise UsageError("is there already, and is not written over", where=str(target),
+                         next_step="Name another with -o") from None
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(target)) from error
+    print(f"{target}: {', '.join(names)}")  # noqa: T201
+    print("Names of users, of this computer and of folders, and whatever looks like a secret, were taken out. "  # noqa: T201
+          "Look into it before you send it.", file=sys.stderr)
+    return int(ExitCode.OK if whole else ExitCode.PARTIAL)
+
+
+def about(log: Path) -> Iterable[tuple[str, str]]:
+    """(name in the archive, text): everything but the log itself and rig.yaml, not yet scrubbed."""
+    from tdhil.commands.doctor_host import host_findings
+
+    yield "versions.json", _json(versions())
+    yield "doctor.txt", "".join(f"{one.text}\n" for one in host_findings(log))
+
+
+def versions() -> dict[str, Any]:
+    """What runs here, and the few variables that change what it does."""
+    found: dict[str, str | None] = {}
+    for name in LIBRARIES:
+        with suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return {
+        "tdhil": __version__,
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "system": platform.system(),
+        "release": platform.release(),
+        "machine": platform.machine(),
+        "processors": os.cpu_count(),
+        "libraries": found,
+        "environment": {name: os.environ[name] for name in VARIABLES if name in os.environ},
+    }
+
+
+def _add_log(archive: zipfile.ZipFile, log: Path, scrub: Scrub) -> bool:
+    """The log with its texts scrubbed, and what it says of the run, as files that anybody reads."""
+    from tdhil.cli.recover import report
+    from tdhil.recording.salvage import examine, write_copy
+
+    try:
+        found = examine(log)
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / "run.mcap"
+            write_copy(log, copy, found, edit=scrub.message)
+            archive.write(copy, "run.mcap")
+    except LogError as error:
+        archive.writestr("log.txt", scrub.text(f"{log.name} is not in this archive: {error}\n"))
+        return False
+    run = found.run
+    summary = report(found, Path(log.name), None)
+    archive.writestr("log.json", _json(scrub.value({**summary, "size_bytes": log.stat().st_size})))
+    events = "".join(f"{one.time_s:.3f}  {one.kind}  {one.text}\n{one.traceback}" for one in run.events)
+    archive.writestr("events.txt", scrub.text(events))
+    configuration = dict(run.configuration)
+    for name in ("profile", "bench"):
+        if (part := configuration.pop(name, None)) is not None:
+            archive.writestr(f"{name}.json", _json(scrub.value(part)))
+    archive.writestr("configuration.json", _json(scrub.value(configuration)))
+    return found.whole
+
+
+class Scrub:
+    """Takes out who sent it: home folders, the names of user and computer, operators, logins, secrets."""
+
+    def __init__(self, *, home: str, names: Iterable[str]) -> None:
+        self._home = home if len(home) > 1 else ""
+        words = sorted({re.escape(name) for name in names if len(name) >= _SHORTEST_NAME}, key=len, reverse=True)
+        self._names = re.compile(rf"(?<![A-Za-z0-9])(?:{'|'.join(words)})(?![A-Za-z0-9])") if words else None
+
+    @classmethod
+    def of_this_computer(cls) -> Scrub:
+        """Names that mean something else in a log (root, user) stay."""
+        names = []
+        with suppress(Exception):      # no entry for this user, no variables either
+            names.append(getpass.getuser())
+        with suppress(OSError):
+            names.append(socket.gethostname())
+        return cls(home=str(Path.home()), names=[name for name in names if name not in ("root", "user", "localhost")])
+
+    def text(self, text: str) -> str:
+        """One text of whatever kind."""
+        if self._home:
+            text = text.replace(self._home, "~")
+        text = _HOMES.sub(r"\1<user>", text)
+        text = _LOGIN.sub(rf"\1{_GONE}@", text)
+        text = _ASSIGNED.sub(lambda found: found[1] + _GONE, text)
+        return self._names.sub("<name>", text) if self._names is not None else text
+
+    def value(self, value: Any, key: str = "") -> Any:
+        """Plain data, all the way down."""
+        if value not in (None, "") and isinstance(key, str) and (_SECRET.search(key) or key in _PERSON):
+            return _GONE
+        if isinstance(value, str):
+            return self.text(value)
+        if isinstance(value, Mapping):
+            return {self.text(str(name)): self.value(one, str(name)) for name, one in value.items()}
+        if isinstance(value, list | tuple):
+            return [self.value(one) for one in value]
+        return value
+
+    def message(self, channel: int, payload: bytes) -> bytes:
+        """A message of a log: its numbers as they are, its texts scrubbed."""
+        from google.protobuf.descriptor import FieldDescriptor
+
+        from tdhil.recording.log_format import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE
+
+        if channel in (SAMPLE, COMMAND, CAN, MODBUS, EXCITATION):
+            return payload
+        message = CLASSES[CHANNELS[channel][1]].FromString(payload)
+        for field in message.DESCRIPTOR.fields:
+            if field.type != FieldDescriptor.TYPE_STRING:
+                continue
+            text = getattr(message, field.name)
+            try:
+                text = json.dumps(self.value(json.loads(text)), ensure_ascii=False) if field.name == "json" else None
+            except ValueError:
+                text = None
+            setattr(message, field.name, self.text(getattr(message, field.name)) if text is None else text)
+        scrubbed: bytes = message.SerializeToString()
+        return scrubbed
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, indent=2) + "\n"

@@ -1,0 +1,103 @@
+"""From rig.yaml and the command line to what the protocol is told."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from drivers.drive import Identity
+from tdhil.config.options import RunOptions
+from tdhil.config.rig import Rig, require_limits, simulated_default_rig
+from tdhil.recording.recording import LagPrior
+from tdhil.run.settings import ExcitationRequest, MachineLimits
+
+ASSUMED_TORQUE_SCALE_REL_SD = 0.03
+"""Where nobody says how good a real drive's torque scale is: inverters know it to some percent."""
+
+UNKNOWN_LAG_SD_SHARE = 0.1
+"""Standard deviation of a lag that rig.yaml states without one."""
+
+
+def bench_of(identity: Identity, rig: Rig | None) -> Rig:
+    """The bench for this peer: a real one needs rig.yaml's limits, a simulated one has its own.
+
+    Raises PreflightRefused without limits.
+    """
+    if identity.simulated:
+        return simulated_default_rig(rig)
+    require_limits(rig)
+    assert rig is not None
+    return rig
+
+
+def machine_limits(
+    bench: Rig, *, accept_no_watchdog: bool = False, accept_shared_watchdog: bool = False,
+    accept_wider: Collection[str] = (), accept_speed_unit: bool = False,
+) -> MachineLimits:
+    """The guard's limits. Raises PreflightRefused where the rig has none.
+
+    What is accepted is a run's, on its own command line: no file of the bench says it.
+    """
+    limits = require_limits(bench)
+    return MachineLimits(
+        speed_min_rad_s=limits.speed_min_rad_s,
+        speed_max_rad_s=limits.speed_max_rad_s,
+        torque_nm=limits.torque_nm,
+        time_s=limits.time_s,
+        quick_stop_rad_s2=limits.quick_stop_rad_s2,
+        watchdog_s=limits.watchdog_s,
+        temperature_c=limits.temperature_c,
+        probe_torque_nm=limits.probe_torque_nm,
+        probe_travel_rad=limits.probe_travel_rad,
+        allow_reverse=bench.allow_reverse,
+        load=bench.load,
+        torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
+        accept_no_watchdog=accept_no_watchdog,
+        accept_shared_watchdog=accept_shared_watchdog,
+        accept_wider=frozenset(accept_wider),
+        accept_speed_unit=accept_speed_unit,
+    )
+
+
+def excitation_request(options: RunOptions) -> ExcitationRequest:
+    """What stage 5 shall do."""
+    return ExcitationRequest(
+        kind=options.excitation,
+        mode=options.mode,
+        frequency_hz=options.frequency_hz,
+        amplitude_rad_s=options.amplitude_rad_s,
+        offset_rad_s=options.offset_rad_s,
+        periods=options.periods,
+        confidence=options.confidence,
+        tolerance=options.tolerance if options.given("tolerance") else None,
+        max_time_s=options.max_time_s,
+    )
+
+
+def lag_prior(bench: Rig) -> LagPrior:
+    """What rig.yaml says of the reporting lags."""
+    data = bench.drive_data
+
+    def deviation(lag_s: float | None, stated_s: float | None) -> float:
+        if lag_s is None:
+            return 0.0
+        return stated_s if stated_s is not None else UNKNOWN_LAG_SD_SHARE * lag_s
+
+    known = data.speed_lag_s is not None or data.torque_lag_s is not None
+    return LagPrior(
+        data.speed_lag_s,
+        deviation(data.speed_lag_s, data.speed_lag_sd_s),
+        data.torque_lag_s,
+        deviation(data.torque_lag_s, data.torque_lag_sd_s),
+        "rig.yaml" if known else "",
+    )
+
+
+def facts(bench: Rig) -> dict[str, Any]:
+    """What a Recording must know of the bench."""
+    scale = bench.drive_data.torque_scale_rel_sd
+    return {
+        "gear_ratio": bench.gear.ratio,
+        "torque_scale_rel_sd": ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
+        "lag_prior": lag_prior(bench),
+    }

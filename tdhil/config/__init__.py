@@ -1,0 +1,1 @@
+"""What a run is told: rig.yaml, and every option with where its value came from."""

@@ -1,0 +1,353 @@
+"""One bench: drive, bus, gear, load, machine limits, and what its user always wants of a run.
+
+`Rig` mirrors rig.yaml key by key; units stand in the names, all of them SI. Torque and speed are those of the
+motor shaft. It is frozen, and knows from which line of which file each of its keys came::
+
+    drive: canopen
+    bus: {interface: socketcan, channel: can0, bitrate: 500000}
+    node: 1
+    limits:
+      speed_min_rad_s: 0.5
+      …
+"""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, PrivateAttr, ValidationError
+
+from drivers.errors import DataFileError, PreflightRefused, Problem
+from profiles.model import DataModel, Finding
+from profiles.yaml_loader import Conversion, load_with_lines
+from profiles.yaml_messages import messages_of
+
+
+def _within(low: float, high: float, *, zero: bool = False) -> Any:
+    """A number that some machine could have: what lies beyond is a slip, and no arithmetic is to choke on it."""
+    return Field(ge=0.0 if zero else low, le=high)
+
+
+Positive = Annotated[float, _within(1e-9, 1e9)]
+NotNegative = Annotated[float, _within(0.0, 1e9, zero=True)]
+Torque = Annotated[float, _within(1e-6, 1e7)]
+Speed = Annotated[float, Field(ge=-1e5, le=1e5)]
+Time = Annotated[float, _within(1e-6, 1e7)]
+Inertia = Annotated[float, _within(1e-9, 1e9)]
+Ratio = Annotated[float, _within(1e-6, 1e6)]
+Amplitude = Annotated[float, _within(1e-9, 1e5)]
+Frequency = Annotated[float, _within(1e-6, 1e4)]
+
+CAN_BIT_RATES = (
+    5_000, 10_000, 20_000, 33_000, 33_333, 47_000, 47_619, 50_000, 62_000, 62_500, 83_000, 83_300, 83_333, 95_000,
+    95_238, 100_000, 125_000, 200_000, 250_000, 400_000, 500_000, 750_000, 800_000, 1_000_000,
+)
+"""bit/s that CiA 301 names, and what else adapters have."""
+
+
+def bit_rate_problem(bit_s: int) -> str:
+    """What is wrong with a CAN bit rate; '' where it is one."""
+    if bit_s in CAN_BIT_RATES:
+        return ""
+    if bit_s * 1000 in CAN_BIT_RATES:
+        return f"{bit_s} bit/s is none of CAN's; {bit_s}k is one: {bit_s * 1000}"
+    nearest = min(CAN_BIT_RATES, key=lambda one: abs(math.log(one / max(bit_s, 1))))
+    return f"{bit_s} bit/s is none of CAN's; the nearest is {nearest}"
+
+
+class Bus(DataModel):
+    """python-can's own options; what is missing here is looked for in its environment variables and files."""
+
+    interface: str | None = Field(default=None, min_length=1, description="as for -i: socketcan, pcan, slcan …")
+    channel: str | int | None = Field(default=None, description="as for -c: can0, PCAN_USBBUS1 …")
+    bitrate: int | None = Field(default=None, gt=0, description="bit/s; socketcan: as the link has it")
+    options: dict[str, str | int | float | bool] = Field(default={}, description="what else the interface takes")
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A bit rate that CAN doesn't know."""
+        bitrate = values.get("bitrate")
+        wrong = "" if bitrate is None else bit_rate_problem(bitrate)
+        return [("bitrate", wrong)] if wrong else []
+
+
+class Modbus(DataModel):
+    """Where a Modbus drive is reached; what is missing here is as the profile's ``line`` says."""
+
+    host: str | None = Field(default=None, min_length=1, description="Modbus TCP: name or address of the drive")
+    port: int | None = Field(default=None, ge=1, le=65535, description="TCP port")
+    serial: str | None = Field(default=None, min_length=1, description="Modbus RTU: device, such as /dev/ttyUSB0")
+    baud: int | None = Field(default=None, ge=1200, le=1_000_000, description="bit/s on the serial line")
+    parity: Literal["N", "E", "O"] | None = Field(default=None, description="of the serial line: N, E or O")
+    stop_bits: Literal[1, 2] | None = Field(default=None, description="of the serial line")
+    unit: int | None = Field(default=None, ge=0, le=255, description="unit (slave) number of the drive")
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """One line only, and a unit that it knows."""
+        findings = []
+        host, serial, unit = (values.get(name) for name in ("host", "serial", "unit"))
+        if host is not None and serial is not None:
+            findings.append(("serial", "and host exclude each other; keep one"))
+        if serial is not None and unit is not None and not 1 <= unit <= 247:
+            findings.append(("unit", f"must be 1 to 247 on a serial line, not {unit}"))
+        return findings
+
+
+class Limits(DataModel):
+    """What the machine may do; watched by the host and, where it can, by the drive."""
+
+    speed_min_rad_s: Speed = Field(description="rad/s; lowest speed while torque is regulated")
+    speed_max_rad_s: Annotated[float, _within(1e-6, 1e5)] = Field(description="rad/s; highest speed")
+    torque_nm: Torque = Field(description="N·m; highest torque, either sign")
+    time_s: Time = Field(description="s; longest run")
+    quick_stop_rad_s2: Positive = Field(description="rad/s²; how hard the shaft is braked")
+    watchdog_s: float = Field(default=0.5, ge=0.02, le=5, description="s of silence until the drive stops by itself")
+    temperature_c: float | None = Field(
+        default=None, gt=0, le=300, description="°C; above it a run is stopped, where the drive tells a temperature"
+    )
+    probe_torque_nm: Torque = Field(description="N·m; highest torque to find out the direction and the breakaway")
+    probe_travel_rad: Positive = Field(description="rad; farthest the shaft may turn while doing so")
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A window that is empty, and a probe beyond the limit."""
+        findings = []
+        lowest, highest = values.get("speed_min_rad_s"), values.get("speed_max_rad_s")
+        if lowest is not None and highest is not None and lowest >= highest:
+            findings.append(("speed_min_rad_s", f"must be below speed_max_rad_s, which is {highest:g}"))
+        probe, most = values.get("probe_torque_nm"), values.get("torque_nm")
+        if probe is not None and most is not None and probe > most:
+            findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {most:g}"))
+        return findings
+
+
+class Gear(DataModel):
+    """Between motor and main shaft."""
+
+    ratio: Ratio = Field(default=1.0, description="i = ω_motor / ω_main; J at the main shaft is J·i²")
+
+
+class DriveData(DataModel):
+    """What the drive does not tell of itself, and how far it can be trusted."""
+
+    rated_torque_nm: Torque | None = Field(default=None, description="N·m; name plate, where 6076h does not say")
+    torque_scale_rel_sd: float | None = Field(
+        default=None, ge=0, lt=1, description="standard deviation of the drive's torque scale, as a share (0.02 = 2 %)"
+    )
+    speed_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported speed")
+    speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
+    torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    parameters: dict[str, float] = Field(
+        default={}, description="drive parameters that can't be read over the bus, by the profile's names, in its units"
+    )
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A deviation of nothing."""
+        return [
+            (f"{name}_sd_s", f"needs {name}_s, the value that it is the deviation of")
+            for name in ("speed_lag", "torque_lag")
+            if values.get(f"{name}_sd_s") is not None and values.get(f"{name}_s", ...) is None
+        ]
+
+
+class Expected(DataModel):
+    """What is expected of the shaft, for planning before it has moved (`--dry-run`); never used for the result."""
+
+    inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor")
+    viscous_nm_s_rad: NotNegative | None = Field(default=None, description="N·m·s/rad")
+    coulomb_nm: Annotated[float, _within(0.0, 1e7, zero=True)] | None = Field(default=None, description="N·m")
+    load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of what disturbs")
+
+
+_OPERATORS = {
+    "yes": "--yes",
+    "accept_no_watchdog": "--accept-no-watchdog",
+    "accept_shared_watchdog": "--accept-shared-watchdog",
+    "accept_wider_limit": "--accept-wider-limit NAME",
+    "accept_wider_limits": "--accept-wider-limit NAME",
+    "accept_speed_unit": "--accept-speed-unit",
+    "reset_fault": "--reset-fault",
+}
+ExcitationKind = Literal["multisine", "sine", "step", "pulses", "coast-down"]
+"""What stage 5 can do."""
+
+_ONLY_THE_OPERATOR = {
+    key: f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the command line"
+    for key, flag in _OPERATORS.items()
+}
+
+
+class Run(DataModel):
+    """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
+
+    never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
+
+    excitation: ExcitationKind | None = None
+    mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
+    frequency_hz: Frequency | None = Field(default=None, description="Hz; base frequency of the excitation")
+    amplitude_rad_s: Amplitude | None = Field(default=None, description="rad/s; amplitude of the speed")
+    offset_rad_s: Speed | None = Field(default=None, description="rad/s; mean speed")
+    periods: int | None = Field(default=None, ge=1, le=10_000)
+    tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
+    max_time_s: Time | None = Field(default=None, description="s; longest stage 5")
+    model: Literal["auto", "rigid", "two-mass", "string", "paper"] | None = Field(
+        default=None, description="of the shaft; auto: the simplest that fits"
+    )
+    confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
+    seed: int | None = Field(default=None, ge=0, le=2**63 - 1, description="repeats a simulated run")
+    simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")
+    real_time: bool | None = Field(default=None, description="simulator against the wall clock")
+    stepped: bool | None = Field(default=None, description="simulator in another process, stepped by SYNC")
+    json_: bool | None = Field(default=None, alias="json", description="one JSON document on stdout")
+    log: str | None = Field(default=None, min_length=1, description="file to write, from the working directory")
+    plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
+    trace: str | None = Field(default=None, min_length=1, description="CSV of the simulated rig's true shaft")
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """Two clocks."""
+        both = values.get("real_time") and values.get("stepped")
+        return [("stepped", "and real_time exclude each other; keep one")] if both else []
+
+
+class Rig(DataModel):
+    """Everything that a bench has; each key is optional until something needs it."""
+
+    never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
+
+    name: str | None = Field(default=None, min_length=1, max_length=200, description="of the rig, for reports and logs")
+    drive: Literal["canopen", "modbus"] | None = None
+    bus: Bus = Bus()
+    node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
+    modbus: Modbus = Modbus()
+    profile: str | None = Field(default=None, min_length=1, description="name, or a .yaml file beside rig.yaml")
+    accept_unverified: tuple[str, ...] | None = Field(
+        default=None, description="entries of the profile that are taken although nobody verified them"
+    )
+    rate_hz: float | None = Field(default=None, gt=0, le=2000, description="cycles a second")
+    limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
+    gear: Gear = Gear()
+    load: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
+    make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; of the string's joints")
+    torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
+    allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
+    drive_data: DriveData = DriveData()
+    expected: Expected = Expected()
+    reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
+    run: Run = Run()
+
+    _file: str = PrivateAttr(default="")
+    _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})
+    _conversions: tuple[Conversion, ...] = PrivateAttr(default=())
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """What a string needs, and limits that don't fit the rest."""
+        is_string = values.get("load") == "string"
+        findings = [
+            ("load", f"string needs '{name}' ({_describe(name)})")
+            for name in ("make_up_torque_nm", "torque_ramp_nm_s")
+            if is_string and values.get(name, ...) is None
+        ]
+        limits: Mapping[str, Any] = values.get("limits") or {}
+        torque, lowest, watchdog = (limits.get(name) for name in ("torque_nm", "speed_min_rad_s", "watchdog_s"))
+        make_up, rate_hz = values.get("make_up_torque_nm"), values.get("rate_hz")
+        if is_string and make_up and torque is not None and torque >= make_up:
+            findings.append(("limits.torque_nm", f"must be below make_up_torque_nm, which is {make_up:g}"))
+        if lowest is not None and lowest < 0 and values.get("allow_reverse") is False:
+            findings.append(("limits.speed_min_rad_s", "below 0 the shaft runs backwards: needs allow_reverse: true"))
+        if rate_hz and watchdog is not None and watchdog * rate_hz < 5:
+            findings.append(("limits.watchdog_s", f"must span at least 5 cycles ({5 / rate_hz:g} s at rate_hz)"))
+        return findings
+
+    def line(self, dotted: str) -> int:
+        """The line in rig.yaml of a key such as ``limits.torque_nm``; 0 where it does not stand there."""
+        return self._lines.get(tuple(dotted.split(".")), 0)
+
+    def source(self, dotted: str) -> str:
+        """``rig.yaml:7``, or '' where the key does not stand in the file."""
+        line = self.line(dotted)
+        return f"{Path(self._file).name}:{line}" if line else ""
+
+    @property
+    def conversions(self) -> tuple[tuple[str, str, str], ...]:
+        """(key, '100 rpm = 10.47 rad/s', 'rig.yaml:7') of everything that stood there in a unit of its own."""
+        keys = [".".join(map(str, one.path)) for one in self._conversions]
+        return tuple((key, one.text, self.source(key)) for key, one in zip(keys, self._conversions, strict=True))
+
+    def get(self, dotted: str) -> Any:
+        """The value of a key such as ``run.seed``."""
+        value: Any = self
+        for part in dotted.split("."):
+            value = getattr(value, "json_" if part == "json" else part)
+        return value
+
+    @property
+    def file(self) -> str:
+        """The file that it was read from; '' for none."""
+        return self._file
+
+    @property
+    def folder(self) -> Path:
+        """Where the files that rig.yaml names are looked for."""
+        return Path(self._file).parent
+
+
+def load_rig(path: Path) -> Rig:
+    """The bench in a rig.yaml; DataFileError with every problem and its line. Values with a unit become SI."""
+    loaded = load_with_lines(path, Rig, convert=True)
+    rig = loaded.value
+    rig._file, rig._lines, rig._conversions = loaded.file, loaded.lines, loaded.conversions
+    return rig
+
+
+def require_limits(rig: Rig | None) -> Limits:
+    """The limits, without which nothing real moves; PreflightRefused, naming the keys, where there are none."""
+    if rig is not None and rig.limits is not None:
+        return rig.limits
+    keys = ", ".join(name for name, field in Limits.model_fields.items() if field.is_required())
+    file = rig._file if rig is not None and rig._file else ""
+    where = file or "rig.yaml"
+    step = f"Add a section limits: with {keys} (docs: rig.yaml)" + ("" if file else ", and name the file with --rig")
+    raise PreflightRefused("no machine limits for a drive that is not simulated", where=where, next_step=step)
+
+
+_SIMULATED_LIMITS = Limits(
+    speed_min_rad_s=0.5,
+    speed_max_rad_s=10.0,
+    torque_nm=400.0,
+    time_s=900.0,
+    quick_stop_rad_s2=2.0,
+    watchdog_s=0.5,
+    probe_torque_nm=200.0,
+    probe_travel_rad=3.0,
+)
+_SIMULATED_TORQUE_SCALE_SD = 0.02
+
+
+def simulated_default_rig(rig: Rig | None = None) -> Rig:
+    """The bench of the simulated rig; what ``rig`` says goes before it. DataFileError where they don't fit."""
+    rig = rig or Rig()
+    data = rig.model_dump(by_alias=True)
+    data["limits"] = data["limits"] or _SIMULATED_LIMITS.model_dump()
+    if data["drive_data"]["torque_scale_rel_sd"] is None:
+        data["drive_data"]["torque_scale_rel_sd"] = _SIMULATED_TORQUE_SCALE_SD
+    try:
+        filled = Rig.model_validate(data)
+    except ValidationError as error:
+        file = rig._file or "rig"
+        found = [
+            Problem(file, rig.line(".".join(map(str, path))), f"{'.'.join(map(str, path))}: {message} (simulated rig)")
+            for path, message in messages_of(error, data, Rig)
+        ]
+        raise DataFileError(tuple(found)) from None
+    filled._file, filled._lines, filled._conversions = rig._file, rig._lines, rig._conversions
+    return filled
+
+
+def _describe(name: str) -> str:
+    return Rig.model_fields[name].description or name

@@ -1,0 +1,135 @@
+"""The case that identification works on, and the finding that a route brings back: what every verdict is made of."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
+from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines
+from tdhil.estimation.result import (
+    BudgetLine,
+    Compliant,
+    Estimate,
+    FrictionPoint,
+    LinePoint,
+    PaperEstimate,
+    Refusal,
+    ResidualTest,
+    SecondOpinion,
+)
+from tdhil.estimation.samples import Samples, Stretch
+from tdhil.identify.lines.residual import rejects
+from tdhil.identify.options import Options
+from tdhil.recording.recording import Recording, Stage
+
+
+def _no_samples() -> Samples:
+    return Samples(np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording, what is asked of it, and what is known of it so far.
+
+    ``recording``: up to the ``aborted`` stage, if one was. ``levels``: of the excited segments; None without any.
+    ``sound``: nothing is wrong with the data as such, so that a second opinion on them is worth having.
+    """
+
+    recording: Recording
+    options: Options
+    aborted: Stage | None = None
+    samples: Samples = field(default_factory=_no_samples)
+    paper: PaperEstimate | None = None
+    periods_used: int = 0
+    samples_used: int = 0
+    warnings: tuple[str, ...] = ()
+    levels: Levels | None = None
+    sound: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeriodicCase(Case):
+    """A case with periodic excitation: its whole periods, their lines, and B from the levels.
+
+    ``every``: the lines pooled over the segments. ``lines``: those where both signals stand clear of the scatter;
+    ``usable``: where one of them does.
+    """
+
+    levels: Levels
+    stretches: tuple[Stretch, ...]
+    fits: tuple[PeriodLines, ...]
+    tie: ViscousTie | None
+    every: tuple[Line, ...]
+    lines: tuple[Line, ...] = ()
+    usable: tuple[Line, ...] = ()
+
+
+@dataclass(frozen=True)
+class Words:
+    """A model in the reader's words, and what to do next: where the data contradict it, where its interval is wide.
+
+    ``what`` ``explains`` the data; ``spread``: what is called too wide; ``digits``: of p where it is contradicted.
+    """
+
+    what: str = ""
+    if_rejected: str = ""
+    if_wide: str = ""
+    explains: str = "explains the data"
+    spread: str = "interval"
+    digits: int = 1
+
+
+_NONE, _WORDLESS = Refusal("", ""), Words()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a route makes of a case, in one form whichever route: `verdict.conclude` makes the verdict of it.
+
+    ``inertia``: as the data have it, bounded; None where the residuals contradict the model, of which then nothing else
+    is told, and where it can't be told, as the ``refusal`` says. ``conditions``: what J is conditional on besides the
+    torque scale. ``bent``: the model has friction that is no straight line over speed. ``samples_used``: None for the
+    case's own. ``preface`` and ``remark`` stand before and after the sentence on the model. ``reading_kg_m2``: by how
+    much more J may be off on either side for the moment at which torque is read; ``advice``: instead of the usual.
+    """
+
+    model: str = "none"
+    words: Words = _WORDLESS
+    residual: ResidualTest | None = None
+    refusal: Refusal = _NONE
+    inertia: Estimate | None = None
+    conditions: tuple[str, ...] = ()
+    viscous_nm_s_rad: Estimate | None = None
+    coulomb_nm: Estimate | None = None
+    speed_lag_s: Estimate | None = None
+    torque_lag_s: Estimate | None = None
+    skew_s: Estimate | None = None
+    bent: bool = False
+    compliant: Compliant | None = None
+    budget: tuple[BudgetLine, ...] = ()
+    lines: tuple[LinePoint, ...] = ()
+    warnings: tuple[str, ...] = ()
+    samples_used: int | None = None
+    preface: str = ""
+    remark: str = ""
+    second_opinions: tuple[SecondOpinion, ...] = ()
+    friction_curve: tuple[FrictionPoint, ...] = ()
+    reading_kg_m2: float = 0.0
+    advice: str = ""
+
+    @property
+    def rejected(self) -> bool:
+        """Do the data contradict the model?"""
+        return rejects(self.residual)
+
+    @property
+    def contradicted(self) -> str:
+        """The sentence on a model that the data contradict."""
+        p_value = "" if self.residual is None else f" (p = {self.residual.p_value:.{self.words.digits}g})"
+        return f"the residuals contradict {self.words.what}{p_value}{self.remark}"
+
+    @property
+    def explained(self) -> str:
+        """The sentence on a model that stands."""
+        tested = ", untested" if self.residual is None else f" (p = {self.residual.p_value:.2g})"
+        return f"{self.preface}{self.words.what} {self.words.explains}{tested}{self.remark}"

@@ -1,0 +1,94 @@
+"""From a finding to the conclusion: which verdict, why, and what the number rests on. Here alone is one made."""
+
+from dataclasses import replace
+
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.result import Identification, InertiaEstimate, Verdict
+from tdhil.identify.options import Options
+from tdhil.identify.torque_scale import widened_most_by_scale, with_total
+from tdhil.recording.recording import Stage
+
+_SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"
+_BY_SCALE = "the drive's torque, checked against a known one, would sharpen this most"
+
+
+def conclude(case: Case, finding: Finding) -> Identification:
+    """The verdict on whatever was found. An abort goes before all else that the data say: without it they might differ.
+
+    ``valid`` where the interval is as narrow as was asked for, ``valid_wide`` where it is bounded, ``model_rejected``
+    by the residuals' p-value, ``not_identifiable`` where a route had to refuse.
+    """
+    inertia = _inertia(case, finding)
+    verdict, reason, advice = _judged(case.options, finding, inertia)
+    warnings = (*case.warnings, *finding.warnings)
+    if case.aborted is not None:
+        said = _aborted(case.aborted)
+        if inertia is not None:
+            warnings = (f"{said}: the result is from what was recorded before", *warnings)
+        else:
+            reason = f"{said}; what was recorded before can't tell: {reason}"
+            advice = "mend what ended the run, and run it again"
+    return Identification(
+        verdict=verdict,
+        model=finding.model,
+        reason=reason,
+        advice=advice,
+        inertia=inertia,
+        viscous_nm_s_rad=finding.viscous_nm_s_rad,
+        coulomb_nm=finding.coulomb_nm,
+        speed_lag_s=finding.speed_lag_s,
+        torque_lag_s=finding.torque_lag_s,
+        skew_s=finding.skew_s,
+        paper=case.paper,
+        residual=finding.residual,
+        periods_used=case.periods_used,
+        samples_used=case.samples_used if finding.samples_used is None else finding.samples_used,
+        warnings=warnings,
+        budget=finding.budget,
+        second_opinions=finding.second_opinions,
+        friction_curve=finding.friction_curve,
+        compliant=finding.compliant,
+        lines=finding.lines,
+    )
+
+
+def _inertia(case: Case, finding: Finding) -> InertiaEstimate | None:
+    """With the torque scale's uncertainty in quadrature, and what the reading of torque adds on either side."""
+    if finding.inertia is None:
+        return None
+    conditions = ("torque scale exact", *finding.conditions)
+    told = with_total(finding.inertia, case.recording.torque_scale_rel_sd, case.options.confidence, conditions)
+    half = finding.reading_kg_m2
+    if half == 0.0:
+        return told
+    return replace(
+        told,
+        low=max(told.low - half, 0.0),
+        high=told.high + half,
+        low_total=max(told.low_total - half, 0.0),
+        high_total=told.high_total + half,
+    )
+
+
+def _judged(options: Options, finding: Finding, inertia: InertiaEstimate | None) -> tuple[Verdict, str, str]:
+    """The verdict, its reason and the advice."""
+    if finding.rejected:
+        return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected
+    if finding.inertia is None or inertia is None:
+        return Verdict.NOT_IDENTIFIABLE, finding.refusal.reason, finding.refusal.advice
+    wide = f"wider than ±{options.tolerance:.2%}"
+    own = 0.5 * (finding.inertia.high - finding.inertia.low) / finding.inertia.value
+    whole = 0.5 * (inertia.high - inertia.low) / inertia.value
+    if not own <= options.tolerance:
+        reason = f"{finding.explained}, but the {finding.words.spread} is ±{own:.2%}, {wide}"
+        return Verdict.VALID_WIDE, reason, finding.advice or finding.words.if_wide
+    if whole > options.tolerance:
+        reason = f"{finding.explained}, but the interval is ±{whole:.2%}, {wide}"
+        return Verdict.VALID_WIDE, reason, finding.advice or _SHARPER
+    advice = _BY_SCALE if widened_most_by_scale(inertia) else finding.advice or _SHARPER
+    return Verdict.VALID, finding.explained, advice
+
+
+def _aborted(stage: Stage) -> str:
+    cause = f" ({stage.detail})" if stage.detail else ""
+    return f"the run was aborted in stage {stage.name}{cause}"

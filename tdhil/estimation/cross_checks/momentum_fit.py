@@ -1,0 +1,151 @@
+"""Inertia and friction from balances of momentum: generalised least squares with a disturbance of unknown density.
+
+Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum_rows`: C is tridiagonal). D is known twice:
+from the scatter of the excited periods' mean torque (`friction.Levels.density`), and from the residuals of the rows
+themselves. They are pooled, unless the rows scatter more than the periods allow (F test, 1 %): then friction or load
+behave otherwise in the changes of speed, and the rows' own scatter is what the interval must be built on.
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from tdhil.estimation.cross_checks.momentum import Balances
+from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.identify.beside.momentum_rows import Kind, Row, overlap_s
+from tdhil.recording.recording import FloatArray
+
+_ROWS_DIFFER_P = 0.01
+_LEAST_DOF = 3.0
+_LEAST_CHANGE = 0.1       # of the greatest speed: rows that change it by less say nothing of J worth a number
+
+
+@dataclass(frozen=True)
+class Density:
+    """Mean square of the disturbance times duration, (N·m)²·s, and the degrees of freedom behind it."""
+
+    value: float
+    dof: float
+
+
+@dataclass(frozen=True)
+class Delay:
+    """δ = τ_w − τ_T, delay of the reported speed behind the reported torque, s; ``known``: fitted or stated."""
+
+    seconds: float
+    sd_s: float
+    known: bool
+
+
+UNKNOWN_DELAY = Delay(0.0, 0.25, False)
+"""Up to half a second either way, two deviations: where nobody knows."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Standard deviation of what rounding leaves in a mean: of speed, rad/s, and of torque, N·m."""
+
+    speed_rad_s: float
+    torque_nm: float
+
+
+@dataclass(frozen=True)
+class MomentumFit:
+    """J kg·m², its half-width at the confidence asked for, and of what it is made (kg·m², one standard deviation).
+
+    ``rows`` is how many changes of speed it rests on; ``density`` is pooled.
+    """
+
+    inertia: float
+    half_width: float
+    scatter_sd: float
+    delay_sd: float
+    viscous: float
+    rows: int
+    density: Density
+
+
+def fit_momentum(
+    found: Balances, kind: Kind, levels: Density, delay: Delay, resolution: Resolution, confidence: float
+) -> MomentumFit | None:
+    """J from the rows of one kind; the others serve for friction where their speed hardly changes. None if they can't.
+
+    Raises LinAlgError where the rows make no system.
+    """
+    fastest = max(abs(row.travel_rad) / row.time_s for row in found.rows)
+
+    def changes(row: Row) -> bool:
+        return abs(row.change_rad_s) >= _LEAST_CHANGE * fastest
+
+    rows = [row for row in found.rows if row.kind is kind or not changes(row)]
+    count = sum(1 for row in rows if row.kind is kind and changes(row))
+    if count == 0 or len(rows) < 3:
+        return None
+    covariance = _covariance(rows)
+    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+    impulse = inverse @ np.array([row.impulse_nm_s for row in rows])
+
+    def solve(delay_s: float) -> tuple[FloatArray, FloatArray, float]:
+        design = inverse @ _design(rows, delay_s, found.direction)
+        scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+        normal = (design / scale).T @ (design / scale)
+        if np.linalg.cond(normal) > 1e12:
+            raise np.linalg.LinAlgError("friction and inertia can't be told apart")
+        spread: FloatArray = np.linalg.inv(normal) / np.outer(scale, scale)
+        x: FloatArray = spread @ (design.T @ impulse)
+        return x, spread, float(np.sum((impulse - design @ x) ** 2))
+
+    x, spread, rest = solve(delay.seconds)
+    density = _pooled(levels, rest, len(rows) - 3)
+    if density is None or not x[0] > 0.0:
+        return None
+    shifted = abs(float(solve(delay.seconds + delay.sd_s)[0][0] - x[0]))
+    design = inverse @ _design(rows, delay.seconds, found.direction)
+    gain = (spread @ design.T @ inverse)[0]                       # ∂J/∂(impulse of each row)
+    edges = gain * float(x[0])
+    # a rounded speed is wrong at a knot: by the same amount, with opposite sign, in the two rows that share it
+    knots = np.append(edges, 0.0) - np.append(0.0, edges)
+    rounding = math.hypot(
+        resolution.speed_rad_s * float(np.linalg.norm(knots)),
+        resolution.torque_nm * float(np.linalg.norm(gain * np.array([row.time_s for row in rows]))),
+    )
+    scatter = math.sqrt(density.value * float(spread[0, 0]))
+    half = math.hypot(
+        student_quantile(confidence, density.dof) * scatter,
+        student_quantile(confidence, 1e6) * math.hypot(shifted, rounding),
+    )
+    return MomentumFit(float(x[0]), half, scatter, shifted, float(x[1]), count, density)
+
+
+def _covariance(rows: list[Row]) -> FloatArray:
+    covariance = np.diag([row.energy_s for row in rows])
+    for i, (earlier, later) in enumerate(pairwise(rows)):
+        covariance[i, i + 1] = covariance[i + 1, i] = overlap_s(earlier, later)
+    return covariance
+
+
+def _design(rows: list[Row], delay_s: float, direction: float) -> FloatArray:
+    """(rows, 3): columns J, B, T_c."""
+    table = []
+    for row in rows:
+        delay = 0.0 if row.kind is Kind.COASTING else delay_s
+        table.append([
+            row.change_rad_s + delay * row.change_rad_s2,
+            row.travel_rad + delay * row.change_rad_s,
+            direction * row.time_s,
+        ])
+    return np.array(table, dtype=np.float64)
+
+
+def _pooled(levels: Density, rest: float, left: int) -> Density | None:
+    from scipy.stats import f
+
+    own = rest / left if left > 0 else 0.0
+    if levels.dof < 1.0 or not levels.value > 0.0:
+        return Density(own, float(left)) if left >= _LEAST_DOF else None
+    if left > 0 and float(f.sf(own / levels.value, left, levels.dof)) < _ROWS_DIFFER_P:
+        return Density(own, float(left))
+    total = levels.dof + left
+    return Density((levels.dof * levels.value + rest) / total, total)

@@ -1,0 +1,182 @@
+"""J by another route through the same run: a balance of momentum instead of lines, and whether the two agree.
+
+The lines tell J by how torque and speed swing together, and need the reports' lags for it. The balances tell it by what
+torque it took to get from one steady speed to another (the ramps of stages 2 and 3, the way to stage 5, the change
+between its mean speeds, the plateaus of a square wave), or how fast the shaft slows down by friction alone; they hardly
+know a lag. The two share the friction and the torque's scale, and otherwise use different stretches of the run, so
+their errors are about independent.
+
+Error model: the disturbance's density over the time that a change takes, friction from all steady stretches, rounding,
+and B·δ of the reports' delays: fitted or stated, else anything up to half a second either way (two deviations).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.cross_checks.friction_curve import friction_curve
+from tdhil.estimation.cross_checks.momentum import Balances, balances
+from tdhil.estimation.cross_checks.momentum_fit import (
+    UNKNOWN_DELAY,
+    Delay,
+    Density,
+    MomentumFit,
+    Resolution,
+    fit_momentum,
+)
+from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.result import Estimate, SecondOpinion
+from tdhil.estimation.samples import Samples
+from tdhil.identify.beside.friction_curve_points import Inertia
+from tdhil.identify.beside.momentum_rows import Kind
+from tdhil.recording.recording import FloatArray, Recording
+
+_LEAST_DOF = 3.0
+_OPEN = 0.5               # a half-width beyond this share of J is no opinion
+_FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
+
+
+def cross_checked(finding: Finding, case: Case) -> Finding:
+    """The finding with what else the run says. Without excited segments there is no friction curve. Never raises.
+
+    Not for data that were refused as such: a second opinion would be a number out of them (`Case.sound`).
+    """
+    opinions = second_opinions(case, finding)
+    warnings = (*finding.warnings, *disagreements(opinions, finding))
+    inertia = _inertia(case, finding, opinions)
+    if inertia is None or case.levels is None:
+        return replace(finding, second_opinions=opinions, warnings=warnings)
+    curve = friction_curve(case.recording, case.samples, case.levels, inertia, case.options)
+    # where the bend is part of the model, J knows of it
+    warnings = (*warnings, *(() if finding.bent else curve.warnings))
+    return replace(finding, second_opinions=opinions, friction_curve=curve.points, warnings=warnings)
+
+
+def _inertia(case: Case, finding: Finding, opinions: tuple[SecondOpinion, ...]) -> Inertia | None:
+    """J of everything that turns with its standard deviation: the finding's, else a second opinion's."""
+    known = reference_inertia(finding)
+    if known is None and opinions:
+        known = opinions[0].inertia_kg_m2
+    if known is None:
+        return None
+    sd = 0.5 * (known.high - known.low) / student_quantile(case.options.confidence, 1e6)
+    finite = math.isfinite(known.value) and math.isfinite(sd)
+    return Inertia(known.value, sd, known_delay(case.recording, finding)) if finite else None
+
+
+def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
+    """J by every route that the run has; () where there is none. The finding's own J and lags are looked at, where it
+    has them. Never raises.
+    """
+    levels = case.levels
+    try:
+        found = balances(case.recording, case.samples, alone=levels is None or levels.dof < _LEAST_DOF)
+        opinions = () if found is None else _opinions(case, found, finding)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
+        return ()
+    share = _FALSE_ALARM / max(1, len(opinions))
+    return tuple(
+        replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, finding, case.options.confidence, share))
+        for opinion in opinions
+    )
+
+
+def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
+    """One warning for each second opinion that contradicts the finding."""
+    reference = reference_inertia(finding)
+    if reference is None:
+        return ()
+    return tuple(
+        f"a second opinion ({opinion.route}) does not agree: {opinion.inertia_kg_m2.value:.4g} "
+        f"({opinion.inertia_kg_m2.low:.4g} to {opinion.inertia_kg_m2.high:.4g}) kg·m² against "
+        f"{reference.value:.4g}; friction, load or the torque's scale may not be what the model takes them for"
+        for opinion in opinions
+        if opinion.agrees is False
+    )
+
+
+def _opinions(case: Case, found: Balances, finding: Finding) -> tuple[SecondOpinion, ...]:
+    recording, levels = case.recording, case.levels
+    density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
+    delay = known_delay(recording, finding)
+    resolution = _resolution(recording, case.samples, found)
+    steps = recording.excitation is not None and recording.excitation.kind == "step"
+    opinions = []
+    for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
+        if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):
+            continue
+        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence)
+        if fit is None or not fit.half_width < _OPEN * fit.inertia:
+            continue
+        inertia = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
+        opinions.append(SecondOpinion(route, inertia, None, _note(fit, kind, delay)))
+    return tuple(opinions)
+
+
+def known_delay(recording: Recording, finding: Finding) -> Delay:
+    """δ = τ_w − τ_T − skew: fitted, else stated, else unknown."""
+    speed, torque, skew = finding.speed_lag_s, finding.torque_lag_s, finding.skew_s
+    if speed is not None and torque is not None and skew is not None:
+        value = speed.value - torque.value - skew.value
+        halves = [0.5 * (part.high - part.low) for part in (speed, torque, skew)]
+        sd = math.hypot(*halves) / student_quantile(0.95, 1e6)
+        if math.isfinite(value) and sd < UNKNOWN_DELAY.sd_s:
+            return Delay(value, sd, True)
+    prior = recording.lag_prior
+    if prior.speed_lag_s is not None and prior.torque_lag_s is not None:
+        sd = math.hypot(prior.speed_lag_sd_s, prior.torque_lag_sd_s, prior.skew_sd_s)
+        return Delay(prior.speed_lag_s - prior.torque_lag_s, sd, True)
+    return UNKNOWN_DELAY
+
+
+def _resolution(recording: Recording, samples: Samples, found: Balances) -> Resolution:
+    """What rounding to a quantum q leaves in a mean, by the scatter σ of the signal at steady speed.
+
+    Noise of deviation σ before the rounding dithers it: the mean's error is at most (q/π) e^(−2π²σ²/q²), and
+    uniform of deviation q/√12 without noise.
+    """
+    return Resolution(
+        _rounding(recording.speed_resolution_rad_s, [s.speed_rad_s for s in _calm_samples(samples, found)]),
+        _rounding(recording.torque_resolution_nm, [s.torque_nm for s in _calm_samples(samples, found)]),
+    )
+
+
+def _calm_samples(samples: Samples, found: Balances) -> list[Samples]:
+    return [part for span in found.calm if len(part := samples.between(span.start_s, span.end_s)) > 1]
+
+
+def _rounding(quantum: float, parts: list[FloatArray]) -> float:
+    if not quantum > 0.0:
+        return 0.0
+    seen = float(np.median([np.var(part) for part in parts])) if parts else 0.0
+    before = max(0.0, seen - quantum**2 / 12.0)
+    return quantum / math.sqrt(12.0) * math.exp(-2.0 * math.pi**2 * before / quantum**2)
+
+
+def reference_inertia(finding: Finding) -> Estimate | None:
+    """What a momentum balance must be compared with: all that turns, also behind a compliant shaft."""
+    return finding.inertia if finding.compliant is None else finding.compliant.total_inertia
+
+
+def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: float) -> bool | None:
+    """Is the difference within what two independent intervals leave? ``miss_share``: the chance to say no wrongly."""
+    reference = reference_inertia(finding)
+    if reference is None or not reference.finite:
+        return None
+    below = own.value < reference.value
+    theirs = reference.value - reference.low if below else reference.high - reference.value
+    ours = own.high - own.value
+    wider = student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
+    return abs(own.value - reference.value) <= wider * math.hypot(ours, theirs)
+
+
+def _note(fit: MomentumFit, kind: Kind, delay: Delay) -> str:
+    changes = f"{fit.rows} change{'s' if fit.rows > 1 else ''} of speed"
+    if kind is Kind.COASTING:
+        return f"{changes} without torque, friction from steady speeds; free of every reporting lag"
+    lags = f"delay between the reports {delay.seconds * 1e3:.0f} ± {delay.sd_s * 1e3:.0f} ms (1 sd)"
+    if not delay.known:
+        lags = "delay between the reports unknown, taken as 0 ± 250 ms (1 sd)"
+    return f"{changes}, friction from steady speeds; {lags}, {fit.delay_sd:.2g} kg·m² of it"

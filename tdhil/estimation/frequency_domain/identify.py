@@ -1,0 +1,156 @@
+"""Periodic excitation in, a finding out: the frequency domain's route.
+
+1. Which whole periods are there, with which lines, and what do the levels say of B?  2. Can they have been so, and do
+enough lines stand clear of the scatter?  3. What does the simplest shaft make of them, and does another do better?
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tdhil.estimation.case import Case, Finding, PeriodicCase
+from tdhil.estimation.cross_checks.friction_curve import friction_curve
+from tdhil.estimation.data_checks import check_motion
+from tdhil.estimation.excitation_checks import check_lines, hints
+from tdhil.estimation.frequency_domain.compliant import identify_compliant
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, measure_levels, tie_viscous
+from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent
+from tdhil.estimation.frequency_domain.rigid import RigidResult, fit_rigid, rigid_finding
+from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
+from tdhil.estimation.result import Refusal, Refused
+from tdhil.estimation.samples import Stretch, stretches
+from tdhil.identify.beside.friction_curve_points import Inertia
+from tdhil.identify.compliant.choice import may_swing, usable_lines
+from tdhil.identify.faults.left_out import log_warnings
+from tdhil.identify.lines.identifiable import known_of, refuse_count, unfiltered
+from tdhil.identify.lines.residual import contradicted
+from tdhil.recording.recording import Excitation
+
+_ROUGH_REL_SD = 0.1
+_LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
+_ONE_LINE = Refusal(
+    "one excited line can't test the paper's assumption that the reported signals are not filtered",
+    "excite with more lines (a multisine)",
+)
+
+
+def measured(case: Case, excitation: Excitation) -> PeriodicCase:
+    """The case with its whole periods, their lines, and B from the levels. Raises Refused without free motion."""
+    recording, samples = case.recording, case.samples
+    check_motion(recording, excitation, samples)
+    cut = stretches(samples, excitation.segments)
+    fits = tuple(period_lines(stretch, samples) for stretch in cut)
+    rough = _rough(fits)
+    levels = measure_levels(cut, fits, samples, recording.levels, rough)
+    tie = _tie(case, levels, rough)
+    return PeriodicCase(
+        recording=recording,
+        options=case.options,
+        aborted=case.aborted,
+        samples=samples,
+        paper=case.paper,
+        periods_used=sum(len(stretch.periods) for stretch in cut),
+        samples_used=sum(len(period) for stretch in cut for period in stretch.periods),
+        warnings=(*log_warnings(recording), *_warnings(cut), *hints(recording, cut, fits, levels)),
+        levels=levels,
+        stretches=cut,
+        fits=fits,
+        tie=tie,
+        every=pooled_lines(fits, tie.slope if tie is not None else 0.0, levels.warming.own),
+    )
+
+
+def clear_lines(case: PeriodicCase) -> PeriodicCase:
+    """The case with the lines that stand clear of their scatter. Raises Refused where they can't tell the inertia."""
+    check_lines(case)
+    every = case.every
+    if not every or max(line.nu for line in every) < _LEAST_NU:
+        raise Refused(
+            f"{case.periods_used} usable whole periods are too few to know the scatter",
+            "let each mean speed run for four periods or more after settling",
+        )
+    lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
+    if not lines:
+        raise Refused("no excited line stands clear of the scatter", "excite with more amplitude, or for longer")
+    warnings = case.warnings
+    if len(lines) < len(every):
+        warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
+    return replace(case, lines=lines, usable=usable_lines(every, _LEAST_NU), warnings=warnings, sound=True)
+
+
+def identify_lines(case: PeriodicCase) -> Finding:
+    """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J."""
+    asked = case.options.model
+    rigid = None
+    if asked in ("two-mass", "string"):
+        finding = identify_compliant(case)
+    else:
+        rigid = _rigid(case, case.lines)
+        weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
+        if rigid is not None and contradicted(rigid.fitted.problem, rigid.fitted.whole.theta, weak):
+            rigid, doubted = _rigid(case, case.usable), asked == "auto"
+        else:
+            doubted = asked == "auto" and rigid is not None and may_swing(rigid)
+        finding = rigid_finding(rigid, case)
+        finding = identify_compliant(case, finding) if doubted else finding
+    if isinstance(finding, Refusal):
+        raise Refused(finding.reason, finding.advice)
+    if finding.rejected and rigid is not None and asked != "paper":
+        return identify_bent(case, rigid) or finding
+    return finding
+
+
+def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:
+    """What a rigid shaft makes of the lines; None if the arithmetic breaks down, which only data can cause that passed
+    every test before. Raises Refused where the lines are too few.
+    """
+    options, scale = case.options, case.recording.torque_scale_rel_sd
+    priors, held = known_of(case.recording.lag_prior, len(lines), case.tie)
+    refusal = refuse_count(len(lines), case.tie, priors)
+    if options.model == "paper":
+        priors, held = (), unfiltered()
+        refusal = None if len(lines) > 1 else _ONE_LINE
+    if refusal is not None:
+        raise Refused(refusal.reason, refusal.advice)
+    try:
+        return fit_rigid(lines, case.levels, case.tie, priors, held, options.confidence, scale)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return None
+
+
+def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousTie | None:
+    """B from the levels; the less sure, the more the friction curve is bent: between two speeds it is a chord."""
+    tie = tie_viscous(levels)
+    if tie is None:
+        return None
+    inertia = Inertia(rough_inertia, _ROUGH_REL_SD * rough_inertia)
+    curve = friction_curve(case.recording, case.samples, levels, inertia, case.options)
+    return replace(tie, sd=math.hypot(tie.sd, curve.viscous_spread_nm_s_rad))
+
+
+def _rough(fits: tuple[PeriodLines, ...]) -> float:
+    """|T|/(ω|W|) at the strongest line: the inertia's size, enough to correct the levels for drift."""
+    for fit in fits:
+        if len(fit.speed):
+            speed, torque = np.abs(fit.speed.mean(axis=0)), np.abs(fit.torque.mean(axis=0))
+            strongest = int(np.argmax(speed))
+            if speed[strongest] > 0.0:
+                return float(torque[strongest] / (2.0 * math.pi * fit.lines_hz[strongest] * speed[strongest]))
+    return 0.0
+
+
+def _warnings(cut: tuple[Stretch, ...]) -> tuple[str, ...]:
+    """What periods are missing, and where friction jumps."""
+    found = []
+    for stretch in cut:
+        segment = stretch.segment
+        expected = round((segment.end_s - segment.start_s) / segment.period_s) - segment.settle_periods
+        if len(stretch.periods) < expected:
+            found.append(
+                f"{len(stretch.periods)} of {expected} periods about {segment.offset_rad_s:.3g} rad/s were usable"
+            )
+        speeds = [period.speed_rad_s for period in stretch.periods]
+        if speeds and min(float(s.min()) for s in speeds) < 0.0 < max(float(s.max()) for s in speeds):
+            found.append(f"the speed about {segment.offset_rad_s:.3g} rad/s crossed zero: friction is not linear there")
+    return tuple(found)

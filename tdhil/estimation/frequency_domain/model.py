@@ -1,0 +1,87 @@
+"""A shaft seen through a drive's reports: G(s) = Z(s; m) · exp(ln F_T/F_w(s; phi)), theta = (m, phi)."""
+
+from collections.abc import Set
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.shafts import RigidShaft, Shaft
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.recording.recording import FloatArray
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """A parameter (its index in theta) known beforehand."""
+
+    index: int
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """theta (P,): the shaft's M parameters, then the six of the reports."""
+
+    shaft: Shaft = field(default_factory=RigidShaft)
+
+    @property
+    def mechanical(self) -> int:
+        """M."""
+        return len(self.shaft.names)
+
+    @property
+    def size(self) -> int:
+        """P."""
+        return self.mechanical + signal_filters.COUNT
+
+    def at(self, report: int) -> int:
+        """Where a parameter of the reports stands in theta."""
+        return self.mechanical + report
+
+    @property
+    def structure(self) -> tuple[int, ...]:
+        """Parameters that are zero for first-order lags."""
+        return tuple(self.at(index) for index in signal_filters.STRUCTURE)
+
+    def plausible(self, stated: Set[int]) -> tuple[GaussianPrior, ...]:
+        """What is plausible of the reports' parameters, but for those that somebody stated."""
+        soft = ((self.at(index), sd) for index, sd in signal_filters.PLAUSIBLE)
+        return tuple(GaussianPrior(index, 0.0, sd) for index, sd in soft if index not in stated)
+
+    @property
+    def inertia_row(self) -> FloatArray:
+        """(P,): the inertia that turns with mean speed."""
+        return np.concatenate([self.shaft.inertia_row, np.zeros(signal_filters.COUNT)])
+
+    @property
+    def viscous_row(self) -> FloatArray:
+        """(P,): the friction slope that levels show."""
+        return np.concatenate([self.shaft.viscous_row, np.zeros(signal_filters.COUNT)])
+
+    def impedance(self, theta: FloatArray, s: ComplexArray) -> ComplexArray:
+        """G, N·m·s/rad, (K,)."""
+        m, phi = theta[: self.mechanical], theta[self.mechanical :]
+        g: ComplexArray = self.shaft.impedance(m, s) * np.exp(signal_filters.log_ratio(phi, s))
+        return g
+
+    def impedance_jacobian(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """G (K,) and ∂G/∂theta (K, P)."""
+        m, phi = theta[: self.mechanical], theta[self.mechanical :]
+        seen = np.exp(signal_filters.log_ratio(phi, s))
+        g: ComplexArray = self.shaft.impedance(m, s) * seen
+        slopes: ComplexArray = np.concatenate(
+            [self.shaft.jacobian(m, s) * seen[:, None], signal_filters.log_ratio_jacobian(phi, s) * g[:, None]], axis=1
+        )
+        return g, slopes
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Least and greatest theta, (P,) each."""
+        low_m, high_m = self.shaft.bounds(rough_inertia, s)
+        low, high = signal_filters.bounds(s)
+        return np.concatenate([low_m, low]), np.concatenate([high_m, high])
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        """The natural size of each of theta, (P,)."""
+        return np.concatenate([self.shaft.scales(rough_inertia, s), signal_filters.scales()])

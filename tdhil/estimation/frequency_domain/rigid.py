@@ -1,0 +1,190 @@
+"""The rigid model fitted to the lines of a recording: values, intervals, what they rest on, and what to say of it."""
+
+import math
+from dataclasses import dataclass, replace
+
+from tdhil.estimation.case import Case, Finding, Words
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, coulomb_level
+from tdhil.estimation.frequency_domain.inference import standard_deviation, student_quantile
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest
+from tdhil.identify.lines.budget import budget_of
+from tdhil.identify.lines.fit import Held, rigid_rivals, rigid_starts
+from tdhil.identify.lines.interval import estimate, first_order_estimate
+from tdhil.identify.lines.line_points import fitted_points
+from tdhil.identify.lines.residual import REJECT_P, rejects, residual_of
+from tdhil.recording.recording import LagPrior
+
+RIGID = "rigid+lags"
+_OPEN = Refusal(
+    "the data leave the inertia open: it can't be told from the lags of the reported signals",
+    "excite with more amplitude at the lowest lines, for longer, and about two mean speeds",
+)
+
+
+@dataclass(frozen=True)
+class RigidResult:
+    """``inertia`` is infinite on a side that the data leave open."""
+
+    inertia: Estimate
+    viscous: Estimate
+    coulomb: Estimate | None
+    speed_lag_s: Estimate
+    torque_lag_s: Estimate
+    skew_s: Estimate
+    residual: ResidualTest | None
+    budget: tuple[BudgetLine, ...]
+    first_order: bool          # first-order lags are the likelier answer
+    fitted: Fitted
+
+
+def fit_rigid(
+    lines: tuple[Line, ...],
+    levels: Levels,
+    tie: ViscousTie | None,
+    priors: tuple[GaussianPrior, ...],
+    held: Held,
+    confidence: float,
+    torque_scale_rel_sd: float = 0.0,
+) -> RigidResult:
+    """Fit, test, and profile. ``held``: parameters of theta known for certain (see Model)."""
+    problem = Likelihood(lines, Model(), tie, priors)
+    fitted = fit_model(problem, held, rigid_starts(problem), rigid_rivals)
+    residual = residual_of(fitted)
+    if rejects(residual):            # then no interval will be shown, and none is sought
+        return _bare(fitted, residual)
+    inertia = estimate(fitted, INERTIA, confidence)
+    viscous = estimate(fitted, VISCOUS, confidence)
+    speed_lag, torque_lag, skew = lags_of(fitted, confidence)
+    return RigidResult(
+        inertia=inertia,
+        viscous=viscous,
+        coulomb=_coulomb(levels, fitted, confidence),
+        speed_lag_s=speed_lag,
+        torque_lag_s=torque_lag,
+        skew_s=skew,
+        residual=residual,
+        budget=budget_of(fitted, inertia, confidence, torque_scale_rel_sd),
+        first_order=fitted.first_order,
+        fitted=fitted,
+    )
+
+
+def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
+    """Of a model that the data reject: the values, for whoever wants to look, without width."""
+    theta, at = fitted.whole.theta, fitted.problem.model.at
+    point = [Estimate(float(x), float(x), float(x)) for x in theta]
+    lags = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
+    speed, torque, skew = (point[at(i)] for i in lags)
+    return RigidResult(
+        point[INERTIA], point[VISCOUS], None, speed, torque, skew, residual, (), fitted.first_order, fitted
+    )
+
+
+def lags_of(fitted: Fitted, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
+    """Delay of slow motion in either report, and what torque is late besides.
+
+    Where first-order lags are the answer, their intervals are those of first-order lags. The whole family counts half
+    of a moving average among the delays, whichever report it stands in; where one was found it is given back.
+    """
+    at = fitted.problem.model.at
+    chosen = (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW)
+    if fitted.first_order:
+        first = [first_order_estimate(fitted, at(index), confidence) for index in chosen]
+        return first[0], first[1], first[2]
+    speed, torque, skew = (estimate(fitted, at(index), confidence) for index in chosen)
+    u = float(fitted.whole.theta[at(signal_filters.AVERAGE)])
+    half = 0.5 * math.sqrt(abs(u))
+    if u > 0.0:
+        return speed, _shifted(torque, half), _shifted(skew, -half)
+    return _shifted(speed, half), torque, _shifted(skew, half)
+
+
+def _shifted(one: Estimate, by: float) -> Estimate:
+    return Estimate(one.value + by, one.low + by, one.high + by)
+
+
+def _coulomb(levels: Levels, fitted: Fitted, confidence: float) -> Estimate | None:
+    if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
+        return None
+    free = [index for index in fitted.free if index not in fitted.simple_held]
+    theta = fitted.likelier.theta
+    sd_viscous, dof = standard_deviation(fitted.problem, theta, VISCOUS, free)
+    value, sd = coulomb_level(levels, float(theta[INERTIA]), float(theta[VISCOUS]), sd_viscous)
+    half = student_quantile(confidence, min(dof, levels.dof)) * sd
+    return Estimate(value, value - half, value + half) if math.isfinite(half) else None
+
+
+def rigid_finding(
+    result: RigidResult | None, case: Case, what: str = "a rigid shaft seen through reporting lags"
+) -> Finding | Refusal:
+    """What a rigid shaft is found to be; the refusal where its inertia stays open. ``what``: it, for the reader."""
+    if result is None or not (rejects(result.residual) or result.inertia.bounded):
+        return _OPEN
+    as_paper = case.options.model == "paper"
+    lines = fitted_points(result.fitted, case.options.confidence)
+    bare = Finding("paper" if as_paper else RIGID, _words(result, as_paper, what), result.residual, lines=lines,
+                   warnings=_caveats(result, as_paper))
+    if bare.rejected:
+        return bare
+    found = replace(bare, inertia=result.inertia, conditions=_conditions(result, case), viscous_nm_s_rad=result.viscous,
+                    coulomb_nm=result.coulomb, budget=result.budget)
+    if as_paper:
+        inertia = result.inertia if case.paper is None else _turned(
+            result.inertia, case.paper.stepped.inertia_kg_m2
+        )
+        return replace(found, inertia=inertia, conditions=("no reporting lags",))
+    return replace(found, speed_lag_s=result.speed_lag_s, torque_lag_s=result.torque_lag_s, skew_s=result.skew_s)
+
+
+def _turned(estimate: Estimate, value: float) -> Estimate:
+    """The same interval stretched to hold another value too."""
+    return replace(estimate, value=value, low=min(estimate.low, value), high=max(estimate.high, value))
+
+
+def _words(result: RigidResult, as_paper: bool, what: str) -> Words:
+    tied = result.fitted.problem.tie is not None
+    return Words(
+        "the paper's model, without lags," if as_paper else what,
+        if_rejected="identify with the rigid model, which includes reporting lags" if as_paper else
+        "look for a compliant load, play, or friction that changes with speed or time; try lower lines",
+        if_wide="excite with more amplitude or for longer" + ("" if tied else ", and about two mean speeds"),
+        spread="repeatability",
+    )
+
+
+def _conditions(result: RigidResult, case: Case) -> tuple[str, ...]:
+    problem = result.fitted.problem
+    skew = problem.model.at(signal_filters.SKEW)
+    exact = [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in problem.priors if p.index == skew]
+    return (*of_reports(case.recording.lag_prior), *exact)
+
+
+def of_reports(prior: LagPrior) -> list[str]:
+    """What an inertia is conditional on, of the reports."""
+    stated = [
+        name for name, lag in (("speed", prior.speed_lag_s), ("torque", prior.torque_lag_s)) if lag is not None
+    ]
+    found = []
+    if stated:
+        by = f" by {prior.source}" if prior.source else ""
+        found.append(f"reporting lags as stated{by}, first order: {', '.join(stated)}")
+    if len(stated) < 2:
+        found.append("unstated reporting filters: two poles, a moving average and a delay at most")
+    return found
+
+
+def _caveats(result: RigidResult, as_paper: bool) -> tuple[str, ...]:
+    found = []
+    if result.fitted.problem.tie is None:
+        found.append("only one mean speed: viscous friction rests on the lines, not on levels")
+    if not as_paper and not result.first_order:
+        found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
+    if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
+        found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
+    return tuple(found)

@@ -1,0 +1,168 @@
+"""From samples to lines: what speed and torque did at each excited frequency, and how sure that is.
+
+Within each period, on the actual time stamps, least squares fits (tᶜ = time from the period's middle)
+
+    x(t) = c + Σ_k (p_k cos ω_k t + q_k sin ω_k t),    X_k = p_k − j q_k,  so that x_k(t) = Re X_k e^(jω_k t).
+
+Speed drifts from period to period: a load disturbance of white torque makes it wander. Integrating J dω/dt over a
+period against e^(−jω_k t) leaves, besides jω_k J W_k, an end term from the net change of speed Δ = ω(end) − ω(start).
+Taking the ramp (Δ/P) tᶜ off the speed, and B (Δ/P) tᶜ off the torque, removes it exactly, so that T_k − G W_k is the
+disturbance's own line, independent from period to period. (A ramp fitted by least squares would not do: it follows the
+wander within the period, leaves errors that are smaller in one period but alike in neighbouring ones, and makes the
+scatter between periods too small by up to two at the lowest line.)
+
+Periods of one segment repeat but for what disturbs them; with x = (W, T) of period p, segment s,
+
+    S_k = Σ_s Σ_p (x_sp − x̄_s)(x_sp − x̄_s)ᴴ / ν_k,   ν_k = Σ_s (P_s − 1),
+
+is the covariance of one period (complex: E|·|² per period), the speed-torque cross term included. In closed loop,
+and in torque mode, a disturbance is in both signals; only the cross term makes the variance of T − G W right.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.estimation.samples import Samples, Stretch
+from tdhil.identify.lines.edge import Edge
+from tdhil.recording.recording import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+_SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
+_BLOCK = 8192             # samples worked on at once
+_FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
+
+
+@dataclass(frozen=True)
+class PeriodLines:
+    """One stretch of P periods: ``speed``, ``torque``, ``ramp`` (P, K) complex lines, the rest (P,).
+
+    ``drift`` is the net change of speed per second; it is taken off ``speed``, not yet off ``torque``. ``ramp`` are the
+    lines of tᶜ itself, s.
+    """
+
+    lines_hz: tuple[float, ...]
+    speed: ComplexArray
+    torque: ComplexArray
+    ramp: ComplexArray
+    speed_mean: FloatArray
+    torque_mean: FloatArray
+    drift: FloatArray
+
+
+@dataclass(frozen=True)
+class Line:
+    """One frequency: M segment means and the pooled covariance of a single period.
+
+    ``speed``, ``torque`` (M,) complex; ``periods`` (M,) whole numbers; ``nu`` complex degrees of freedom.
+    """
+
+    hertz: float
+    speed: ComplexArray
+    torque: ComplexArray
+    periods: FloatArray
+    s_ww: float
+    s_tt: float
+    s_tw: complex             # E T W*
+    nu: float
+
+    @property
+    def excited(self) -> bool:
+        """Both signals stand clear of their scatter, in every segment."""
+        speed_clear = np.abs(self.speed) ** 2 * self.periods > _SIGNIFICANT * self.s_ww
+        torque_clear = np.abs(self.torque) ** 2 * self.periods > _SIGNIFICANT * self.s_tt
+        return bool(np.all(speed_clear & torque_clear))
+
+
+def period_lines(stretch: Stretch, samples: Samples) -> PeriodLines:
+    """The least-squares lines of every period of a stretch; ``samples``: all there are, to look across theirs."""
+    segment = stretch.segment
+    lines = segment.lines_hz
+    count = len(lines)
+    fits = [_fit(period, segment.start_s, lines) for period in stretch.periods]
+    table: ComplexArray = np.array([fit[1] for fit in fits]).reshape(-1, 3, count)
+    means = np.array([fit[0] for fit in fits]).reshape(-1, 3)
+    wave = table[:, 0].mean(axis=0) if fits else np.zeros(count, dtype=np.complex128)
+    # only within the segment: across its ends the motion is another one
+    edge = Edge(samples.between(segment.start_s - 1e-9, segment.end_s - 1e-9), segment.start_s, lines, wave)
+    begins = [segment.start_s + number * segment.period_s for number in stretch.index]
+    drift = np.array([edge.drift(begin, segment.period_s) for begin in begins])
+    return PeriodLines(
+        lines_hz=lines,
+        speed=table[:, 0] - drift[:, None] * table[:, 2],
+        torque=table[:, 1],
+        ramp=table[:, 2],
+        speed_mean=means[:, 0] - drift * means[:, 2],
+        torque_mean=means[:, 1],
+        drift=drift,
+    )
+
+
+def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray]:
+    """Means (3,) and lines (3, K) of speed, torque and tᶜ in one period; phases count from ``start_s``."""
+    count = len(lines_hz)
+    time = period.time_s
+    middle = 0.5 * (time[0] + time[-1])
+    omega = 2.0 * np.pi * np.asarray(lines_hz)
+    # normal equations: the columns are nearly orthogonal, so nothing is lost and much time is won; in blocks, so that
+    # a long period never stands in memory as a whole table
+    normal, right = np.zeros((1 + 2 * count, 1 + 2 * count)), np.zeros((1 + 2 * count, 3))
+    for first in range(0, len(time), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        angle = np.multiply.outer(time[block] - start_s, omega)
+        design = np.empty((len(angle), 1 + 2 * count))
+        design[:, 0] = 1.0
+        np.cos(angle, out=design[:, 1 : 1 + count])
+        np.sin(angle, out=design[:, 1 + count :])
+        signals = np.column_stack([period.speed_rad_s[block], period.torque_nm[block], time[block] - middle])
+        normal += design.T @ design
+        right += design.T @ signals
+    solution = np.linalg.solve(normal, right)
+    lines: ComplexArray = (solution[1 : 1 + count] - 1j * solution[1 + count :]).T
+    return solution[0], lines
+
+
+def pooled_lines(
+    fits: tuple[PeriodLines, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
+) -> tuple[Line, ...]:
+    """Lines in rising frequency, pooled over the segments that have them; only those with a scatter to go by.
+
+    ``viscous``: B as the levels tell it (0 if they don't), for the ramp of torque that a ramp of speed needs.
+    ``warming_nm_s``: the ramp of friction in each of the segments; none of it if left out.
+    """
+    rates = warming_nm_s or (0.0,) * len(fits)
+    frequencies = sorted({round(hertz, 9) for fit in fits for hertz in fit.lines_hz})
+    pooled = []
+    for hertz in frequencies:
+        speeds, torques = [], []
+        for fit, rate in zip(fits, rates, strict=True):
+            torque = fit.torque - (viscous * fit.drift + rate)[:, None] * fit.ramp
+            for column, own in enumerate(fit.lines_hz):
+                if round(own, 9) == hertz and len(fit.speed) > 0:
+                    speeds.append(fit.speed[:, column])
+                    torques.append(torque[:, column])
+        line = _pool(hertz, speeds, torques)
+        if line is not None:
+            pooled.append(line)
+    return tuple(pooled)
+
+
+def _pool(hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray]) -> Line | None:
+    nu = float(sum(len(speed) - 1 for speed in speeds))
+    if nu < 1.0:
+        return None
+    s_ww = s_tt = 0.0
+    s_tw = 0.0 + 0.0j
+    for speed, torque in zip(speeds, torques, strict=True):
+        dw, dt = speed - speed.mean(), torque - torque.mean()
+        s_ww += float(np.sum(np.abs(dw) ** 2)) / nu
+        s_tt += float(np.sum(np.abs(dt) ** 2)) / nu
+        s_tw += complex(np.sum(dt * dw.conj())) / nu
+    mean_speed = np.array([speed.mean() for speed in speeds])
+    mean_torque = np.array([torque.mean() for torque in torques])
+    s_ww += _FLOOR * float(np.max(np.abs(mean_speed) ** 2))
+    s_tt += _FLOOR * float(np.max(np.abs(mean_torque) ** 2))
+    counts = np.array([float(len(speed)) for speed in speeds])
+    return Line(hertz, mean_speed, mean_torque, counts, s_ww, s_tt, s_tw, nu)

@@ -1,0 +1,55 @@
+"""Recording in, Identification out: the order of the questions.
+
+1. Are these samples at all?  2. Was there motion that a limit did not shape?  3. Can these lines tell the inertia?
+4. Which inertia, with what interval?  5. Do the residuals allow the model?  The paper's method is computed wherever
+there are samples, and shown beside whatever comes out.
+"""
+
+from dataclasses import replace
+
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.conclude import conclude
+from tdhil.estimation.cross_checks.second_opinion import cross_checked
+from tdhil.estimation.data_checks import check_samples
+from tdhil.estimation.frequency_domain.identify import clear_lines, identify_lines, measured
+from tdhil.estimation.paper_method import paper_estimate
+from tdhil.estimation.result import Identification, Refused
+from tdhil.estimation.samples import excited_window, usable_samples
+from tdhil.estimation.setpoint_sampling import stretched
+from tdhil.estimation.time_domain import identify_record, recorded
+from tdhil.identify.options import Options
+from tdhil.recording.recording import Recording, aborted_stage, before_abort
+
+
+def identify(recording: Recording, options: Options | None = None) -> Identification:
+    """Identify the inertia. Pure: on one machine the same recording gives the same bits. Never raises: it refuses."""
+    case = Case(before_abort(recording), options or Options(), aborted_stage(recording))
+    try:
+        case = _sampled(case)
+        excitation = case.recording.excitation
+        if excitation is None or not excitation.segments:
+            case = recorded(case)
+            finding = identify_record(case)
+        else:
+            # a refusal shows what had been counted by then: so the case grows, step by step
+            case = periodic = measured(case, excitation)
+            case = periodic = clear_lines(periodic)
+            finding = identify_lines(periodic)
+    except Refused as refused:
+        finding = Finding(refusal=refused.refusal)
+    if case.sound:
+        finding = cross_checked(finding, case)
+    return conclude(case, stretched(finding, case.recording))
+
+
+def _sampled(case: Case) -> Case:
+    """With samples, and what the paper's method makes of them: after settling, or of all where nothing was excited.
+
+    Raises Refused for what are no samples.
+    """
+    check_samples(case.recording)
+    samples = usable_samples(case.recording)
+    parts = [samples]
+    if case.recording.excitation is not None and case.recording.excitation.segments:
+        parts = [samples.between(*excited_window(segment)) for segment in case.recording.excitation.segments]
+    return replace(case, samples=samples, paper=paper_estimate(tuple(parts)), samples_used=len(samples))

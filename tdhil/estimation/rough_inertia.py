@@ -1,0 +1,108 @@
+"""A rough inertia from one change of speed, quick enough to be had while the shaft turns. It plans the excitation.
+
+Momentum balance from one steady level to the next, over the time between the levels' middles:
+
+    J (ω_b − ω_a) = ∫ (T − T_c − B ω) dt.
+
+A reported signal that lags by τ has lost, in the integral from steady to steady, τ times its own change: T_rep loses
+τ_T (T_b − T_a) = τ_T B Δω, B ω_rep loses τ_w B Δω. So lags of any kind cost B (τ_w − τ_T) in J, some percent at the
+worst, where a regression of torque on acceleration would be wrong by their ratio. Noise averages out over the integral;
+what is left is the level's own scatter, which carries the friction through the ramp.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.recording.recording import FloatArray, Level
+
+_LEAST_REL = 0.05       # unknown lags, friction that isn't a straight line
+_MOST_REL = 0.9
+_BLOCK_S = 1.0          # means over a block are taken as independent
+
+
+@dataclass(frozen=True)
+class RoughFriction:
+    """T = viscous·ω + coulomb at steady speed; the sd of a steady torque read off that line, N·m."""
+
+    viscous_nm_s_rad: float
+    coulomb_nm: float
+    level_sd_nm: float
+
+
+@dataclass(frozen=True)
+class RoughInertia:
+    """kg·m², with a generous relative uncertainty (about 2 sd), and the friction that it rests on."""
+
+    inertia_kg_m2: float
+    rel_error: float
+    friction: RoughFriction
+
+
+def rough_friction(
+    time_s: FloatArray, speed_rad_s: FloatArray, torque_nm: FloatArray, level_a: Level, level_b: Level
+) -> RoughFriction | None:
+    """The line through two steady levels; through one (all Coulomb) if their speeds are alike. None without samples."""
+    time = np.asarray(time_s, dtype=np.float64)
+    means, deviations = [], []
+    for level in (level_a, level_b):
+        inside = (time >= level.start_s) & (time < level.end_s) & np.isfinite(speed_rad_s) & np.isfinite(torque_nm)
+        if np.count_nonzero(inside) < 4:
+            return None
+        means.append((float(np.mean(speed_rad_s[inside])), float(np.mean(torque_nm[inside]))))
+        deviations.append(_sd_of_mean(time[inside], torque_nm[inside]))
+    (speed_a, torque_a), (speed_b, torque_b) = means
+    if abs(speed_b - speed_a) < 0.05 * max(abs(speed_a), abs(speed_b), 1e-12):
+        return RoughFriction(0.0, 0.5 * (torque_a + torque_b), max(deviations))
+    viscous = (torque_b - torque_a) / (speed_b - speed_a)
+    return RoughFriction(viscous, torque_a - viscous * speed_a, math.hypot(*deviations))
+
+
+def rough_inertia(
+    time_s: FloatArray,
+    speed_rad_s: FloatArray,
+    torque_nm: FloatArray,
+    level_a: Level,
+    level_b: Level,
+    friction: RoughFriction | None = None,
+) -> RoughInertia | None:
+    """Inertia from the change of speed between two levels, either way; (N,) arrays, time rising.
+
+    ``friction`` from elsewhere (two levels of the speed stage) allows level_b to be not quite steady, as after a ramp
+    of torque; without it, it is taken from these two levels. None if there is no change of speed to go by.
+    """
+    own = friction or rough_friction(time_s, speed_rad_s, torque_nm, level_a, level_b)
+    good = np.isfinite(speed_rad_s) & np.isfinite(torque_nm)
+    time = np.asarray(time_s, dtype=np.float64)[good]
+    speed = np.asarray(speed_rad_s, dtype=np.float64)[good]
+    torque = np.asarray(torque_nm, dtype=np.float64)[good]
+    if own is None or level_b.start_s <= level_a.end_s:
+        return None
+    middle_a, middle_b = 0.5 * (level_a.start_s + level_a.end_s), 0.5 * (level_b.start_s + level_b.end_s)
+    first, last = np.searchsorted(time, (middle_a, middle_b))
+    before = speed[(time >= level_a.start_s) & (time < level_a.end_s)]
+    after = speed[(time >= level_b.start_s) & (time < level_b.end_s)]
+    if last - first < 8 or len(before) < 4 or len(after) < 4:
+        return None
+    change = float(np.mean(after) - np.mean(before))
+    scatter = float(np.hypot(np.std(before), np.std(after)))
+    if abs(change) <= 3.0 * scatter or change == 0.0:
+        return None
+    surplus = torque[first:last] - own.coulomb_nm - own.viscous_nm_s_rad * speed[first:last]
+    spacing = np.diff(time[first:last])
+    impulse = float(np.sum(0.5 * (surplus[1:] + surplus[:-1]) * spacing))
+    inertia = impulse / change
+    if not (np.isfinite(inertia) and inertia > 0.0):
+        return None
+    duration = float(np.sum(spacing))
+    friction_error = 2.0 * own.level_sd_nm * duration / abs(impulse)
+    relative = float(np.hypot(_LEAST_REL, friction_error) + scatter / abs(change))
+    return RoughInertia(inertia, min(relative, _MOST_REL), own)
+
+
+def _sd_of_mean(time: FloatArray, torque: FloatArray) -> float:
+    """Of a level's mean torque, from the scatter of its block means (load disturbance is slow, noise is not)."""
+    blocks = int(min(8, max(2, (time[-1] - time[0]) // _BLOCK_S)))
+    means = [float(np.mean(part)) for part in np.array_split(torque, blocks)]
+    return float(np.std(means, ddof=1) / np.sqrt(blocks))

@@ -1,0 +1,64 @@
+r"""The shaft in every bin: what is left of torque when speed has explained its share.
+
+With ω = Q_w(s) ω_rep and T = Q_T(s) e^(ds) T_rep the shaft's equation is, friction constant in each direction,
+
+    A T_rep = C ω_rep + c,      A = Q_T e^(ds),   C = (J s + B) Q_w,   Q = 1 + τ s + κ τ² s²,
+
+d the delay of the torque report beyond the speed report's. Of the structure of a filter only its low frequencies count:
+κ = 0 is one pole, up to ¼ two poles, ⅓ a moving average, ½ a delay. κ is a nuisance within [0, ½].
+
+The residual of a bin is e = (A T − C W − c Φ)/A, N·m·s: T_rep less what the model makes of ω_rep.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.estimation.time_domain.taylor import ComplexArray, exponential, polynomial, product
+from tdhil.estimation.time_domain.windows import Bins
+from tdhil.recording.recording import FloatArray
+
+INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE, FORWARD, BACK, BEND = range(10)
+PARAMETERS = 10
+MOST_SHAPE = 0.5
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """``error`` (M,), its slopes (M, 10), and G = C/A (M,)."""
+
+    error: ComplexArray
+    slopes: ComplexArray
+    gain: ComplexArray
+
+
+def evaluate(theta: FloatArray, bins: Bins) -> Evaluated:
+    """The residual of every bin and how it changes with theta."""
+    inertia, viscous, lag_w, lag_t, skew, shape_w, shape_t = (float(value) for value in theta[:7])
+    s = bins.s
+    shaft, report = polynomial(s, viscous, inertia), polynomial(s, 1.0, lag_w, shape_w * lag_w**2)
+    late, filtered = exponential(s, skew), polynomial(s, 1.0, lag_t, shape_t * lag_t**2)
+    a, c = product(late, filtered), product(shaft, report)
+
+    def of_speed(series: ComplexArray) -> ComplexArray:
+        return np.asarray(np.einsum("mn,mn->m", series, bins.speed), dtype=np.complex128)
+
+    def of_torque(series: ComplexArray) -> ComplexArray:
+        return np.asarray(np.einsum("mn,mn->m", series, bins.torque), dtype=np.complex128)
+
+    first = a[:, 0]
+    error = (of_torque(a) - of_speed(c) - bins.level @ theta[FORWARD:BEND] - theta[BEND] * bins.bend) / first
+    slopes = np.empty((len(s), PARAMETERS), dtype=np.complex128)
+    slopes[:, INERTIA] = -of_speed(product(polynomial(s, 0.0, 1.0), report))
+    slopes[:, VISCOUS] = -of_speed(report)
+    slopes[:, SPEED_LAG] = -of_speed(product(shaft, polynomial(s, 0.0, 1.0, 2.0 * shape_w * lag_w)))
+    slopes[:, SPEED_SHAPE] = -of_speed(product(shaft, polynomial(s, 0.0, 0.0, lag_w**2)))
+    by_lag = product(late, polynomial(s, 0.0, 1.0, 2.0 * shape_t * lag_t))
+    by_shape = product(late, polynomial(s, 0.0, 0.0, lag_t**2))
+    by_skew = product(a, polynomial(s, 0.0, 1.0))
+    for index, series in ((TORQUE_LAG, by_lag), (TORQUE_SHAPE, by_shape), (SKEW, by_skew)):
+        slopes[:, index] = of_torque(series) - error * series[:, 0]
+    slopes[:, FORWARD:BEND] = -bins.level
+    slopes[:, BEND] = -bins.bend
+    slopes /= first[:, None]
+    return Evaluated(error, slopes, c[:, 0] / first)

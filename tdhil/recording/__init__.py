@@ -1,0 +1,1 @@
+"""From samples to run.mcap and back to a Recording."""

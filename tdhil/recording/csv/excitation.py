@@ -1,0 +1,137 @@
+"""excitation.yaml: what the machine was made to do, where a trace can't say it.
+
+::
+
+    kind: multisine
+    mode: torque
+    segments:
+      - {start_s: 12.0, periods: 7, period_s: 20.0, settle_periods: 1, offset_rad_s: 2.2,
+         lines_hz: [0.05, 0.1, 0.15, 0.25, 0.35, 0.5]}
+
+Times are the trace's own, in seconds; where it has clock times, they count from its first row.
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from drivers.errors import DataFileError, Problem
+from profiles.model import DataModel, refuse_if
+from profiles.yaml_loader import load_with_lines
+from tdhil.recording.recording import Excitation, FloatArray, Level, Segment
+
+_MOST_PERIODS = 100_000
+_WHOLE = 1e-3       # of a period that a line may be off a whole number of them
+Hertz = Annotated[float, Field(gt=0, le=1e4)]
+
+
+class SegmentFile(DataModel):
+    """One stretch about one mean speed."""
+
+    start_s: float = Field(description="s; when its first period began, in the trace's time")
+    periods: int | None = Field(default=None, ge=1, le=_MOST_PERIODS, description="how many there were; or end_s")
+    end_s: float | None = Field(default=None, description="s; when it ended; or periods")
+    period_s: float = Field(gt=0, le=86400, description="s; length of a period")
+    settle_periods: int = Field(default=1, ge=0, le=_MOST_PERIODS, description="periods at the start to be left out")
+    offset_rad_s: float = Field(description="rad/s; mean speed of the motor shaft")
+    lines_hz: tuple[Hertz, ...] = Field(min_length=1, max_length=200, description="Hz; the excited frequencies")
+    amplitudes_rad_s: tuple[float, ...] | None = Field(default=None, description="rad/s; of each line, where known")
+    phases_rad: tuple[float, ...] | None = Field(default=None, description="rad; of each line, where known")
+
+    @property
+    def whole_periods(self) -> int:
+        """How many periods it has, by either way of saying it; 0 without one."""
+        if self.periods is not None:
+            return self.periods
+        if self.end_s is None or not self.end_s > self.start_s:
+            return 0
+        return math.floor(min((self.end_s - self.start_s) / self.period_s, 2.0 * _MOST_PERIODS) + 1e-6)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        findings = []
+        if (self.periods is None) == (self.end_s is None):
+            findings.append(("start_s", "give either periods or end_s"))
+        elif not self.settle_periods < self.whole_periods <= _MOST_PERIODS:
+            key = "end_s" if self.periods is None else "periods"
+            whole = self.whole_periods
+            findings.append((key, f"{whole} whole periods, of which {self.settle_periods} are for settling"))
+        for number, hertz in enumerate(self.lines_hz):
+            cycles = hertz * self.period_s
+            if round(cycles) < 1 or abs(cycles - round(cycles)) > _WHOLE:
+                message = f"{hertz:g} Hz is {cycles:.6g} cycles a period, not a whole number"
+                findings.append((f"lines_hz.{number}", message))
+        if len({round(hertz * self.period_s) for hertz in self.lines_hz}) < len(self.lines_hz):
+            findings.append(("lines_hz", "a line stands there twice"))
+        for key in ("amplitudes_rad_s", "phases_rad"):
+            given = getattr(self, key)
+            if given is not None and len(given) != len(self.lines_hz):
+                findings.append((key, f"{len(given)} numbers for {len(self.lines_hz)} lines"))
+        refuse_if(findings)
+        return self
+
+    def segment(self) -> Segment:
+        """As a recording has it; amplitudes and phases that nobody knows are empty."""
+        return Segment(
+            start_s=self.start_s,
+            end_s=self.start_s + self.whole_periods * self.period_s,
+            period_s=self.period_s,
+            settle_periods=self.settle_periods,
+            offset_rad_s=self.offset_rad_s,
+            lines_hz=self.lines_hz,
+            amplitudes_rad_s=self.amplitudes_rad_s or (),
+            phases_rad=self.phases_rad or (),
+        )
+
+
+class LevelFile(DataModel):
+    """A stretch of steady speed, whose mean torque is friction."""
+
+    start_s: float = Field(description="s")
+    end_s: float = Field(description="s")
+
+
+class ExcitationFile(DataModel):
+    """The whole file."""
+
+    kind: Literal["multisine", "sine", "step"] = Field(default="multisine", description="multisine, sine or step")
+    mode: Literal["torque", "speed"] = Field(default="torque", description="what the drive regulated: torque or speed")
+    segments: tuple[SegmentFile, ...] = Field(min_length=1, max_length=100, description="in the order of time")
+    levels: tuple[LevelFile, ...] = Field(default=(), max_length=100, description="stretches of steady speed, if any")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        findings = []
+        segments = [part.segment() for part in self.segments]
+        for number in range(1, len(segments)):
+            if segments[number].start_s < segments[number - 1].end_s - 1e-6:
+                end = segments[number - 1].end_s
+                findings.append((f"segments.{number}.start_s", f"the segment before lasts until {end:g} s"))
+        findings += [
+            (f"levels.{number}.end_s", "must be after start_s")
+            for number, level in enumerate(self.levels) if not level.end_s > level.start_s
+        ]
+        refuse_if(findings)
+        return self
+
+
+def load_excitation(path: Path, time_s: FloatArray) -> tuple[Excitation, tuple[Level, ...]]:
+    """The excitation in ``path``, of a trace with these times. DataFileError with every problem and its line."""
+    loaded = load_with_lines(path, ExcitationFile)
+    parts = loaded.value.segments
+    first, last = float(time_s[0]), float(time_s[-1])
+    outside = [
+        Problem(
+            loaded.file, loaded.lines.get(("segments", number, "start_s"), 0),
+            f"segment {number + 1} lasts from {segment.start_s:g} to {segment.end_s:g} s, but the trace "
+            f"from {first:.6g} to {last:.6g} s",
+        )
+        for number, segment in enumerate(part.segment() for part in parts)
+        if segment.start_s >= last or segment.end_s <= first
+    ]
+    if outside:
+        raise DataFileError(tuple(outside))
+    levels = tuple(Level(level.start_s, level.end_s) for level in loaded.value.levels)
+    return Excitation(loaded.value.kind, loaded.value.mode, tuple(part.segment() for part in parts)), levels

@@ -1,0 +1,210 @@
+"""The MCAP container, from records to chunks to the file.
+
+mcap's own writer costs some 7 µs a message and can't be told to take back a chunk that the disk refused; its
+record classes are used for everything that is written once a chunk or less. A message stands in its chunk as
+
+::
+
+    05  length:8  channel:2  sequence:4  log time:8  publish time:8  payload          (little-endian)
+
+Schemas and channels stand in the first chunk, where the CRC covers them. Each chunk goes to the operating
+system in one piece with its indexes, so what a kill leaves is whole chunks and at most one cut one.
+"""
+
+import errno
+import os
+import stat
+from contextlib import suppress
+from struct import Struct
+from typing import Any, Final, Protocol
+from zlib import crc32
+
+import zstandard
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics, SummaryOffset
+
+from tdhil import __version__
+from tdhil.recording.log_format import CHANNELS, CLASSES, PACKAGE, schema_name
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+LIBRARY: Final = f"{PACKAGE} {__version__}"
+_MESSAGE: Final = Struct("<BQHIQQ")
+_INDEX: Final = Struct("<BQHI")
+_FOOTER_HEAD: Final = Struct("<BQQQ")
+
+
+class RawFile(Protocol):
+    """What is asked of a file: an unbuffered binary one fits."""
+
+    def write(self, data: memoryview, /) -> int | None: ...
+
+    def seek(self, offset: int, /) -> int: ...
+
+    def truncate(self) -> int: ...
+
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+class LogGone(OSError):
+    """Somebody else has removed the file, or cut it short, while it was being written."""
+
+
+class Container:
+    """One file being written. Every method but `add` may raise OSError; the file then ends with its last chunk.
+
+    Before each write it is looked whether the file is still there: one that was removed takes all that is written to it
+    without a word, and so does one that was cut short.
+    """
+
+    def __init__(self, file: RawFile) -> None:
+        self._file = file
+        self._offset = 0
+        self._watched = _is_named(file)
+        self._compress = zstandard.ZstdCompressor(level=1).compress
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._index: dict[int, list[int]] = {}          # channel: log time, offset, log time, offset, …
+        self._chunks: list[ChunkIndex] = []
+        self._counts: dict[int, int] = dict.fromkeys(CHANNELS, 0)
+        self._declarations = _declarations()
+        self._put(MAGIC + _record(Header(profile="", library=LIBRARY)))
+
+    @property
+    def size(self) -> int:
+        """Bytes of messages in the open chunk."""
+        return self._size
+
+    def add(self, channel: int, log_time_ns: int, payload: bytes) -> None:
+        """Puts a message into the open chunk."""
+        if not self._parts and not self._chunks:
+            first = b"".join(record for group in self._declarations for record in group)
+            self._parts.append(first)
+            self._size = len(first)
+        self._index.setdefault(channel, []).extend((log_time_ns, self._size))
+        length = len(payload)
+        self._parts.append(_MESSAGE.pack(Opcode.MESSAGE, 22 + length, channel, 0, log_time_ns, log_time_ns))
+        self._parts.append(payload)
+        self._size += 31 + length
+
+    def close_chunk(self) -> None:
+        """Compresses the open chunk, if it holds anything, and hands it to the operating system."""
+        if not self._parts:
+            return
+        raw, index = b"".join(self._parts), self._index
+        self._parts, self._size, self._index = [], 0, {}
+        times = [time for pairs in index.values() for time in pairs[::2]]
+        data = self._compress(raw)
+        chunk = _record(Chunk(
+            compression="zstd", data=data, message_start_time=min(times), message_end_time=max(times),
+            uncompressed_crc=crc32(raw), uncompressed_size=len(raw)))
+        parts, offsets, end = [chunk], {}, self._offset + len(chunk)
+        for channel, pairs in index.items():
+            offsets[channel] = end
+            parts.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(pairs), channel, 8 * len(pairs)))
+            parts.append(Struct(f"<{len(pairs)}Q").pack(*pairs))
+            end += _INDEX.size + 8 * len(pairs)
+        start = self._offset
+        self._put(b"".join(parts))
+        for channel, pairs in index.items():
+            self._counts[channel] += len(pairs) // 2
+        self._chunks.append(ChunkIndex(
+            chunk_length=len(chunk), chunk_start_offset=start, compression="zstd", compressed_size=len(data),
+            message_start_time=min(times), message_end_time=max(times), message_index_offsets=offsets,
+            message_index_length=end - start - len(chunk), uncompressed_size=len(raw)))
+
+    def finish(self) -> None:
+        """Writes the summary; the file is then a whole MCAP. An open chunk is not part of it."""
+        end = _record(DataEnd(0))
+        start = self._offset + len(end)
+        schemas, channels = self._declarations
+        groups: list[tuple[Opcode, list[bytes]]] = [
+            (Opcode.SCHEMA, schemas),
+            (Opcode.CHANNEL, channels),
+            (Opcode.STATISTICS, [_record(self._statistics())]),
+            (Opcode.CHUNK_INDEX, [_record(chunk) for chunk in self._chunks]),
+        ]
+        summary, pointers = b"", b""
+        for opcode, records in groups:
+            group = b"".join(records)
+            pointers += _record(SummaryOffset(opcode, start + len(summary), len(group)))
+            summary += group
+        crc = crc32(summary + pointers + _FOOTER_HEAD.pack(Opcode.FOOTER, 20, start, start + len(summary)))
+        footer = _record(Footer(summary_start=start, summary_offset_start=start + len(summary), summary_crc=crc))
+        self._put(end + summary + pointers + footer + MAGIC)
+
+    def close(self) -> None:
+        """Lets go of the file."""
+        self._file.close()
+
+    def _put(self, data: bytes) -> None:
+        """Writes all of ``data``, or leaves the file as it was before and raises OSError; LogGone where it is gone."""
+        if self._watched:
+            self._look()
+        left = memoryview(data)
+        try:
+            while left:
+                written = self._file.write(left)
+                if not written:
+                    raise OSError("nothing was written")
+                left = left[written:]
+        except OSError:
+            with suppress(OSError):                # the first cause is the one to report
+                self._file.seek(self._offset)
+                self._file.truncate()
+            raise
+        self._offset += len(data)
+
+    def _look(self) -> None:
+        found = os.fstat(self._file.fileno())
+        if not found.st_nlink:
+            raise LogGone(errno.ENOENT, "the file was removed while it was being written")
+        if found.st_size < self._offset:
+            raise LogGone(
+                errno.EIO, f"the file was cut to {found.st_size} of {self._offset} bytes while it was being written"
+            )
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0, metadata_count=0, channel_count=len(CHANNELS), schema_count=len(CHANNELS),
+            chunk_count=len(self._chunks), message_count=sum(self._counts.values()),
+            channel_message_counts={channel: count for channel, count in self._counts.items() if count},
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0))
+
+
+def _is_named(file: RawFile) -> bool:
+    """Is it a plain file whose names are counted? Pipes and devices aren't, and some file systems don't count."""
+    try:
+        found = os.fstat(file.fileno())
+    except (OSError, ValueError):
+        return False
+    return stat.S_ISREG(found.st_mode) and found.st_nlink > 0
+
+
+def _declarations() -> tuple[list[bytes], list[bytes]]:
+    """The schema and channel records; a channel and its schema bear the same number."""
+    schemas, channels = [], []
+    for number, (topic, message) in CHANNELS.items():
+        data = _descriptor_set(CLASSES[message])
+        schemas.append(_record(Schema(id=number, name=schema_name(message), encoding="protobuf", data=data)))
+        channels.append(_record(
+            Channel(id=number, topic=topic, message_encoding="protobuf", schema_id=number, metadata={})))
+    return schemas, channels
+
+
+def _descriptor_set(message: Any) -> bytes:
+    files = FileDescriptorSet()
+    for file in (*message.DESCRIPTOR.file.dependencies, message.DESCRIPTOR.file):
+        file.CopyToProto(files.file.add())
+    return files.SerializeToString(deterministic=True)
+
+
+def _record(record: Any) -> bytes:
+    builder: Any = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data

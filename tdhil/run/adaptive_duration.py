@@ -1,0 +1,143 @@
+"""Stage 5 with a tolerance: after the pilot and after every extension, is it enough, and if not, how much more?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from statistics import NormalDist
+from typing import Any
+
+from tdhil.protocol.design.look import Look, interval_of, look
+from tdhil.recording.recording import Recording
+from tdhil.run.design.stopping_rule import LOOKS, MARGIN
+from tdhil.run.excitation import Plan
+from tdhil.run.planning import Stopping, extension_s
+
+Snapshot = Callable[[], Recording]
+LEAST_EXTENSION = 2       # periods at each mean speed: fewer are not worth the way back
+_SECOND_SHARE = 0.5       # of what is there: the least that another look may need to say something else
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a look led to: so many periods more at each mean speed (0: the end), and why.
+
+    ``seen``: how many intervals have been looked at and found too wide; ``working_confidence``: of the interval that
+    comes of whatever is there when the run ends after this decision. ``interval``: the one that was looked at.
+    """
+
+    periods: int
+    why: str
+    look: Look | None
+    seen: int
+    working_confidence: float
+    interval: float | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        seen = None if self.look is None else {
+            name: value if not isinstance(value, float) or math.isfinite(value) else None
+            for name, value in asdict(self.look).items()
+        }
+        interval = self.interval if self.interval is not None and math.isfinite(self.interval) else None
+        return asdict(self) | {"look": seen, "interval": interval}
+
+
+@dataclass
+class Enough:
+    """Asks, and remembers. ``snapshot`` gives what is recorded so far; ``note`` is told every decision."""
+
+    stopping: Stopping
+    plan: Plan
+    snapshot: Snapshot
+    note: Callable[[Decision], None]
+    decisions: list[Decision] = field(default_factory=list)
+
+    def question(self, spent_s: float) -> Callable[[], Decision]:
+        """The work of one look, to be done in any thread or process; the samples are taken now."""
+        recording, rule = self.snapshot(), self.stopping
+        left_s = rule.allowed_s - spent_s
+        seen = self.decisions[-1].seen if self.decisions else 0
+        return partial(decide, recording, rule, self.plan, left_s, len(self.decisions), seen)
+
+    def decided(self, decision: Decision) -> int:
+        """Keep and tell a decision; the periods that it asks for."""
+        self.decisions.append(decision)
+        self.note(decision)
+        return decision.periods
+
+
+def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, looks: int, seen: int) -> Decision:
+    """Pure: the decision after ``looks`` extensions, with ``left_s`` seconds left, ``seen`` intervals looked at."""
+    segments = len(plan.segments)
+    period = sum(one.reference.period_s for one in plan.segments)
+    room = max(0, math.floor((left_s - extension_s(plan, 0)) / period + 1e-9)) if looks < LOOKS else 0
+    counted = _counted(recording)
+    most = (counted + segments * room) / counted if counted else 1.0
+
+    def looked(number: int) -> Look | None:
+        return look(recording, rule.working(number), rule.tolerance / MARGIN, most, rule.pilot_dof)
+
+    def more(found: Look, least: int) -> int:
+        wanted = math.ceil((found.scale - 1.0) * found.periods / segments - 1e-6)
+        return min(room, max(least, wanted)) if found.enough else min(room, wanted)
+
+    found = looked(seen)
+    if found is None:
+        return _by_interval_alone(recording, rule, counted / segments, room, seen)
+    asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"±{100.0 * found.half_width_now:.3g} %"
+    if found.half_width_now > rule.tolerance / MARGIN:
+        periods = more(found, LEAST_EXTENSION)
+        if periods >= LEAST_EXTENSION:
+            then = f"±{100.0 * found.half_width_then:.3g} %"
+            why = f"the scatter says {now}: {periods} more periods at each mean speed for {then}"
+            return Decision(periods, why, found, seen, rule.working(seen))
+        why = f"the scatter says {now} instead of {asked}, and the time that is left would change little"
+        return Decision(0, why, found, seen, rule.working(seen))
+    width = interval_of(recording, rule.working(seen))
+    interval = f"the interval is ±{100.0 * width:.3g} %" if math.isfinite(width) else "there is no interval"
+    if width <= rule.tolerance:
+        return Decision(0, f"{interval}: as tight as {asked}", found, seen, rule.working(seen), width)
+    again = looked(seen + 1) if room >= LEAST_EXTENSION else None
+    if again is None:
+        why = f"{interval} instead of {asked}, and no time or look is left"
+        return Decision(0, why, found, seen, rule.working(seen), width)
+    half_as_much = math.ceil(_SECOND_SHARE * again.periods / segments)
+    periods = max(more(again, half_as_much), min(room, half_as_much))
+    why = f"{interval} instead of {asked}, as other lags are not excluded: {periods} more periods at each mean speed"
+    return Decision(periods, why, found, seen + 1, rule.working(seen + 1), width)
+
+
+def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, room: int, seen: int) -> Decision:
+    """Where a rigid shaft with straight friction is not what the scatter is about; ``periods`` at each mean speed.
+
+    Friction that bends, or a shaft that swings, may still have an interval. Each that is looked at costs its share.
+    """
+    working = rule.working(seen)
+    width = interval_of(recording, working)
+    if not math.isfinite(width):
+        return Decision(0, "what was acquired can't be judged, and has no interval", None, seen, working)
+    asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
+    if width <= rule.tolerance:
+        return Decision(0, f"{now}: as tight as {asked}", None, seen, working, width)
+    stricter = _quantile(rule.working(seen + 1)) / _quantile(working)
+    wanted = math.ceil(periods * ((MARGIN * stricter * width / rule.tolerance) ** 2 - 1.0))
+    more = min(room, max(LEAST_EXTENSION, wanted))
+    if more < LEAST_EXTENSION:
+        return Decision(0, f"{now} instead of {asked}, and no time or look is left", None, seen, working, width)
+    why = f"{now} instead of {asked}: {more} more periods at each mean speed"
+    return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
+
+
+def _quantile(confidence: float) -> float:
+    return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
+
+
+def _counted(recording: Recording) -> int:
+    """Whole periods behind settling, of all segments."""
+    excitation = recording.excitation
+    return 0 if excitation is None else sum(
+        max(0, round((one.end_s - one.start_s) / one.period_s) - one.settle_periods) for one in excitation.segments
+    )

@@ -1,0 +1,285 @@
+"""Arithmetic beside the control loop: in a process of its own where one stands ready, else in a thread of this one.
+
+A process has an interpreter and a priority of its own: no cycle waits for what it reckons. It is started and has loaded
+all it needs before the shaft moves, gets its work as pickles through a pipe, and answers through another. It inherits
+neither sockets nor signal handlers nor threads, since it begins as a new program; it ends when its pipe does, which is
+when this process ends, however that comes about; and nobody ever waits for it: where its answer isn't wanted any more
+it is killed.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from queue import SimpleQueue
+from threading import Event, Lock, Thread
+from typing import IO, Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+SWITCH_S = 0.0005
+"""How long arithmetic in a thread of this process may keep the interpreter to itself."""
+
+NICE = 10
+"""By how much the process is nicer than the control loop. It is no hog, but it must not starve beside one either."""
+
+READY_S = 60.0
+"""Wall time that the process gets to load what it needs. It is waited for: loading would disturb what follows."""
+
+READY = b"ready"
+_REAPED_S = 1.0           # wall time that a killed process gets to be gone; it is left to itself then
+_PROGRAM = (
+    "import pickle, sys\n"
+    "sys.path[:] = pickle.load(sys.stdin.buffer)\n"
+    "from tdhil.run.background import serve\n"
+    "serve()\n"
+)
+
+
+class Gone(Exception):
+    """The process can't answer: it never began, died, or did not understand what it was asked."""
+
+
+class Reckoner:
+    """A process of its own for arithmetic. ``program`` is what it runs, for tests.
+
+    Raises OSError where it can't be started. Whoever made one calls `end`, and `close` when nothing hurries any more.
+    """
+
+    def __init__(self, program: str = _PROGRAM) -> None:
+        if not sys.executable:
+            raise FileNotFoundError("where this Python lies is not known")
+        self._answering = Lock()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", program],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **_out_of_the_way(),
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._questions: IO[bytes] = self._process.stdin
+        self._answers: IO[bytes] = self._process.stdout
+        self._ready = Event()
+        self._began = False
+        Thread(target=self._await_ready, name="tdhil-reckoner", daemon=True).start()
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def wait_ready(self, for_s: float) -> bool | None:
+        """Has it loaded all it needs? None: not within ``for_s`` of wall time; False: it never will."""
+        return self._began if self._ready.wait(for_s) else None
+
+    def ask(self, work: Callable[[], T]) -> T:
+        """What ``work`` gives, or raises what it raises; as long as it takes. Raises Gone where nothing comes of it.
+
+        ``work`` is pickled: a function of a module, or a `functools.partial` of one with arguments of plain data.
+        """
+        with self._answering:
+            try:
+                question = pickle.dumps(work)
+                pickle.dump(question, self._questions)
+                self._questions.flush()
+                kind, answer = pickle.load(self._answers)
+                found = pickle.loads(answer)
+            except Exception as error:
+                raise Gone(f"{type(error).__name__}: {error}") from error
+        if kind == "unfit":
+            raise Gone(str(found))
+        if kind == "raised":
+            assert isinstance(found, BaseException)
+            raise found
+        result: T = found
+        return result
+
+    def end(self) -> None:
+        """Kill it, whatever it does; returns at once."""
+        with suppress(OSError):
+            self._process.kill()
+
+    def close(self) -> None:
+        """Kill it, and tidy up behind it: pipes and all. Takes a moment, a second at the very most."""
+        self.end()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_REAPED_S)
+        if self._answering.acquire(timeout=_REAPED_S):
+            for pipe in (self._questions, self._answers):
+                with suppress(OSError):
+                    pipe.close()
+            self._answering.release()
+
+    def _await_ready(self) -> None:
+        with self._answering:
+            try:
+                pickle.dump(sys.path, self._questions)
+                self._questions.flush()
+                self._began = pickle.load(self._answers) == READY
+            except Exception:       # however that fails: it is not ready
+                self._began = False
+            finally:
+                self._ready.set()
+
+
+class Beside(Generic[T]):
+    """One piece of work, begun at once, that nobody has to wait for: neither a stop nor the process's end.
+
+    Where ``reckoner`` can't do it, a thread does, and ``instead`` says why. As long as a thread is at it, whoever
+    controls the shaft gets the interpreter sooner than usual, also once the work has been left alone.
+    """
+
+    def __init__(self, work: Callable[[], T], reckoner: Reckoner | None = None) -> None:
+        self.ended = Event()
+        self.instead = ""
+        self._work = work
+        self._reckoner = reckoner
+        self._dropped = False
+        self._found: list[T] = []
+        self._failure: BaseException | None = None
+        # A pool's threads are joined when the interpreter ends; a daemon is not.
+        Thread(target=self._run, name="tdhil-beside", daemon=True).start()
+
+    def result(self) -> T:
+        """Once it has ended: what it gave, or raises what it raised."""
+        if self._failure is not None:
+            raise self._failure
+        return self._found[0]
+
+    def drop(self) -> None:
+        """Nobody asks any more; returns at once."""
+        self._dropped = True
+        if self._reckoner is not None:
+            self._reckoner.end()
+
+    def _run(self) -> None:
+        try:
+            self._found.append(self._reckon())
+        except BaseException as error:         # raised where the result is asked for
+            self._failure = error
+        finally:
+            self.ended.set()
+
+    def _reckon(self) -> T:
+        if self._reckoner is not None:
+            try:
+                return self._reckoner.ask(self._work)
+            except Gone as gone:
+                if self._dropped:
+                    raise
+                self.instead = str(gone)
+        usual_s = sys.getswitchinterval()
+        sys.setswitchinterval(min(usual_s, SWITCH_S))
+        try:
+            return self._work()
+        finally:
+            sys.setswitchinterval(usual_s)
+
+
+def begin(
+    meanwhile: Callable[[], object], stopped: Callable[[], bool], within_s: float = READY_S, program: str = _PROGRAM
+) -> tuple[Reckoner | None, str]:
+    """A process that stands ready, or None and why there is none. Ends sooner, with None, once ``stopped`` says so.
+
+    Takes as long as Python takes to load what the plan needs: a second or two, more on a busy computer; ``meanwhile``
+    is done beside it.
+    """
+    try:
+        reckoner = Reckoner(program)
+    except (OSError, ValueError, RuntimeError, subprocess.SubprocessError) as error:
+        meanwhile()
+        return None, f"it can't be started: {error}"
+    try:
+        meanwhile()
+        until_s = time.monotonic() + within_s
+        while not stopped():
+            ready = reckoner.wait_ready(0.05)
+            if ready:
+                return reckoner, ""
+            if ready is not None:
+                reckoner.close()
+                return None, "it died while it was loading"
+            if time.monotonic() > until_s:
+                reckoner.close()
+                return None, f"it was not ready within {within_s:g} s"
+    except BaseException:
+        reckoner.close()
+        raise
+    reckoner.close()
+    return None, "a stop was asked for"
+
+
+def _out_of_the_way() -> dict[str, Any]:
+    """Ctrl-C at the terminal is for this process alone. The same session: where each is weighed, nice means nothing."""
+    if sys.platform == "win32":
+        flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
+        return {"creationflags": flags | subprocess.BELOW_NORMAL_PRIORITY_CLASS}
+    return {"process_group": 0}
+
+
+# -- in the process itself -----------------------------------------------------------------------------------
+
+
+def serve() -> None:
+    """Answer one question after the other until the pipe ends; what `Reckoner` runs."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _take_second_place()
+    # Whatever prints must not come between the answers.
+    answers = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+
+    from tdhil.protocol.choose_rate import quieten
+    from tdhil.run import adaptive_duration, stage_planner  # noqa: F401
+
+    quieten()
+    asked: SimpleQueue[bytes] = SimpleQueue()
+    Thread(target=_listen, args=(asked,), daemon=True).start()
+    pickle.dump(READY, answers)
+    answers.flush()
+    while True:
+        pickle.dump(_answer(asked.get()), answers)
+        answers.flush()
+
+
+def _listen(asked: SimpleQueue[bytes]) -> None:
+    """A thread that always waits: it sees the end of the pipe in the midst of work, too."""
+    try:
+        while True:
+            asked.put(pickle.load(sys.stdin.buffer))
+    finally:
+        os._exit(0)
+
+
+def _answer(question: bytes) -> tuple[str, bytes]:
+    try:
+        work = pickle.loads(question)
+    except Exception as error:
+        return "unfit", pickle.dumps(f"{type(error).__name__}: {error}")
+    kind = "found"
+    try:
+        found = work()
+    except BaseException as error:
+        error.add_note("in the process beside the control loop:\n" + "".join(traceback.format_exception(error)))
+        kind, found = "raised", error
+    try:
+        answer = pickle.dumps(found)
+        pickle.loads(answer)
+    except Exception as error:
+        return "unfit", pickle.dumps(f"{type(found).__name__} can't be handed on: {error}")
+    return kind, answer
+
+
+def _take_second_place() -> None:
+    """No real-time scheduling, even where it was inherited, and nicer than the control loop."""
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with suppress(AttributeError, OSError):
+        os.nice(NICE)

@@ -1,0 +1,187 @@
+"""One cycle of a run: guard, drive, guard, log. Every stage goes through here, and nothing goes around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Event
+from typing import Any, Protocol, TypeVar
+
+from drivers.drive import Command, Drive, KeptAlive, Mode, PowerState, Sample, Telling
+from drivers.errors import DriveFault, ModeNotConfirmed
+from tdhil.errors import Interrupted
+from tdhil.run.background import Beside, Reckoner
+from tdhil.run.guard import Guard
+from tdhil.run.settings import StopRequest
+
+T = TypeVar("T")
+
+ALIVE_S = 0.2
+"""Wall time between two signs of life in stepped time; a simulated peer gives a host a second."""
+
+SWITCH_CYCLES = 10
+"""A drive on a slow line gets so many cycles for a switch of its mode: asked, done, seen, and some that were lost."""
+
+
+NO_RECKONER = "arithmetic goes on in a thread beside the control loop, not in a process of its own"
+"""Said in the log, with the reason. Cycles may be late meanwhile, and it is no more than that."""
+
+
+class RunLog(Protocol):
+    """Where a run is written as it goes (record room); `cycle` is called once per exchange."""
+
+    def cycle(self, command: Command, sample: Sample) -> None: ...
+
+    def event(self, time_s: float, kind: str, text: str) -> None: ...
+
+    def configure(self, **run: Any) -> None: ...
+
+
+Watcher = Callable[[Command, Sample], None]
+
+
+class Bench:
+    """A drive under guard. ``watch`` sees every cycle (live display); ``stop_request`` is looked at in each."""
+
+    def __init__(
+        self, drive: Drive, guard: Guard, log: RunLog, stop_request: StopRequest, watch: Watcher | None = None
+    ) -> None:
+        self.drive = drive
+        self.guard = guard
+        self.log = log
+        self.period_s = drive.period_s
+        self.stop_side_troubles: list[str] = []
+        self.last: Sample | None = None
+        self.beside: Watcher | None = None         # what a stage does beside every cycle, behind the guard
+        self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
+        self.reckoner: Reckoner | None = None      # where longer arithmetic is done in real time; None: in a thread
+        self.remarks: list[str] = []       # what others did on the drive's bus
+        self._telling = drive if isinstance(drive, Telling) else None
+        self._stop_request = stop_request
+        self._watch = watch
+
+    @property
+    def now_s(self) -> float:
+        """Control time."""
+        return self.drive.clock.now_s()
+
+    def cycle(self, command: Command) -> Sample:
+        """One exchange. Raises Interrupted when a stop was asked for, and whatever guard, drive and log raise."""
+        if self._stop_request.signum is not None:
+            raise Interrupted(self._stop_request.signum)
+        self.guard.check_command(command)
+        sample = self.drive.exchange(command)
+        self.log.cycle(command, sample)
+        self.last = sample
+        if self._telling is not None:
+            self._note(self._telling)
+        self.guard.check_sample(command, sample)
+        self.guard.check_pace(self.drive.counters)
+        if self.beside is not None:
+            self.beside(command, sample)
+        if self._watch is not None and not self.quiet:
+            self._watch(command, sample)
+        return sample
+
+    def stop_cycle(self, command: Command) -> Sample:
+        """One exchange of the stop sequence: unguarded, and neither log nor display may keep it from going on."""
+        sample = self.drive.exchange(command)
+        try:
+            self.log.cycle(command, sample)
+            if self._telling is not None:
+                self._note(self._telling)
+            if self._watch is not None:
+                self._watch(command, sample)
+        except Exception as error:
+            self.stop_side_troubles.append(f"{type(error).__name__}: {error}")
+            del self.stop_side_troubles[10:]
+        return sample
+
+    def _note(self, drive: Telling) -> None:
+        for line in drive.remarks():
+            self.remarks.append(line)
+            self.log.event(self.now_s, "bus", line)
+
+    def cycles(self, seconds: float) -> int:
+        """How many cycles last that long."""
+        return max(1, round(seconds / self.period_s))
+
+    def hold(self, command: Command, seconds: float) -> list[Sample]:
+        """Keep one command for a time; the samples."""
+        return [self.cycle(command) for _ in range(self.cycles(seconds))]
+
+    def enable(self, mode: Mode, command: Command, timeout_s: float = 3.0) -> Sample:
+        """Enable in a mode and wait until the drive says so."""
+        self.drive.enable(mode)
+        for _ in range(self.cycles(timeout_s)):
+            sample = self.cycle(command)
+            if sample.state is PowerState.ENABLED and sample.mode is mode:
+                self.guard.expected = PowerState.ENABLED
+                return sample
+            if sample.state is PowerState.FAULT:
+                break
+        raise DriveFault(
+            f"no {mode.value} mode within {timeout_s:g} s of enabling; the drive shows '{sample.state.value}'",
+            where=f"statusword {sample.status:04X}h",
+            next_step="Look for STO, a missing enable input or a fault on the drive's own panel",
+        )
+
+    def switch_mode(self, command: Command, timeout_s: float = 0.5) -> Sample:
+        """Go on with ``command.mode`` while enabled; the drive must display the new mode in time, and in ten cycles."""
+        for _ in range(max(SWITCH_CYCLES, self.cycles(timeout_s))):
+            sample = self.cycle(command)
+            if sample.mode is command.mode:
+                return sample
+        raise ModeNotConfirmed(
+            f"the drive did not take over {command.mode.value} mode within {timeout_s:g} s",
+            where="modes of operation display 6061h",
+            next_step="Check in the drive's manual whether the mode may change while enabled; use --mode speed",
+        )
+
+    def compute(self, work: Callable[[], T], command: Command) -> T:
+        """Do a longer piece of arithmetic while the drive keeps getting one command."""
+        return self.compute_while(work, lambda: self.cycle(command))
+
+    def compute_while(self, work: Callable[[], T], cycle: Callable[[], object]) -> T:
+        """Do a longer piece of arithmetic without letting the drive starve of setpoints: ``cycle`` is one of them.
+
+        In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
+        there, signs of life that move no time on are all that goes out. In real time a process of its own does it
+        where one stands ready and understands the ``work`` (`beside.Reckoner.ask`): a thread shares the interpreter,
+        and cycles come late beside it. They may all the same on a computer of one processor, and that alone doesn't
+        end the run.
+
+        Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
+        may be turning without a setpoint meanwhile. A process is killed; a thread goes on by itself, beside the stop,
+        and what comes of it is dropped.
+        """
+        beside = Beside(work, None if self.drive.clock.stepped else self.reckoner)
+        told = False
+        self.guard.reckoning = True
+        try:
+            while not beside.ended.is_set():
+                if beside.instead and not told:
+                    self.no_reckoner(beside.instead)
+                    told = True
+                if self.drive.clock.stepped:
+                    self._wait_alive(beside.ended)
+                else:
+                    cycle()
+        except BaseException:
+            beside.drop()
+            raise
+        finally:
+            self.guard.reckoning = False
+        if beside.instead and not told:
+            self.no_reckoner(beside.instead)
+        return beside.result()
+
+    def no_reckoner(self, why: str) -> None:
+        """Note that arithmetic has to share this process with the control loop."""
+        self.log.event(self.now_s, "host", f"{NO_RECKONER}: {why}")
+
+    def _wait_alive(self, ended: Event) -> None:
+        """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
+        if self._stop_request.signum is not None:
+            raise Interrupted(self._stop_request.signum)
+        if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
+            self.drive.keep_alive()

@@ -1,0 +1,126 @@
+"""How a shaft under the drive's speed control follows its setpoint: two poles and a zero, and the drive's own ramp.
+
+A speed loop with integral action makes H(s) = (1 + b s)/(1 + a₁ s + a₂ s²) of setpoint to speed: flat at low frequency,
+often a little above one near its bandwidth, falling beyond; the report adds its lag. It is fitted to the ramp between
+the two mean speeds of stage 2, sampled as slowly as the line has it. It plans, and bounds what slow sampling between
+the setpoint's steps may do to J (`identify.stepped`); J itself is not read off it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.recording.recording import FloatArray
+
+_GRID_S = 0.02
+_STARTS = ((1.0, 1.0, 0.3), (0.2, 0.6, 0.1), (0.1, 0.15, 0.01))    # b, a1, a2
+_LEAST_S, _MOST_S = 1e-3, 5.0
+_GOOD = 0.05              # of the change: a fit that leaves more of it says nothing
+_HELD_BACK = 1.12         # times the commanded time from a fifth to four fifths of the way: the drive has its own ramp
+
+
+@dataclass(frozen=True)
+class Following:
+    """Of setpoint to the shaft's speed; behind ``speed_lag_s`` it is reported."""
+
+    zero_s: float
+    first_s: float
+    second_s2: float
+    speed_lag_s: float = 0.0
+
+    def reported(self, hertz: FloatArray) -> NDArray[np.complex128]:
+        """Complex gain to the reported speed, (K,)."""
+        s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
+        gain: NDArray[np.complex128] = self.shaft(hertz) / (1.0 + self.speed_lag_s * s)
+        return gain
+
+    def shaft(self, hertz: FloatArray) -> NDArray[np.complex128]:
+        """Complex gain to the shaft's speed, (K,)."""
+        s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
+        gain: NDArray[np.complex128] = (1.0 + self.zero_s * s) / (1.0 + self.first_s * s + self.second_s2 * s * s)
+        return gain
+
+
+def fit_following(
+    time_s: FloatArray,
+    setpoint_rad_s: FloatArray,
+    reported_rad_s: FloatArray,
+    speed_lag_s: float = 0.0,
+    ramp_rad_s2: float = math.inf,
+) -> Following | None:
+    """From one change of setpoint that begins and ends steadily, (N,) each; None where the model does not fit.
+
+    ``ramp_rad_s2``: of the drive's own ramp, which the setpoint passes first.
+    """
+    from scipy.optimize import least_squares
+
+    begin, change = float(setpoint_rad_s[0]), float(setpoint_rad_s[-1] - setpoint_rad_s[0])
+    if len(time_s) < 16 or change == 0.0:
+        return None
+    grid = np.arange(float(time_s[0]), float(time_s[-1]) + _GRID_S, _GRID_S)
+    # A setpoint holds until the next one.
+    at = np.clip(np.searchsorted(time_s, grid, side="right") - 1, 0, len(time_s) - 1)
+    wanted = _ramped((setpoint_rad_s[at] - begin) / change, ramp_rad_s2 / abs(change))
+    seen = (reported_rad_s - begin) / change
+
+    def left(logs: FloatArray) -> FloatArray:
+        zero, first, second = (float(x) for x in np.exp(logs))
+        error: FloatArray = np.interp(time_s, grid, _response(wanted, zero, first, second, speed_lag_s)) - seen
+        return error
+
+    bounds = (np.log([_LEAST_S, _LEAST_S, _LEAST_S**2]), np.log([_MOST_S, _MOST_S, _MOST_S**2]))
+    fits = [least_squares(left, np.log(start), bounds=bounds, max_nfev=60) for start in _STARTS]
+    best = min(fits, key=lambda fit: float(fit.cost))
+    if math.sqrt(2.0 * float(best.cost) / len(time_s)) > _GOOD:
+        return None
+    zero, first, second = (float(x) for x in np.exp(best.x))
+    return Following(zero, first, second, speed_lag_s)
+
+
+def held_back_to(
+    time_s: FloatArray, setpoint_rad_s: FloatArray, reported_rad_s: FloatArray
+) -> float | None:
+    """The acceleration that the drive's own ramp lets through, rad/s²; None where it kept up with the setpoint."""
+    begin, change = float(setpoint_rad_s[0]), float(setpoint_rad_s[-1] - setpoint_rad_s[0])
+    if change == 0.0:
+        return None
+
+    def between(signal: FloatArray) -> float:
+        share = (signal - begin) / change
+        passed = [float(time_s[np.flatnonzero(share >= level)[0]]) if np.any(share >= level) else math.inf
+                  for level in (0.2, 0.8)]
+        return passed[1] - passed[0]
+
+    asked, took = between(setpoint_rad_s), between(reported_rad_s)
+    if not (math.isfinite(took) and took > _HELD_BACK * asked > 0.0):
+        return None
+    return 0.6 * abs(change) / took
+
+
+def _ramped(wanted: FloatArray, rate: float) -> FloatArray:
+    """A setpoint on the grid behind a ramp, per second."""
+    if math.isinf(rate):
+        return wanted
+    found, now = np.empty_like(wanted), float(wanted[0])
+    for index, target in enumerate(wanted.tolist()):
+        now += max(-rate * _GRID_S, min(rate * _GRID_S, target - now))
+        found[index] = now
+    return found
+
+
+def _response(wanted: FloatArray, zero: float, first: float, second: float, lag: float) -> FloatArray:
+    """Of H and the lag on the grid, by the bilinear transform."""
+    from scipy.signal import lfilter
+
+    k = 2.0 / _GRID_S
+    top = np.array([1.0 + zero * k, 2.0, 1.0 - zero * k])
+    bottom = np.array([
+        1.0 + first * k + second * k * k, 2.0 - 2.0 * second * k * k, 1.0 - first * k + second * k * k,
+    ])
+    late = lfilter([1.0, 1.0], [1.0 + lag * k, 1.0 - lag * k], lfilter(top, bottom, wanted))
+    found: FloatArray = np.asarray(late, dtype=np.float64)
+    return found

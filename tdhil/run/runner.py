@@ -1,0 +1,322 @@
+"""Runs the five stages in order, and whatever happens in them, the one stop sequence.
+
+The first cause is kept: what goes wrong while stopping is reported beside it, never instead of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, replace
+
+from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample, Timed
+from drivers.errors import PreflightRefused
+from tdhil.errors import Interrupted
+from tdhil.protocol import no_watchdog, others
+from tdhil.protocol.choose_rate import choose_rate, quieten
+from tdhil.protocol.control import MeanSpeedControl
+from tdhil.protocol.lag_knowledge import with_known_lag, with_read_filters, with_timing
+from tdhil.protocol.stage_swing import run_swings
+from tdhil.protocol.string_rules import refuse_with_string
+from tdhil.recording.recording import Excitation, LagPrior, Ramp
+from tdhil.recording.run_log import RunLog
+from tdhil.run.background import Reckoner, begin
+from tdhil.run.control_loop import Bench
+from tdhil.run.excitation import RigGuess, SwingPlan
+from tdhil.run.guard import Guard
+from tdhil.run.preconditions import choose_mode, keep_within, no_torque
+from tdhil.run.settings import StopRequest
+from tdhil.run.speed_check import Onlooker
+from tdhil.run.stage_log import StageBook
+from tdhil.run.stage_planner import StagePlanner
+from tdhil.run.stages.acquire import run_acquire
+from tdhil.run.stages.brake_test import NOT_YET, slow_down
+from tdhil.run.stages.hold import run_hold
+from tdhil.run.stages.setup import measure_offsets, probe_sign
+from tdhil.run.stages.speed import SpeedResult, run_speed
+from tdhil.run.stages.torque import TorqueResult, run_torque
+from tdhil.run.stop import StopReport, StopSequence
+from tdhil.run.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
+
+
+def _nothing(text: str) -> None:
+    pass
+
+
+class Runner:
+    """One run of one drive. `run` never raises: everything is in the outcome."""
+
+    def __init__(
+        self,
+        drive: Drive,
+        make_task: MakeTask,
+        log: RunLog,
+        stop_request: StopRequest,
+        display: Display,
+        confirm: Confirm,
+        *,
+        reset_fault: bool = False,
+        say: Say = _nothing,
+        confirm_speed: ConfirmSpeed = nobody_sees,
+    ) -> None:
+        self._drive = drive
+        self._make_task = make_task
+        self._reset_fault = reset_fault
+        self._say = say
+        self._log = log
+        self._stop_request = stop_request
+        self._display = display
+        self._confirm = confirm
+        self._confirm_speed = confirm_speed
+        self._book = StageBook(drive, log, display, say)
+        self._stop: StopSequence | None = None
+        self._prior = LagPrior()
+        self._reckoner: Reckoner | None = None
+
+    def run(self) -> RunOutcome:
+        """Connect, five stages, stop, close."""
+        cause: BaseException | None = None
+        report: StopReport | None = None
+        try:
+            self._run_stages()
+        except BaseException as error:
+            cause = error
+            self._log_failure(error)
+        finally:
+            if self._reckoner is not None:
+                self._reckoner.end()
+            if self._stop is not None:
+                report = self._stop.run()
+                with suppress(Exception):
+                    self._log.configure(stop={"confirmed": report.confirmed, "at_rest_s": report.at_rest_s})
+                with suppress(Exception):
+                    for trouble in report.trouble:
+                        self._log.event(self._drive.clock.now_s(), "stop", trouble)
+                with suppress(Exception):
+                    self._display.stopped(report.confirmed)
+            with suppress(Exception):
+                others.tell(self._drive, self._log.configure, self._say)
+            with suppress(Exception):
+                self._log.configure(counters=asdict(self._drive.counters))
+            try:
+                left = self._drive.close()
+            except Exception as error:
+                cause = cause or error
+            else:
+                with suppress(Exception):
+                    for line in left:
+                        self._log.event(self._drive.clock.now_s(), "left", f"not given back: {line}")
+            if self._reckoner is not None:
+                self._reckoner.close()
+        return RunOutcome(tuple(self._book.stages), cause, report, self._book.preflight)
+
+    # -- the stages ------------------------------------------------------------------------------------------
+
+    def _run_stages(self) -> None:
+        with self._book.stage("setup", 10.0):
+            task, bench, preflight = self._prepare()
+            limits, assumptions = task.limits, task.assumptions
+            mode = choose_mode(task.request, limits, preflight)
+            _, torque_offset = measure_offsets(bench, limits)
+            self._log.learn(torque_offset_nm=torque_offset)
+            self._confirm(task, preflight, lambda: self._idle(bench))
+            self._stop = StopSequence(
+                bench,
+                limits,
+                preflight.speed_resolution_rad_s,
+                preflight.quick_stop_in_torque_mode,
+                assumptions,
+                torque_resolution_nm=preflight.torque_resolution_nm,
+                torque_offset_nm=torque_offset,
+                watched=preflight.watched,
+            )
+            bench.guard.start_clock(bench.now_s)
+            breakaway = probe_sign(bench, limits, mode, preflight.speed_resolution_rad_s)
+            if breakaway is not None:
+                self._log.event(bench.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
+        with self._book.stage("speed", 50.0):
+            onlooker = Onlooker(
+                self._confirm_speed, preflight.identity.simulated, limits.accept_speed_unit, self._say
+            )
+            speed = run_speed(
+                bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset, onlooker
+            )
+            self._log.motion(None, speed.levels, (speed.ramp,))
+            self._note_rough(bench, speed)
+            self._note_timing(bench, speed)
+            resolution = preflight.speed_resolution_rad_s
+            slow: tuple[Sample, ...] = ()
+            if mode is Mode.TORQUE:
+                slow = slow_down(bench, limits, speed.model, assumptions, speed.high.speed_rad_s, resolution)
+        ramps: tuple[Ramp, ...] = (speed.ramp,)
+        drifted: TorqueResult | None = None
+        if mode is Mode.TORQUE:
+            with self._book.stage("torque", 15.0):
+                drifted = run_torque(
+                    bench, limits, assumptions, speed, slow, torque_offset, resolution, preflight.torque_setpoint
+                )
+                ramps = (speed.ramp, drifted.ramp)
+                self._log.motion(None, speed.levels, ramps)
+        else:
+            why = no_torque(task.request.mode, preflight)
+            self._book.skip("torque", f"{why}: no switch, and no second look at the inertia by a drift")
+        model = self._model(bench, speed, drifted)
+        planner = StagePlanner(bench, self._log, self._display, self._say)
+        planned = planner.plan(task, speed, mode, self._prior)
+        plan = planned.plan
+        control: MeanSpeedControl | None = None
+        if drifted is not None:
+            with self._book.stage("hold", 15.0):
+                control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
+                target = plan.start_rad_s if isinstance(plan, SwingPlan) else plan.segments[0].reference.offset_rad_s
+                run_hold(bench, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
+        else:
+            self._book.skip("hold", f"{why}: the drive's own speed control holds the mean speed")
+        with self._book.stage("acquire", planned.duration_s + 10.0):
+            announced = self._announcer(speed, ramps)
+            if isinstance(plan, SwingPlan):
+                run_swings(bench, limits, plan, control, assumptions, announced)
+            else:
+                run_acquire(
+                    bench, limits, plan, control, announced, planner.enough(planned),
+                    preflight.speed_resolution_rad_s,
+                )
+
+    def _prepare(self) -> tuple[Task, Bench, Preflight]:
+        identity = self._drive.connect()
+        self._log.learn(simulated=identity.simulated)
+        task = self._make_task(identity)
+        limits = task.limits
+        self._log.learn(**task.facts)
+        if self._reset_fault:
+            self._log.event(self._drive.clock.now_s(), "reset", "fault reset, as asked for by the operator")
+            self._drive.reset_fault()
+        no_reckoner = ""
+        if not self._drive.clock.stepped:
+            no_reckoner = self._make_ready()
+        preflight = self._book.preflight = self._drive.preflight(
+            Limits(
+                limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
+                limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
+                limits.temperature_c,
+            )
+        )
+        self._display.preflight(preflight)
+        for check in preflight.checks:
+            wanted = f"wanted {check.wanted}, " if check.wanted else ""
+            text = f"{check.name}: {wanted}found {check.found} ({check.outcome.value}) {check.where}"
+            self._log.event(self._drive.clock.now_s(), "preflight", text)
+        if preflight.refused:
+            raise _refusal(preflight)
+        refuse_with_string(limits, task.request, preflight)
+        limits = keep_within(limits, task.request, preflight)
+        task = replace(task, limits=limits)
+        if not preflight.watched:
+            self._log.configure(**no_watchdog.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID)
+            self._say(no_watchdog.SAID)
+        elif preflight.fed_by_any_client and not identity.simulated:
+            self._log.configure(**no_watchdog.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID_SHARED)
+            self._say(no_watchdog.SAID_SHARED)
+        self._choose_rate()
+        # What the line carries is known only now: the driver may have measured it in preflight.
+        period_s = self._drive.period_s
+        task = replace(task, assumptions=task.assumptions.at_period(period_s))
+        self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
+        self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles a second")
+        self._prior = with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
+        task = replace(task, assumptions=with_known_lag(task.assumptions, self._prior))
+        self._log.learn(
+            speed_resolution_rad_s=preflight.speed_resolution_rad_s,
+            torque_resolution_nm=preflight.torque_resolution_nm,
+            torque_limit_nm=limits.torque_nm,
+            lag_prior=self._prior,
+        )
+        guard = Guard(
+            limits,
+            period_s,
+            preflight.speed_resolution_rad_s,
+            preflight.torque_resolution_nm,
+            task.assumptions,
+        )
+        guard.no_braking = NOT_YET
+        if isinstance(self._drive, Timed):
+            guard.host_late = self._drive.host_late
+        bench = Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle)
+        bench.reckoner = self._reckoner
+        if no_reckoner:
+            bench.no_reckoner(no_reckoner)
+        return task, bench, preflight
+
+    def _make_ready(self) -> str:
+        """Load and start whatever would hold the loop up later; why there is no process for arithmetic, if so."""
+        stop_request = self._stop_request
+        self._reckoner, why = begin(quieten, lambda: stop_request.signum is not None)
+        if stop_request.signum is not None:
+            raise Interrupted(stop_request.signum)
+        return why
+
+    def _choose_rate(self) -> None:
+        """Where nobody has named it and this computer's clock is what counts: the highest that holds."""
+        drive = self._drive
+        if not (isinstance(drive, Paced) and drive.rates_hz):
+            return
+
+        def cycle() -> Sample:
+            if self._stop_request.signum is not None:
+                raise Interrupted(self._stop_request.signum)
+            return drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+
+        choice = choose_rate(drive, drive.rates_hz, cycle)
+        self._log.event(drive.clock.now_s(), "rate", choice.text)
+        self._log.configure(rate_tried=choice.plain())
+        self._say(choice.text)
+
+    def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
+        """The rough rig: stage 2's, with the drift of stage 3 as a witness."""
+        model = speed.model
+        if drifted is not None and drifted.rough is not None:
+            ratio = drifted.rough.inertia_kg_m2 / model.inertia_kg_m2
+            text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} of it from the drift"
+            self._log.event(bench.now_s, "plan", text)
+        return model
+
+    def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
+        return lambda motion: self._log.motion(motion, speed.levels, ramps)
+
+    def _note_timing(self, bench: Bench, speed: SpeedResult) -> None:
+        """How far a sample's time may be off; torque and speed may be apart by as much."""
+        half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
+        if half_s > 0.0:
+            self._prior = with_timing(self._prior, half_s)
+            self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
+            text = f"a sample's time is known to ±{1e3 * half_s:.3g} ms, the half of a transaction"
+            self._log.event(bench.now_s, "rate", text)
+
+    def _note_rough(self, bench: Bench, speed: SpeedResult) -> None:
+        model = speed.model
+        self._log.event(
+            bench.now_s,
+            "plan",
+            f"rough model: J {model.inertia_kg_m2:.4g} kg·m² ± {100 * speed.rough.rel_error:.0f} %, "
+            f"B {model.viscous_nm_s_rad:.3g} N·m·s/rad, T_c {model.coulomb_nm:.3g} N·m",
+        )
+
+    def _idle(self, bench: Bench) -> None:
+        bench.cycle(Command(Mode.SPEED, 0.0, 0.0))
+
+    def _log_failure(self, error: BaseException) -> None:
+        try:
+            self._log.failure(self._drive.clock.now_s(), error)
+        except Exception as also:
+            error.add_note(f"and the log did not take it: {also}")
+
+
+def _refusal(preflight: Preflight) -> PreflightRefused:
+    refused = [check for check in preflight.checks if check.outcome is Outcome.REFUSED]
+    first = refused[0]
+    more = f" (and {len(refused) - 1} more, see the table)" if len(refused) > 1 else ""
+    return PreflightRefused(
+        f"{first.name}: wanted {first.wanted}, found {first.found}{more}", where=first.where, next_step=first.next_step
+    )

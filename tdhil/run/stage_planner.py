@@ -1,0 +1,139 @@
+"""What stage 5 will do, planned while the shaft turns; told, shown and logged before any of it is done."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+from drivers.drive import Command, Mode
+from drivers.errors import LimitHit, PreflightRefused
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import FloatArray, LagPrior, SteppedSetpoint
+from tdhil.recording.run_log import RunLog
+from tdhil.run import excitation
+from tdhil.run.adaptive_duration import Decision, Enough
+from tdhil.run.control_loop import Bench
+from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
+from tdhil.run.excitation import Plan, PlanRefused, RigGuess, SwingPlan
+from tdhil.run.guard import Guard
+from tdhil.run.planning import Planned, as_followed, plan_acquisition
+from tdhil.run.settings import ExcitationRequest
+from tdhil.run.stages.speed import Course, SpeedResult
+from tdhil.run.task import Display, Say, Task
+
+RESERVE_S = 30.0
+"""Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
+
+
+class StagePlanner:
+    """Of one run, whose bench it keeps going while it reckons."""
+
+    def __init__(self, bench: Bench, log: RunLog, display: Display, say: Say) -> None:
+        self._bench = bench
+        self._log = log
+        self._display = display
+        self._say = say
+
+    def plan(self, task: Task, speed: SpeedResult, mode: Mode, prior: LagPrior) -> Planned:
+        """From what stage 2 has shown; the shaft goes on as it turns meanwhile.
+
+        Raises LimitHit where no plan fits the shaft within its limits, PreflightRefused where it would have to brake
+        and must not, and whatever a cycle raises.
+        """
+        bench = self._bench
+        request, limits, model = task.request, task.limits, speed.model
+        room = excitation.MachineLimits(
+            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
+        )
+        course = speed.course if mode is Mode.SPEED else None
+        last = bench.last
+        speed_now = max(0.0, last.speed_rad_s) if last else 0.0
+        keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
+        left_s = bench.guard.left_s(bench.now_s) - RESERVE_S
+        assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
+        theta = Knowledge(assumed, prior).theta(model)
+
+        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course, left_s)
+        try:
+            planned = bench.compute(work, keep)
+        except PlanRefused as error:
+            raise LimitHit(
+                f"no plan of stage 5 fits this shaft, as stages 2 and 3 have shown it: {error}",
+                where="plan of stage 5",
+                next_step=f"The shaft was stopped. {error.next_step}",
+            ) from error
+        plan = planned.plan
+        if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and bench.guard.no_braking:
+            raise PreflightRefused(
+                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {bench.guard.no_braking}",
+                where="plan of stage 5",
+                next_step=bench.guard.to_brake,
+            )
+        if course is not None:
+            self._note_following(plan)
+        self._display.planned(plan)
+        self._log.event(
+            bench.now_s,
+            "plan",
+            f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
+        )
+        self._tell(planned.said())
+        self._log.configure(plan=planned.plain())
+        if planned.stopping is not None:
+            self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})
+        return planned
+
+    def enough(self, planned: Planned) -> Enough | None:
+        """Asks the scatter, where a tolerance was given; every decision is in the log before it is carried out."""
+        rule = planned.stopping
+        if rule is None:
+            return None
+        told: list[dict[str, Any]] = []
+
+        def note(decision: Decision) -> None:
+            told.append(decision.plain())
+            self._log.configure(stopping=rule.plain() | {"decisions": list(told)})
+            self._tell(decision.why)
+
+        assert isinstance(planned.plan, Plan)
+        return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
+
+    def _note_following(self, plan: Plan | SwingPlan) -> None:
+        """What slow sampling of a stepped setpoint may do to J is identification's to say; it needs these."""
+        following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
+        if math.isfinite(ramp):
+            self._tell(f"the drive's own speed ramp holds the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
+        if following is None:
+            self._tell("how the drive follows its setpoint was not clear; stage 5 takes it to follow at once")
+            return
+        self._log.learn(
+            stepped_setpoint=SteppedSetpoint(
+                self._bench.period_s, following.zero_s, following.first_s, following.second_s2
+            )
+        )
+
+    def _tell(self, text: str) -> None:
+        self._log.event(self._bench.now_s, "plan", text)
+        self._say(text)
+
+
+def _reckon(
+    request: ExcitationRequest,
+    mode: Mode,
+    room: excitation.MachineLimits,
+    model: RigGuess,
+    prior: LagPrior,
+    assumed: Noise,
+    steady: tuple[Samples, ...],
+    theta: FloatArray,
+    course: Course | None,
+    left_s: float,
+) -> Planned:
+    """The arithmetic: plain data in and out, so that it can be done anywhere."""
+    known = Knowledge(measured_noise(steady, theta, assumed), prior)
+    if course is None:
+        return plan_acquisition(request, mode.value, room, model, known, left_s)
+    seen, within = as_followed(model, room, course, known.speed_lag_s)
+    return plan_acquisition(request, mode.value, within, seen, known, left_s)

@@ -1,0 +1,174 @@
+"""Stage 5, acquire: the planned excitation, in torque mode or in speed mode.
+
+In torque mode the feed-forward of the plan moves the shaft and a slow host loop keeps its mean where it belongs;
+in speed mode the reference goes to the drive's own loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from drivers.drive import Command, Mode, Sample
+from tdhil.protocol.control import MeanSpeedControl
+from tdhil.protocol.dither import dither, dither_peak
+from tdhil.recording.recording import Excitation, Segment
+from tdhil.run.adaptive_duration import Decision, Enough
+from tdhil.run.control_loop import Bench
+from tdhil.run.excitation import Plan, PlannedSegment
+from tdhil.run.settings import MachineLimits
+
+Reference = Callable[[float], tuple[float, float]]
+Announce = Callable[[Excitation], None]
+
+
+@dataclass(frozen=True)
+class AcquireResult:
+    """What was run, as the recording keeps it."""
+
+    excitation: Excitation
+
+
+class Follower:
+    """Follows a reference for a while, one command a cycle."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        limits: MachineLimits,
+        mode: Mode,
+        control: MeanSpeedControl | None,
+        beside: Callable[[float], float] | None = None,
+    ) -> None:
+        self._bench = bench
+        self._beside = beside
+        self._limits = limits
+        self._mode = mode
+        self._control = control
+        last = bench.last
+        self.time_s = last.time_s if last else bench.now_s
+        self.reported_rad_s = last.speed_rad_s if last else 0.0
+        self.wanted_rad_s = self.reported_rad_s
+
+    def follow(self, reference: Reference, duration_s: float) -> float:
+        """Run ``reference`` for a duration from the next cycle on; the control time at which it began."""
+        start_s = self.time_s + self._bench.period_s
+        # By time, not by a number of cycles: a slow line keeps its period on average at best.
+        self.follow_until(reference, start_s, start_s + max(duration_s, self._bench.period_s))
+        return start_s
+
+    def follow_until(self, reference: Reference, start_s: float, end_s: float) -> None:
+        """Go on with a reference that began at ``start_s`` up to the last cycle before ``end_s``."""
+        while self.time_s + 1.5 * self._bench.period_s < end_s:
+            self.step(reference, start_s)
+
+    def step(self, reference: Reference, start_s: float) -> None:
+        """One cycle of a reference that began at ``start_s``."""
+        self._step(*reference(self.time_s + self._bench.period_s - start_s))
+
+    def _step(self, speed_rad_s: float, torque_nm: float) -> None:
+        limits = self._limits
+        if self._control is not None:
+            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._bench.period_s)
+        torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
+        lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
+        setpoint = speed_rad_s + (0.0 if self._beside is None else self._beside(self.time_s))
+        wanted = max(lowest, min(limits.speed_max_rad_s, setpoint))
+        self.saw(self._bench.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+
+    def saw(self, sample: Sample, wanted_rad_s: float) -> None:
+        """Where the shaft is, after a cycle in which it was to have this speed."""
+        self.time_s, self.reported_rad_s, self.wanted_rad_s = sample.time_s, sample.speed_rad_s, wanted_rad_s
+
+
+def run_acquire(
+    bench: Bench,
+    limits: MachineLimits,
+    plan: Plan,
+    control: MeanSpeedControl | None,
+    announce: Announce,
+    enough: Enough | None = None,
+    speed_resolution_rad_s: float = 0.0,
+) -> AcquireResult:
+    """Every segment of the plan, with its transitions. ``announce`` is told the excitation as it grows.
+
+    A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
+    ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
+    more is wanted so many periods more at its mean speed and then, settled anew, at the others. In speed mode a
+    coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
+    """
+    begun_s = bench.now_s
+    beside = _beside(plan, speed_resolution_rad_s, begun_s)
+    course = _Course(bench, plan, Follower(bench, limits, Mode(plan.mode), control, beside), announce)
+    for index in range(len(plan.segments)):
+        course.go_to(index)
+    while enough is not None:
+        more = enough.decided(course.ask(enough.question(bench.now_s - begun_s)))
+        if more == 0:
+            break
+        course.go_on(more)
+        for index in course.others():
+            course.go_to(index, more)
+    announce(course.excitation)
+    return AcquireResult(course.excitation)
+
+
+def _beside(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
+    peak_rad_s = dither_peak(resolution_rad_s, plan.limits.width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
+    if peak_rad_s == 0.0:
+        return None
+    period_s = plan.segments[0].reference.period_s
+    return lambda time_s: dither(time_s - begun_s, period_s, peak_rad_s)
+
+
+class _Course:
+    """Where stage 5 is: the segments that are done, and the one that the shaft is in."""
+
+    def __init__(self, bench: Bench, plan: Plan, follower: Follower, announce: Announce) -> None:
+        self._bench, self._plan, self._follower, self._announce = bench, plan, follower, announce
+        self._done: list[Segment] = []
+        self._index = 0
+        self._segment: PlannedSegment = plan.segments[0]
+        self._start_s = 0.0
+
+    @property
+    def excitation(self) -> Excitation:
+        """What has been run."""
+        return Excitation(self._plan.kind, self._plan.mode, tuple(self._done))
+
+    def go_to(self, index: int, counted: int | None = None) -> None:
+        """To another mean speed, and through its segment: as planned, or with so many periods that count."""
+        segment, follower = self._plan.segments[index], self._follower
+        if counted is not None:
+            segment = replace(segment, periods=segment.settle_periods + counted)
+        transition = self._plan.transition(follower.wanted_rad_s, index)
+        follower.follow(transition.reference, transition.duration_s)
+        self._tell(segment.recorded(follower.time_s + self._bench.period_s))
+        self._start_s = follower.follow(segment.reference.reference, segment.duration_s)
+        self._index, self._segment = index, segment
+        self._done.append(self._recorded())
+
+    def ask(self, work: Callable[[], Decision]) -> Decision:
+        """What has been run is announced; then the segment goes on for as long as the look takes (real time)."""
+        self._announce(self.excitation)
+        reference = self._segment.reference.reference
+        return self._bench.compute_while(work, lambda: self._follower.step(reference, self._start_s))
+
+    def go_on(self, periods: int) -> None:
+        """So many periods more where the shaft is."""
+        self._done.pop()
+        segment = self._segment = replace(self._segment, periods=self._segment.periods + periods)
+        self._tell(segment.recorded(self._start_s))
+        self._follower.follow_until(segment.reference.reference, self._start_s, self._start_s + segment.duration_s)
+        self._done.append(self._recorded())
+
+    def others(self) -> list[int]:
+        """The other mean speeds, the one before first."""
+        return [index for index in reversed(range(len(self._plan.segments))) if index != self._index]
+
+    def _tell(self, planned: Segment) -> None:
+        self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
+
+    def _recorded(self) -> Segment:
+        # The last period is whole when its last sample is there: the one before the cycle that would begin the next.
+        return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._bench.period_s)

@@ -1,0 +1,72 @@
+"""Stage 4, hold: the host's fine adjustment on real-time feedback, to the mean speed at which stage 5 begins."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from drivers.drive import Command, Mode
+from drivers.errors import LimitHit
+from tdhil.protocol.control import MeanSpeedControl
+from tdhil.run.control_loop import Bench
+from tdhil.run.excitation import RigGuess
+from tdhil.run.settings import MachineLimits
+
+WINDOW_SHARE = 0.02
+SETTLED_S = 3.0
+MEAN_S = 1.0
+TIMEOUT_S = 90.0
+"""Beyond the ramp, which takes a heavy shaft long."""
+
+
+@dataclass(frozen=True)
+class HoldResult:
+    """The steady point: where it is, and the torque that holds it beside the model's friction."""
+
+    speed_rad_s: float
+    correction_nm: float
+    settling_s: float
+
+
+def run_hold(
+    bench: Bench,
+    limits: MachineLimits,
+    model: RigGuess,
+    control: MeanSpeedControl,
+    target_rad_s: float,
+    start_rad_s: float,
+    speed_resolution_rad_s: float,
+) -> HoldResult:
+    """Bring the mean speed into a window of 2 % and keep it there for 3 s, in torque mode.
+
+    The wanted speed is ramped from where the shaft is, at a rate that takes a quarter of the torque limit.
+    """
+    tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s)
+    recent: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
+    rate = min(0.25 * limits.torque_nm / model.inertia_kg_m2, (limits.speed_max_rad_s - limits.speed_min_rad_s) / 5.0)
+    begun_s = bench.now_s
+    inside_since_s: float | None = None
+    wanted = reported = start_rad_s
+    correction = 0.0
+    timeout_s = TIMEOUT_S + abs(target_rad_s - start_rad_s) / rate
+    for _ in range(bench.cycles(timeout_s)):
+        step = max(-rate * bench.period_s, min(rate * bench.period_s, target_rad_s - wanted))
+        wanted += step
+        correction = control.update(wanted - reported, bench.period_s)
+        ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / bench.period_s
+        torque = max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))
+        sample = bench.cycle(Command(Mode.TORQUE, wanted, torque))
+        reported = sample.speed_rad_s
+        recent.append(reported)
+        mean = sum(recent) / len(recent)
+        if abs(mean - target_rad_s) > tolerance_rad_s:
+            inside_since_s = None
+        elif inside_since_s is None:
+            inside_since_s = sample.time_s
+        elif sample.time_s - inside_since_s >= SETTLED_S:
+            return HoldResult(mean, correction, sample.time_s - begun_s)
+    raise LimitHit(
+        f"no steady speed near {target_rad_s:.3f} rad/s within {timeout_s:.0f} s (last {mean:.3f} rad/s)",
+        where="stage hold",
+        next_step="Does the load change by itself, or does a brake drag? Look at speed and torque in the log",
+    )

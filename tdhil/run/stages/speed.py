@@ -1,0 +1,174 @@
+"""Stage 2, speed: to n0 under the drive's own speed control, settle; then a second mean speed.
+
+The mean torque at two steady speeds gives Coulomb and viscous friction free of every lag, and the ramp between
+them a rough inertia by its balance of momentum, in which a lag cancels since both ends are steady.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.drive import Command, Mode, Sample
+from drivers.errors import DriveFault
+from tdhil.estimation.rough_inertia import RoughInertia, rough_inertia
+from tdhil.estimation.samples import Samples
+from tdhil.recording.recording import FloatArray, Level, Ramp
+from tdhil.run.control_loop import Bench
+from tdhil.run.excitation import RigGuess
+from tdhil.run.settings import ControlAssumptions, MachineLimits
+from tdhil.run.speed_check import Onlooker, SpeedLook
+from tdhil.run.stages.steady import SteadyLevel, steady_level, trace, wait_until_steady
+
+LEVEL_S = 6.0
+FIRST_RAMP_S = 8.0
+"""The first ramp takes this long over the whole window; a rig too light to show in it is ramped faster."""
+
+GOOD_ENOUGH = 0.2
+"""Relative uncertainty of the rough inertia that is good enough to plan with."""
+
+TRIES = 4
+NOBODY = Onlooker()
+
+
+@dataclass(frozen=True)
+class Course:
+    """Setpoint and reported speed of the ramp between the levels, with the calm at both ends, (N,) each."""
+
+    time_s: FloatArray
+    setpoint_rad_s: FloatArray
+    reported_rad_s: FloatArray
+
+
+@dataclass(frozen=True)
+class SpeedResult:
+    """Torque at two speeds, and the model that the rest is planned with."""
+
+    low: SteadyLevel
+    high: SteadyLevel
+    model: RigGuess
+    rough: RoughInertia
+    ramp: Ramp
+    last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
+    steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
+    course: Course | None = None       # how the drive followed the ramp
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        return (self.low.level, self.high.level)
+
+
+def mean_speeds(limits: MachineLimits) -> tuple[float, float]:
+    """The two mean speeds of the friction level, rad/s."""
+    span = limits.speed_max_rad_s - limits.speed_min_rad_s
+    return limits.speed_min_rad_s + 0.25 * span, limits.speed_min_rad_s + 0.7 * span
+
+
+def run_speed(
+    bench: Bench,
+    limits: MachineLimits,
+    assumptions: ControlAssumptions,
+    speed_resolution_rad_s: float,
+    torque_offset_nm: float,
+    onlooker: Onlooker = NOBODY,
+) -> SpeedResult:
+    """Both levels and the ramp between them.
+
+    Raises what the bench raises, LimitHit if a speed doesn't settle, PreflightRefused if the unit of speed is wrong.
+    """
+    low_rad_s, high_rad_s = mean_speeds(limits)
+    tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
+    rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
+    start = bench.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(bench) else None
+    speed_now = max(0.0, start.speed_rad_s) if start else 0.0
+    look = SpeedLook(bench, limits, assumptions, speed_resolution_rad_s, onlooker)
+    look.ramp(speed_now, low_rad_s, rate)
+    low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions, before_level=look.level)
+    look.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
+    for _ in range(TRIES):
+        between = _ramp(bench, low_rad_s, high_rad_s, rate)
+        ramped = len(between)
+        high_samples = _settle_and_hold(bench, high_rad_s, tolerance_rad_s, assumptions, between)
+        held = bench.cycles(LEVEL_S)
+        low, high = steady_level(low_samples[-held:]), steady_level(high_samples[-held:])
+        moved = trace([*low_samples[-held:], *between, *high_samples[-held:]])
+        rough = rough_inertia(
+            moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
+        )
+        if rough is not None and rough.rel_error <= GOOD_ENOUGH:
+            break
+        rate *= 4.0
+        bench.log.event(bench.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
+        _ramp(bench, high_rad_s, low_rad_s, rate)
+        low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions)
+    if rough is None or not rough.inertia_kg_m2 > 0.0:
+        found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
+        raise DriveFault(
+            f"no plausible inertia could be read off the speed ramp ({found})",
+            where="stage speed",
+            next_step="Is the sign or the scale of the torque right? A wider speed window gives a better ramp",
+        )
+    model = RigGuess(
+        rough.inertia_kg_m2,
+        max(0.0, rough.friction.viscous_nm_s_rad),
+        max(0.0, rough.friction.coulomb_nm),
+        min(0.8, max(GOOD_ENOUGH, rough.rel_error)),
+    )
+    bench.guard.model = model
+    return SpeedResult(
+        low,
+        high,
+        model,
+        rough,
+        Ramp(low.level.end_s, high.level.start_s),
+        tuple(high_samples[-bench.cycles(0.5) :]),
+        tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
+        _course(low_samples[-held:], between[:ramped], [*between[ramped:], *high_samples[-held:]], mean_speeds(limits)),
+    )
+
+
+def _course(low: list[Sample], ramp: list[Sample], high: list[Sample], speeds_rad_s: tuple[float, float]) -> Course:
+    low_rad_s, high_rad_s = speeds_rad_s
+    setpoint = np.concatenate([
+        np.full(len(low), low_rad_s),
+        low_rad_s + (high_rad_s - low_rad_s) * np.arange(1, len(ramp) + 1) / len(ramp),
+        np.full(len(high), high_rad_s),
+    ])
+    rows = np.array([(one.time_s, one.speed_rad_s, one.fresh) for one in (*low, *ramp, *high)], dtype=np.float64)
+    fresh = rows[:, 2] > 0.0
+    return Course(rows[fresh, 0], setpoint[fresh], rows[fresh, 1])
+
+
+def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:
+    fresh = trace(held)
+    return Samples(fresh.time_s, fresh.speed_rad_s, fresh.torque_nm - torque_offset_nm)
+
+
+def _in_torque(bench: Bench) -> bool:
+    return bench.last is not None and bench.last.mode is Mode.TORQUE
+
+
+def _ramp(bench: Bench, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
+    steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / bench.period_s))
+    span = end_rad_s - start_rad_s
+    return [bench.cycle(Command(Mode.SPEED, start_rad_s + span * step / steps, 0.0)) for step in range(1, steps + 1)]
+
+
+def _settle_and_hold(
+    bench: Bench,
+    speed_rad_s: float,
+    tolerance_rad_s: float,
+    assumptions: ControlAssumptions,
+    into: list[Sample] | None = None,
+    before_level: Callable[[], None] = lambda: None,
+) -> list[Sample]:
+    """Settle, let the reporting lags run out, then the level; the settling is appended to ``into``."""
+    command = Command(Mode.SPEED, speed_rad_s, 0.0)
+    settling = wait_until_steady(bench, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
+    settling += bench.hold(command, 2.0 * assumptions.largest_speed_lag_s)
+    if into is not None:
+        into += settling
+    before_level()
+    return bench.hold(command, LEVEL_S)

@@ -1,0 +1,403 @@
+"""The one stop sequence, for every cause and for the normal end.
+
+1. Quick stop under the drive's speed control; where the profile says that a quick stop does not decelerate from
+   torque mode, speed mode at zero first.
+2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer
+   than the largest plausible lag. How long that takes depends on the torque limit and on what swings: as long as the
+   shaft keeps getting slower, it is waited for.
+3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`let_go`). Since a drive may
+   end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in speed mode,
+   at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at once, and is
+   then left holding what it holds: a wound-up string is not let go by disabling.
+4. Only then disable, and confirm: torque off by status word, and the shaft still at rest without it.
+
+What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been
+quiet for half a swing (`let_go.QUIET_S`); its motor does not follow, since its friction holds.
+
+Where the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the drive is
+looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
+has had its time, and a look contradicts it (`stop_looks`).
+
+A shaft that goes on turning in spite of the quick stop (somebody else commands it, or the drive doesn't brake) is not
+held up by the host's own sign of life: the drive is not fed any more, so that its watchdog acts, and it is watched on.
+
+A turning shaft is never disabled from here. If the drive can't be reached, its own watchdog must act, and that
+is what the report says. Nothing that is raised on the way, an interrupt included, skips any of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from drivers.drive import Command, Mode, PowerState, Sample, StopsFeeding
+from drivers.errors import CommandRejected, StopNotConfirmed
+from tdhil.protocol.stop_looks import Looks, Slowing
+from tdhil.protocol.stop_patience import Patience
+from tdhil.run.control_loop import Bench
+from tdhil.run.settings import ControlAssumptions, MachineLimits
+from tdhil.run.string_release import MEAN_S, LetGo, LetGoLimits
+
+AT_REST_SHARE = 0.005
+"""Standstill is a speed below this share of the speed limit, or three quanta if that is more."""
+
+LONGEST_GAP_S, LONGEST_GAP_CYCLES = 0.2, 3
+"""Standstill must have been watched without a longer gap in the feedback than both; on a slow line a frame may go."""
+
+SILENT_S, SILENT_CYCLES = 1.0, 25
+"""After so long, and so many cycles, without any feedback the drive can't be reached: its watchdog stops the shaft."""
+
+MODE_S = 0.5
+"""The drive may take so long to change to speed mode."""
+
+REST_AFTER_S = 10.0
+"""A shaft that begins to turn once its torque is off gets so long to come to rest by itself."""
+
+UNMOVED_S, UNMOVED_STRING_S, UNMOVED_RAMP_SHARE = 3.0, 10.0, 0.1
+"""A shaft that got no slower for so long after the quick stop is left to the drive's watchdog; one with a string may
+swing meanwhile. On a long ramp this share of it, from the highest speed, if that is more."""
+
+MOST_INTERRUPTIONS = 5
+"""The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
+
+_NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT, PowerState.NOT_READY)
+_REST = Command(Mode.SPEED, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class StopReport:
+    """How the stop went. ``confirmed``: seen at rest and disabled."""
+
+    confirmed: bool
+    at_rest_s: float | None            # control time at which the shaft was seen at rest
+    disabled: bool
+    trouble: tuple[str, ...] = ()
+    trapped_nm: float = 0.0            # what a drill string held at standstill, before it was let go; signed
+
+
+class StopSequence:
+    """Runs once; a second call gives the first one's report. ``watched``: the drive's own watchdog is armed."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        limits: MachineLimits,
+        speed_resolution_rad_s: float,
+        quick_stop_in_torque_mode: bool,
+        assumptions: ControlAssumptions | None = None,
+        *,
+        torque_resolution_nm: float = 0.0,
+        torque_offset_nm: float = 0.0,
+        watched: bool = True,
+    ) -> None:
+        assumptions = assumptions or ControlAssumptions()
+        self._bench = bench
+        self._limits = limits
+        self._at_rest_rad_s = max(3.0 * speed_resolution_rad_s, AT_REST_SHARE * limits.speed_max_rad_s)
+        self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * bench.period_s)
+        self._settle_s = 3.0 * assumptions.largest_speed_lag_s
+        # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
+        ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
+        self._enough_s = 3.0 * ramp_s + 2.0 * self._settle_s + 1.0
+        self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
+        self._watched = watched
+        self._string = None
+        if limits.load == "string":
+            self._string = LetGoLimits(
+                torque_nm=limits.torque_nm,
+                speed_rad_s=limits.speed_max_rad_s,
+                ramp_nm_s=limits.torque_ramp_nm_s,
+                torque_resolution_nm=torque_resolution_nm,
+                torque_offset_nm=torque_offset_nm,
+            )
+        self._held: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
+        self._trapped_nm = 0.0
+        self._trouble: list[str] = []
+        self._looks = Looks(bench.drive, bench.period_s)
+        self._slowing = Slowing(self._at_rest_rad_s)
+        self._unmoved_s = max(
+            UNMOVED_STRING_S if self._string is not None else UNMOVED_S, UNMOVED_RAMP_SHARE * ramp_s
+        )
+        self._fed = True
+        self._silent = 0
+        self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
+        self._running = False
+        self._report: StopReport | None = None
+
+    def run(self) -> StopReport:
+        """Bring the shaft to rest and disable. Never raises; what went wrong is in the report."""
+        if self._running:
+            return StopReport(False, None, False, ("the stop sequence is under way already",))
+        self._running = True
+        for _ in range(MOST_INTERRUPTIONS):
+            if self._report is not None:
+                break
+            try:
+                self._report = self._sequence()
+            except BaseException as error:  # an interrupt must not end it either: from the beginning, then
+                self._note(error)
+        self._running = False
+        return self._report or StopReport(False, None, False, tuple(self._trouble))
+
+    def _sequence(self) -> StopReport:
+        self._bench.guard.expected = None
+        if self._string is not None and self._slow_down():
+            self._let_go(self._string)
+        at_rest_s = self._decelerate()
+        disabled = stays = False
+        if at_rest_s is not None and not self._wound_up():
+            disabled = self._disable()
+            stays = disabled and self._stays_at_rest()
+        return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
+
+    # -- with a drill string -----------------------------------------------------------------------------------
+
+    def _slow_down(self) -> bool:
+        """Speed mode, ramped to zero: whether the drive followed, and so holds the shaft under speed control now."""
+        last = self._bench.last
+        speed = last.speed_rad_s if last is not None and math.isfinite(last.speed_rad_s) else 0.0
+        came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._bench.period_s
+        patience = Patience(self._enough_s, self._at_rest_rad_s)
+        since_s = 0.0
+        while not patience.over:
+            speed = math.copysign(max(0.0, abs(speed) - step), came_from)
+            sample = self._exchange(Command(Mode.SPEED, speed, 0.0))
+            since_s += self._bench.period_s
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    return False
+                patience.wait(self._bench.period_s)
+                continue
+            regulated = sample.mode is Mode.SPEED
+            if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S):
+                return False
+            patience.see(sample.speed_rad_s, self._bench.period_s)
+            if regulated and speed == 0.0 and sample.speed_rad_s * came_from <= self._at_rest_rad_s:
+                return True
+        self._trouble.append("the shaft did not follow speed mode to standstill; quick stop instead")
+        return False
+
+    def _let_go(self, string: LetGoLimits) -> None:
+        """Yield to what the string holds, until nothing is left or the bounds are reached."""
+        going = LetGo(string, self._at_rest_rad_s, self._bench.period_s)
+        command = _REST
+        while not (going.done or going.failed):
+            sample = self._exchange(command)
+            if sample is None:
+                command = _REST
+                if self._silent >= self._enough_silent:
+                    return
+                continue
+            if sample.state is not PowerState.ENABLED or sample.mode is not Mode.SPEED:
+                self._trouble.append(f"the drive shows '{sample.state.value}' while trapped torque is let go")
+                break
+            command = Command(Mode.SPEED, going.step(sample.torque_nm, sample.speed_rad_s), 0.0)
+        self._trapped_nm = going.trapped_nm
+        if going.failed:
+            self._trouble.append(
+                f"trapped torque did not come down: {going.trapped_nm:.0f} N·m at first, {going.torque_nm:.0f} N·m"
+                f" after {going.travel_rad:.1f} rad"
+            )
+
+    def _wound_up(self) -> bool:
+        """Does the drive hold a torque that disabling would let go at once?"""
+        last = self._bench.last
+        if self._string is None or not self._held or last is None or last.state in _NO_TORQUE:
+            return False
+        held_nm = math.fsum(self._held) / len(self._held) - self._string.torque_offset_nm
+        if abs(held_nm) <= 2.0 * self._string.residual_nm:
+            return False
+        self._trouble.append(
+            f"the drill string still holds {held_nm:.0f} N·m: the drive was not disabled and holds the shaft at rest"
+        )
+        return True
+
+    # -- with any load -----------------------------------------------------------------------------------------
+
+    def _decelerate(self) -> float | None:
+        if not self._quick_stop_in_torque_mode:
+            for _ in range(self._bench.cycles(MODE_S)):
+                sample = self._exchange(_REST)
+                if sample is not None and sample.mode is Mode.SPEED:
+                    break
+        asked = self._ask(self._bench.drive.quick_stop)
+        at_rest_s = self._see_rest(asked)
+        if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
+            at_rest_s = self._see_rest(asked)
+        return at_rest_s
+
+    def _see_rest(self, asked: bool) -> float | None:
+        patience = Patience(self._enough_s, self._at_rest_rad_s)
+        braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
+        quiet_since_s: float | None = None
+        heard_s = 0.0
+        while not patience.over:
+            asked = asked or self._ask(self._bench.drive.quick_stop)
+            sample = self._exchange(_REST, or_look=True)
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    self._trouble.append("no feedback from the drive any more")
+                    return None
+                patience.wait(self._bench.period_s)
+                continue
+            if not self._gets_slower(sample):
+                return None
+            patience.see(sample.speed_rad_s, self._bench.period_s)
+            if not braking.see(sample.time_s, sample.speed_rad_s) and self._leave_to_watchdog(sample):
+                patience = Patience(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
+            # Single lost frames don't unsay what the others showed; a longer gap does.
+            unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
+            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
+                quiet_since_s = None
+            elif quiet_since_s is None or unheard_s > self._longest_gap_s:
+                quiet_since_s = sample.time_s
+            elif sample.time_s - quiet_since_s >= self._settle_s and (sample.standstill or sample.state in _NO_TORQUE):
+                return sample.time_s
+        self._trouble.append(f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop")
+        return None
+
+    def _leave_to_watchdog(self, sample: Sample) -> bool:
+        """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
+        drive = self._bench.drive
+        if not (self._fed and self._watched and isinstance(drive, StopsFeeding)):
+            return False
+        try:
+            drive.stop_feeding()
+        except CommandRejected as error:   # it would not help: somebody else feeds the watchdog, too
+            self._fed = False
+            self._note(error)
+            return False
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return False
+        self._fed = False
+        self._trouble.append(
+            f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s in spite of the quick stop: the host's sign"
+            " of life was ended, so that the drive's own watchdog acts"
+        )
+        return True
+
+    def _disable(self) -> bool:
+        asked = self._ask(self._bench.drive.disable)
+        for _ in range(self._bench.cycles(3.0)):
+            asked = asked or self._ask(self._bench.drive.disable)
+            sample = self._exchange(_REST, or_look=True)
+            if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
+                return True
+            if self._silent >= self._enough_silent:
+                break
+        self._trouble.append("the drive did not confirm that it is disabled")
+        return False
+
+    def _stays_at_rest(self) -> bool:
+        """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
+        quiet_s, told, heard_s = 0.0, False, self._bench.now_s
+        for _ in range(self._bench.cycles(REST_AFTER_S)):
+            sample = self._exchange(_REST, or_look=True)
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    self._trouble.append("nothing was heard of the drive once it was disabled")
+                    return True
+                continue
+            # Looks are further apart than cycles are; a longer gap shows nothing.
+            apart_s = sample.time_s - heard_s if self._looks.standing else 0.0
+            quiet_s += max(self._bench.period_s, min(self._longest_gap_s, apart_s))
+            heard_s = sample.time_s
+            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
+                quiet_s = 0.0
+                if not told:
+                    told = True
+                    self._trouble.append(
+                        f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
+                        " is something wound up, or hanging on it?"
+                    )
+            elif quiet_s >= self._settle_s:
+                return True
+        return False
+
+    def _ask(self, request: Callable[[], None]) -> bool:
+        """Whether the drive took a request; one that fails is made again in the next cycle."""
+        try:
+            request()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return False
+        return True
+
+    def _note(self, error: BaseException) -> None:
+        if len(self._trouble) < 20:
+            self._trouble.append(str(error) or type(error).__name__)
+
+    def _exchange(self, command: Command, *, or_look: bool = False) -> Sample | None:
+        """One cycle's feedback; where there is none, a look's, if that may be taken and one is due."""
+        sample: Sample | None = None
+        try:
+            sample = self._bench.stop_cycle(command)
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+        if sample is None or not sample.fresh or (or_look and self._looks.only):
+            sample = self._look() if or_look else None
+        else:
+            self._looks.heard()
+            self._slowing.reset()
+        if sample is None:
+            self._silent += 1
+            return None
+        self._silent = 0
+        self._bench.last = sample
+        self._held.append(sample.torque_nm)
+        return sample
+
+    # -- looks beside the cycle --------------------------------------------------------------------------------
+
+    def _look(self) -> Sample | None:
+        try:
+            sample = self._looks.missed()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return None
+        if sample is not None and self._looks.answered == 1:
+            self._held.clear()             # what was held before the gap tells nothing of now
+            self._trouble.append("the cycle brings no feedback: the drive was asked one question at a time instead")
+        return sample
+
+    def _contradicted(self) -> bool:
+        """Does a look show another drive than the cycle's feedback does? Then only looks are believed from now on."""
+        told = self._bench.last
+        try:
+            sample = self._looks.ask()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return False
+        if sample is None or told is None:
+            return False
+        rest = self._at_rest_rad_s
+        self._looks.only = abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest
+        if self._looks.only:
+            self._held.clear()
+            self._trouble.append(
+                f"the cycle's feedback tells of {told.speed_rad_s:.3f} rad/s, and a look at the drive of"
+                f" {sample.speed_rad_s:.3f} rad/s: the cycle's is not believed any more"
+            )
+        return self._looks.only
+
+    def _gets_slower(self, sample: Sample) -> bool:
+        """A shaft that looks alone show, and that goes on turning, is left to the drive's own watchdog, if armed."""
+        if not (self._watched and self._looks.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
+            return True
+        self._trouble.append(
+            f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s without feedback of the cycle: the drive is"
+            " left alone, so that its own watchdog acts"
+        )
+        return False
+
+
+def not_confirmed(report: StopReport) -> StopNotConfirmed:
+    """The loudest error there is."""
+    return StopNotConfirmed(
+        "the stop was NOT confirmed: " + (report.trouble[-1] if report.trouble else "no standstill seen"),
+        where="stop sequence",
+        next_step="Use the hard-wired emergency stop now. The drive's own watchdog stops the shaft if it was armed",
+    )

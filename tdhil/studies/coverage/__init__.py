@@ -1,0 +1,1 @@
+"""How often the interval covers: seeded plants, identified by the hundred."""

@@ -1,0 +1,150 @@
+"""The Cramér-Rao bound of the inertia, from the true parameters and the noise at the lines; no estimator's code.
+
+Over P whole periods of length L at one mean speed, the lines W_k of reported speed and T_k of reported torque obey
+T_k = G_k W_k + r_k, with
+
+    G = (J s + B) H_T(s)/H_w(s) e^(−d s),   E|r_k|² = 4 S_k/(P L).
+
+W_k is a nuisance parameter of its own, free at every line and mean speed. Concentrated out of the Gaussian likelihood
+of (T_k, W_k), whatever their covariance, it leaves the information about theta
+
+    F = 2 Re Σ_k |W_k|² (∂G_k/∂theta)ᴴ (∂G_k/∂theta) / E|r_k|²,
+
+and the mean torque T̄ = B ω̄ + T_c + r₀, E r₀² = S_0/(P L), adds (∂T̄/∂theta)ᵀ(∂T̄/∂theta) P L/S_0. S is the density
+(per Hz, two-sided) of r = T − G W on the sampled signals:
+
+- the load, once: in T − G W it appears as −H_T·load (speed answers it, the torque as reported doesn't know of it);
+- ripple turns the shaft and is reported: it cancels at the line, but what the sampling folds onto the line does not;
+- the sensor's noise, through H_w, times |G|²; its folds too;
+- what is added to each report and the rounding (q²/12), white over the samples.
+
+theta = (J, B, T_c, every lag, every average's width, the skew): derivatives by central differences.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, FloatArray, Report
+from tdhil.studies.coverage.simulate import quiet_shaft
+
+_FOLDS = 30              # multiples of the sampling rate that are folded in, either way
+_SINGULAR = 1e-10        # of the scaled information: below it the bound is not a number
+_KNOWN_LAGS = [0, 1, 2, -1]
+_ROUGH = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])    # five equal shares of the rough inertia's error
+
+
+@dataclass(frozen=True)
+class Watched:
+    """One mean speed: ``speed`` (K,) complex lines of reported speed, rad/s, over ``seconds`` of whole periods."""
+
+    mean_rad_s: float
+    speed: ComplexArray
+    seconds: float
+
+
+def theta_of(plant: CoveragePlant) -> FloatArray:
+    """(J, B, T_c, speed lags, speed average, torque lags, torque average, skew)."""
+    parts = [plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.coulomb_nm]
+    for report in (plant.speed_report, plant.torque_report):
+        parts += [*report.lags_s, *([report.average_s] if report.average_s > 0.0 else [])]
+    return np.array([*parts, plant.skew_s])
+
+
+def impedance_of(plant: CoveragePlant, theta: FloatArray, s: ComplexArray) -> ComplexArray:
+    """G(s) as the host sees it, (K,); the plant says which lags theta holds."""
+    rest = list(theta[3:-1])
+    shown = []
+    for report in (plant.speed_report, plant.torque_report):
+        lags = tuple(float(rest.pop(0)) for _ in report.lags_s)
+        shown.append(Report(lags, float(rest.pop(0)) if report.average_s > 0.0 else 0.0))
+    shaft = theta[0] * s + theta[1]
+    seen: ComplexArray = shaft * shown[1].response(s) / shown[0].response(s) * np.exp(-theta[-1] * s)
+    return seen
+
+
+def density(plant: CoveragePlant, hertz: FloatArray) -> FloatArray:
+    """S of T − G W at the lines, (N·m)²/Hz, (K,)."""
+    noise, rate = plant.noise, plant.reading.rate_hz
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    g2 = np.abs(impedance_of(plant, theta_of(plant), s)) ** 2
+    ripple, sensor = noise.ripple_nm**2 * plant.step_s, noise.sensor_rad_s**2 * plant.step_s
+    total = np.zeros(len(hertz))
+    for fold in range(-_FOLDS, _FOLDS + 1):
+        f: ComplexArray = 2j * np.pi * (hertz + fold * rate).astype(np.complex128)
+        if abs(fold) * rate > 0.5 / plant.step_s:
+            continue
+        load = 2.0 * noise.load_nm**2 * noise.load_time_s / (1.0 + np.abs(f * noise.load_time_s) ** 2)
+        h_t, h_w = (np.abs(report.response(f)) ** 2 for report in (plant.torque_report, plant.speed_report))
+        total += g2 * h_w * sensor
+        if fold == 0:
+            total += h_t * load
+        else:
+            shaft = np.abs(plant.inertia_kg_m2 * f + plant.viscous_nm_s_rad) ** 2
+            total += h_t * ripple + g2 * h_w * (load + ripple) / shaft
+    speed_white = noise.reported_speed_rad_s**2 + noise.speed_quantum_rad_s**2 / 12.0
+    torque_white = noise.reported_torque_nm**2 + noise.torque_quantum_nm**2 / 12.0
+    kept = rate * (1.0 - plant.reading.dropped)
+    result: FloatArray = total + (torque_white + g2 * speed_white) / kept
+    return result
+
+
+def information(plant: CoveragePlant, hertz: FloatArray, watched: list[Watched]) -> FloatArray:
+    """Fisher information about theta, (n, n)."""
+    theta = theta_of(plant)
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    columns = []
+    for index in range(len(theta)):
+        by = np.zeros(len(theta))
+        by[index] = 1e-5 * max(abs(theta[index]), 0.01)
+        rise = impedance_of(plant, theta + by, s) - impedance_of(plant, theta - by, s)
+        columns.append(rise / (2.0 * by[index]))
+    slopes: ComplexArray = np.stack(columns, axis=1)
+    at_lines, at_rest = density(plant, hertz), float(density(plant, np.zeros(1))[0])
+    found = np.zeros((len(theta), len(theta)))
+    for one in watched:
+        weight = np.abs(one.speed) ** 2 * one.seconds / (4.0 * at_lines)
+        found += 2.0 * (slopes.conj().T @ (weight[:, None] * slopes)).real
+        level = np.zeros(len(theta))
+        level[1], level[2] = one.mean_rad_s, 1.0
+        found += np.outer(level, level) * one.seconds / at_rest
+    return found
+
+
+def bound_of(fisher: FloatArray) -> float | None:
+    """Least standard deviation of the first parameter; None where the parameters can't be told apart."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    scaled = fisher * np.outer(scale, scale)
+    if float(np.linalg.eigvalsh(scaled)[0]) < _SINGULAR:
+        return None
+    return float(np.sqrt(np.linalg.inv(scaled)[0, 0]) * scale[0])
+
+
+def cramer_rao(plant: CoveragePlant, periods: int) -> float | None:
+    """Least standard deviation of J, kg·m²: root of the mean variance over rough inertias, which set the amplitude.
+
+    Where the lags can't be told apart they count as known: that is the best estimator there, and no bound for ours.
+    """
+    asked, shaft = quiet_shaft(plant, _ROUGH, periods)
+    variances = []
+    for run, segments in enumerate(asked.segments):
+        hertz = np.array(segments[0].lines_hz)
+        watched = []
+        for segment in segments:
+            first = segment.start_s + segment.settle_periods * segment.period_s
+            rows = slice(round(first / shaft.step_s), round(segment.end_s / shaft.step_s))
+            speed = shaft.speed[rows, run]
+            time = np.arange(rows.start, rows.stop) * shaft.step_s
+            turned: ComplexArray = np.exp(-2j * np.pi * np.outer(hertz, time)).astype(np.complex128)
+            lines: ComplexArray = (turned @ speed.astype(np.complex128)) * (2.0 / len(time))
+            lines = lines * plant.speed_report.response(2j * np.pi * hertz.astype(np.complex128))
+            watched.append(Watched(float(speed.mean()), lines, segment.end_s - first))
+        fisher = information(plant, hertz, watched)
+        sd = bound_of(fisher[np.ix_(_KNOWN_LAGS, _KNOWN_LAGS)] if plant.degenerate else fisher)
+        if sd is None:
+            return None
+        variances.append(sd * sd)
+    return float(np.sqrt(np.mean(variances)))
+

@@ -1,0 +1,15 @@
+"""The field studies on a bench: sections 5.1 and 5.2 of the paper, figures 19 to 23."""
+
+from __future__ import annotations
+
+from tdhil.studies.field.bench import FieldBench
+from tdhil.studies.field.gains import KiSweep, KpSweep
+from tdhil.studies.field.loops import LoopScatter
+from tdhil.studies.field.slopes import FieldSlopes
+from tdhil.studies.study import Study
+from tdhil.study.field_tones import ToneSweep
+
+
+def field_studies(bench: FieldBench) -> tuple[Study, ...]:
+    """In the paper's order."""
+    return (LoopScatter(bench), KpSweep(bench), KiSweep(bench), FieldSlopes(bench), ToneSweep(bench))

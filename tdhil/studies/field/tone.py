@@ -1,0 +1,96 @@
+"""What one recorded sine says: amplitude in, amplitude out, and the paper's scatter of torque over acceleration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.paper_method import STEP_S, paper_estimate
+from tdhil.estimation.result import LineFit
+from tdhil.estimation.samples import Samples, excited_window, stretches, usable_samples
+from tdhil.recording.recording import FloatArray, Recording
+
+SETTLE_S = 10.0
+
+
+@dataclass(frozen=True)
+class Amplitudes:
+    """Of the commanded and of the reported speed, rad/s; ``sd_rad_s`` is the output's standard deviation."""
+
+    input_rad_s: float
+    output_rad_s: float
+    sd_rad_s: float
+    limited: float                     # share of the samples at which the drive was at a limit
+
+    @property
+    def difference_rad_s(self) -> float:
+        """Input minus output; negative where the output overshoots."""
+        return self.input_rad_s - self.output_rad_s
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Points (N,) of figure 22, and the straight line through all of them (equations 7 and 16)."""
+
+    acceleration_rad_s2: FloatArray
+    torque_nm: FloatArray
+    fit: LineFit
+
+
+def periods_for(frequency_hz: float, measured_s: float) -> int:
+    """Whole periods to ask for: settling, and at least three that count."""
+    return max(1, math.ceil(SETTLE_S * frequency_hz - 1e-9)) + max(3, round(measured_s * frequency_hz))
+
+
+def excited(recording: Recording) -> Samples:
+    """The samples after settling, of a recording with one segment."""
+    assert recording.excitation is not None
+    (segment,) = recording.excitation.segments
+    return usable_samples(recording).between(*excited_window(segment))
+
+
+def amplitudes(recording: Recording) -> Amplitudes:
+    """By the Fourier coefficient of each whole period, averaged over the periods."""
+    assert recording.excitation is not None
+    samples = usable_samples(recording)
+    (stretch,) = stretches(samples, recording.excitation.segments)
+    lines = period_lines(stretch, samples).speed[:, 0]
+    start, end = excited_window(stretch.segment)
+    inside = (recording.time_s >= start) & (recording.time_s < end)
+    count = len(lines)
+    scatter = float(np.sum(np.abs(lines - lines.mean()) ** 2)) / max(1, count - 1)
+    return Amplitudes(
+        input_rad_s=stretch.segment.amplitudes_rad_s[0],
+        output_rad_s=float(np.abs(lines.mean())),
+        sd_rad_s=math.sqrt(0.5 * scatter / count),
+        limited=float(np.mean(recording.limited[inside])),
+    )
+
+
+def line_slope(recording: Recording) -> float:
+    """The slope at the tone itself, kg·m²: Re T/(jω W) of the Fourier coefficients, averaged over the periods.
+
+    What least squares on the scatter tends to where noise in α takes nothing off it.
+    """
+    assert recording.excitation is not None
+    samples = usable_samples(recording)
+    (stretch,) = stretches(samples, recording.excitation.segments)
+    lines = period_lines(stretch, samples)
+    omega = 2.0 * math.pi * stretch.segment.lines_hz[0]
+    return float((lines.torque[:, 0].mean() / (1j * omega * lines.speed[:, 0].mean())).real)
+
+
+def scatter(recording: Recording) -> Scatter:
+    """Acceleration as Δω over 0.1 s against the torque's mean over the same 0.1 s; the fit is identification's own."""
+    samples = excited(recording)
+    estimate = paper_estimate((samples,))
+    assert estimate is not None, "a recorded sine has samples"
+    edges = np.arange(samples.time_s[0], samples.time_s[-1], STEP_S)
+    at = np.clip(np.searchsorted(samples.time_s, edges - 1e-6), 0, len(samples) - 1)
+    width = np.diff(samples.time_s)
+    impulse = np.concatenate(([0.0], np.cumsum(0.5 * (samples.torque_nm[1:] + samples.torque_nm[:-1]) * width)))
+    length = np.diff(samples.time_s[at])
+    return Scatter(np.diff(samples.speed_rad_s[at]) / length, np.diff(impulse[at]) / length, estimate.stepped)

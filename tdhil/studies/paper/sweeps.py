@@ -1,0 +1,159 @@
+"""Figures 9, 10, 12 and 13: one thing is swept, the speed follows the sine more or less well (section 3.4).
+
+P and I of these figures aren't printed, and "the parameters are held constant" through 3.4.1 to 3.4.3: the defaults
+are those that give the two gains printed for figure 11 (`figures_signal`). Amplitude, gain and phase are taken over
+the last whole periods of each record's second half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+
+from profiles.model import refuse_if
+from tdhil.studies.paper.loop import simulate
+from tdhil.studies.paper.processing import Response, response, settled_periods
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
+from tdhil.study.figures_sweep_draw import Curve, draw_sweep
+from tdhil.study.settings import LoopSettings, Positive, SamplePeriod, changed
+
+FloatArray = NDArray[np.float64]
+Values = Annotated[tuple[Positive, ...], Field(min_length=2, max_length=24)]
+
+
+class SweepSettings(LoopSettings):
+    """One field takes ``values``; the rest is shared.
+
+    ``duration_s`` and ``sample_period_s`` are those of a run at ``frequency_hz``: a run at another frequency gets the
+    same number of periods (the paper: ten) and of samples.
+    """
+
+    swept: ClassVar[str]
+    signal: Literal["sine"] = "sine"
+    sample_period_s: SamplePeriod = 0.0005
+    values: Values
+
+    @property
+    def varied(self) -> frozenset[str]:
+        """A frequency that is swept still scales duration and sampling."""
+        return frozenset({self.swept} - {"frequency_hz"})
+
+    def runs(self) -> list[LoopSettings]:
+        """One for each value."""
+        runs = []
+        for value in self.values:
+            longer = self.frequency_hz / value if self.swept == "frequency_hz" else 1.0
+            times = {"duration_s": self.duration_s * longer, "sample_period_s": self.sample_period_s * longer}
+            runs.append(changed(self, **times, **{self.swept: value}))
+        return runs
+
+    @model_validator(mode="after")
+    def _all_simulable(self) -> SweepSettings:
+        try:
+            runs = self.runs()
+        except ValidationError as error:
+            item = error.errors(include_url=False)[0]
+            refuse_if([("values", f"one run can't be simulated: {item['msg'].removeprefix('Value error, ')}")])
+            raise
+        if settled_periods(runs[0].steps, runs[0].sample_period_s, 1.0 / runs[0].frequency_hz) is None:
+            refuse_if([("duration_s", "the second half must hold one whole period at least")])
+        return self
+
+
+class InertiaSweep(SweepSettings):
+    """Figure 9; J0 = 900 kg·m², and 0.5, 2 and 3 times as much."""
+
+    swept: ClassVar[str] = "inertia_kg_m2"
+    values: Values = (450.0, 900.0, 1800.0, 2700.0)
+
+
+class FrequencySweep(SweepSettings):
+    """Figure 10."""
+
+    swept: ClassVar[str] = "frequency_hz"
+    values: Values = (0.1, 0.2, 0.5, 1.0, 2.0)
+
+
+class KpSweepSettings(SweepSettings):
+    """Figure 12; P of Table 1."""
+
+    swept: ClassVar[str] = "kp_nm_s_rad"
+    values: Values = (5000.0, 10000.0, 15000.0)
+
+
+class KiSweepSettings(SweepSettings):
+    """Figure 13; I of Table 1."""
+
+    swept: ClassVar[str] = "ki_nm_rad"
+    values: Values = (1500.0, 3000.0, 6000.0, 9000.0)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One value of what is swept, and how the speed followed."""
+
+    value: float
+    response: Response
+
+
+Claims = Callable[[SweepSettings, list[Point]], tuple[Statement, ...]]
+
+
+class SweepStudy:
+    """One of figures 9, 10, 12, 13."""
+
+    def __init__(self, name: str, title: str, model: type[SweepSettings], claims: Claims) -> None:
+        self.name = name
+        self.title = title
+        self._model = model
+        self._claims = claims
+
+    @property
+    def settings_model(self) -> type[SweepSettings]:
+        return self._model
+
+    def run(self, settings: SweepSettings, progress: Progress) -> StudyOutcome:
+        runs = settings.runs()
+        begun = perf_counter()
+        record = simulate(runs, lambda share: progress(share, f"{self.name}: {len(runs)} runs"))
+        wall_s = perf_counter() - begun
+        points, curves = [], []
+        for number, run in enumerate(runs):
+            window = settled_periods(run.steps, run.sample_period_s, 1.0 / run.frequency_hz)
+            assert window is not None   # the settings were checked for it
+            time, asked, speed, _ = record.of(number, window)
+            points.append(Point(settings.values[number], response(time, asked, speed, run.frequency_hz)))
+            curves.append(Curve(settings.values[number], (time - time[0]) * run.frequency_hz, asked, speed))
+        progress(1.0, self.name)
+        return StudyOutcome(
+            name=self.name, title=self.title, tables=(_table(self.name, settings, points),),
+            statements=self._claims(settings, points), document=_document(settings, points),
+            simulated_s=record.simulated_s, simulation_wall_s=wall_s,
+            draw=lambda figure: draw_sweep(figure, settings.swept, curves, [point.response for point in points]),
+        )
+
+
+def _columns(point: Point) -> dict[str, float]:
+    found = point.response
+    return {
+        "amplitude_in_rad_s": found.amplitude_in_rad_s, "amplitude_out_rad_s": found.amplitude_out_rad_s,
+        "amplitude_difference_rad_s": found.amplitude_difference_rad_s, "gain": found.gain,
+        "phase_lag_zero_crossing_deg": found.lag_zeros_deg, "gain_fundamental": found.gain_fundamental,
+        "phase_lag_fundamental_deg": found.lag_fundamental_deg,
+    }
+
+
+def _table(name: str, settings: SweepSettings, points: list[Point]) -> ResultTable:
+    rows: list[tuple[Cell, ...]] = [(point.value, *_columns(point).values()) for point in points]
+    return ResultTable(f"{name}_response", (settings.swept, *_columns(points[0])), tuple(rows))
+
+
+def _document(settings: SweepSettings, points: list[Point]) -> dict[str, Any]:
+    runs = [{settings.swept: point.value, **_columns(point)} for point in points]
+    return {"settings": settings.model_dump(mode="json"), "runs": runs}

@@ -1,0 +1,101 @@
+"""Settings from a file and from `--set`: the study's defaults, then the file, then each assignment.
+
+::
+
+    study: table7               # a study's name
+    settings:                   # any of its settings; what is left out keeps its default
+      kp_nm_s_rad: 3000
+      array: [[1, 1], [1, 2], [2, 1], [2, 2]]
+      factors:
+        - {name: J, levels: [450, 900]}
+        - {name: viscous_nm_s_rad, levels: [10, 100]}
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, Field, ValidationError, create_model
+
+from profiles.errors import DataFileError, Problem
+from profiles.model import DataModel
+from profiles.yaml_loader import load_model, load_with_lines
+from profiles.yaml_messages import messages_of
+from profiles.yaml_tree import read_tree
+from tdhil.errors import UsageError
+from tdhil.studies.study import Study
+from tdhil.study.settings import SYMBOLS, full_name
+
+M = TypeVar("M", bound=BaseModel)
+
+
+class _Envelope(DataModel):
+    study: str
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+
+def load_study_file(path: Path, studies: Mapping[str, Study]) -> tuple[Study, Any]:
+    """The study that a file names, and its settings; DataFileError with each problem and its line."""
+    envelope = load_with_lines(path, _Envelope)
+    name = envelope.value.study
+    if name not in studies:
+        line = envelope.lines.get(("study",), 0)
+        raise DataFileError((Problem(str(path), line, f"study: no study '{name[:40]}'; known: {', '.join(studies)}"),))
+    model = studies[name].settings_model
+    if not envelope.value.settings:
+        return studies[name], model()
+    whole = create_model(f"{name}_file", __base__=DataModel, study=(str, ...), settings=(model, ...))
+    return studies[name], getattr(load_model(path, whole), "settings")  # noqa: B009 - a field made just now
+
+
+def with_assignments(settings: M, assignments: Iterable[str]) -> M:
+    """``settings`` with every ``name=value`` applied, all checked together; UsageError in one line.
+
+    A name is a field, its symbol (`Kp`), or a field of a section (`rig.inertia_kg_m2`); a value is written as in YAML
+    (`3000`, `[0.1, 0.5]`).
+    """
+    data = settings.model_dump(mode="json")
+    for assignment in assignments:
+        name, sign, text = (part.strip() for part in assignment.partition("="))
+        if not (name and sign and text):
+            raise UsageError(f"--set {assignment}: name=value is wanted", next_step="For example --set Kp=3000")
+        *sections, last = name.split(".")
+        field = last if sections else _field(name, settings)
+        if not sections:
+            _refuse_varied(settings, field, assignment)
+        tree = read_tree(f"value: {text}", "--set")
+        if tree.problems or not isinstance(tree.data, dict) or list(tree.data) != ["value"]:
+            why = tree.problems[0].message if tree.problems else "one value is wanted"
+            raise UsageError(f"--set {assignment}: {why}")
+        place: Any = data
+        for section in sections:
+            place = place.get(section) if isinstance(place, dict) else None
+        if not isinstance(place, dict):
+            raise UsageError(f"--set {assignment}: there is no section '{'.'.join(sections)}'")
+        place[field] = tree.data["value"]
+    try:
+        return type(settings).model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        told = [
+            f"{'.'.join(str(part) for part in path)}: {message}" if path else message
+            for path, message in messages_of(error, data, type(settings))
+        ]
+        raise UsageError("--set " + "; ".join(told), next_step=f"Symbols: {', '.join(SYMBOLS)}") from None
+
+
+def _field(name: str, settings: BaseModel) -> str:
+    """The field that is meant; a name that is none stays as it is, and is refused by the model in its own words."""
+    fields = type(settings).model_fields
+    return next((one for one in (name, full_name(name), name.lower()) if one in fields), name)
+
+
+def _refuse_varied(settings: BaseModel, field: str, assignment: str) -> None:
+    """What varies from run to run has its levels; one value for all runs would silently do nothing."""
+    if field in getattr(settings, "varied", ()):
+        raise UsageError(
+            f"--set {assignment}: {field} is what this study varies from run to run",
+            next_step="Change its levels: 'factors' of a design, 'values' of a sweep",
+        )

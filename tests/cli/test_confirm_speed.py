@@ -1,0 +1,69 @@
+"""What the operator is asked at the first slow speed, and what counts as his word."""
+
+import io
+import sys
+
+import pytest
+from rich.console import Console
+
+from drivers.errors import PreflightRefused
+from tdhil.commands.confirm import confirm_speed, turns_text
+from tdhil.config.rig import Run
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def ask(monkeypatch, typed, terminal=True, **options):
+    """What is printed; a cycle goes on while somebody makes up his mind."""
+    monkeypatch.setattr(sys, "stdin", Terminal(typed) if terminal else io.StringIO(typed))
+    console, cycles = Console(file=io.StringIO(), width=200), []
+    confirm_speed(
+        0.5236, "the drive tells no angle of its shaft", lambda: cycles.append(1), console=console,
+        pause_display=lambda: None, **options,
+    )
+    assert cycles
+    return console.file.getvalue()
+
+
+def test_yes(monkeypatch):
+    shown = ask(monkeypatch, "yes\n")
+    assert "Is it turning forward once every 12 s?" in shown
+    assert "0.524 rad/s" in shown
+    assert "tells no angle" in shown
+
+
+def test_the_main_shaft_is_named_where_a_gear_is(monkeypatch):
+    assert "the main shaft, behind the gear, forward once every 60 s" in ask(monkeypatch, "Y\n", gear_ratio=5.0)
+
+
+@pytest.mark.parametrize("typed", ["no\n", "\n", "", "MOVE\n", "yes it is\n", "ja\n"])
+def test_anything_else_is_a_no(monkeypatch, typed):
+    with pytest.raises(PreflightRefused, match="was not seen to turn forward once every 12 s") as caught:
+        ask(monkeypatch, typed)
+    assert "speed scaling in the profile" in caught.value.next_step
+
+
+def test_nobody_at_a_terminal_is_no_yes(monkeypatch):
+    with pytest.raises(PreflightRefused, match="nobody is there to see") as caught:
+        ask(monkeypatch, "yes\n", terminal=False)
+    assert "--accept-speed-unit" in caught.value.next_step
+
+
+def test_no_terminal_at_all(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", None)
+    with pytest.raises(PreflightRefused, match="nobody is there"):
+        confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
+
+
+def test_a_file_never_says_it():
+    assert "--accept-speed-unit" in Run.never_here["accept_speed_unit"]
+
+
+@pytest.mark.parametrize(("speed_rad_s", "said"), [
+    (0.5236, "forward once every 12 s"), (-0.5236, "backwards once every 12 s"), (7.5, "forward 11.9 times in 10 s"),
+])
+def test_how_a_speed_is_said(speed_rad_s, said):
+    assert turns_text(speed_rad_s) == said

@@ -1,0 +1,145 @@
+"""How `tdhil identify` ends: the code of each way to go wrong, and what is said, without a run behind it."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import CommunicationLost, DriveFault, LimitHit
+from tdhil.cli.main import main
+from tdhil.commands.stop_signals import stop_on_signals
+from tdhil.errors import ExitCode, Interrupted
+from tdhil.record.errors import LogBroken
+from tdhil.recording.mcap_container import Container
+from tdhil.recording.recording import Stage
+from tdhil.recording.run_log import RunLog
+from tdhil.run.stop import StopReport
+from tdhil.run.task import RunOutcome
+
+REST = StopReport(True, 12.25, True)
+TURNING = StopReport(False, None, False, ("no feedback from the drive any more",))
+STAGES = (Stage("setup", 0.0, 3.0, "ok", ""), Stage("speed", 3.0, 10.0, "aborted", ""))
+CAUSES = {
+    "none": (None, 0), "bus": (CommunicationLost("no feedback for 13 cycles"), 5), "fault": (DriveFault("EMCY"), 6),
+    "limit": (LimitHit("too fast"), 7), "Ctrl-C": (Interrupted(2), 130), "SIGTERM": (Interrupted(15), 143),
+    "log": (LogBroken("the log can't be written any more"), 3), "mistake": (ZeroDivisionError("ours"), 1),
+}
+
+
+@pytest.fixture
+def ends(monkeypatch, tmp_path, capsys):
+    """``ends(cause, stop, verdict's code)``: (exit code, stdout, stderr) of a command whose run went so."""
+    monkeypatch.chdir(tmp_path)
+
+    def ends(cause, stop, verdict=ExitCode.OK, *arguments):
+        class Fake:
+            def __init__(self, *_arguments, **_options):
+                pass
+
+            def run(self):
+                return RunOutcome(STAGES, cause, stop, None)
+
+        def conclude(*_arguments, **_options):
+            return {"verdict": "as the test has it"}, verdict
+
+        monkeypatch.setattr("tdhil.run.runner.Runner", Fake)
+        monkeypatch.setattr("tdhil.cli.conclude.conclude", conclude)
+        monkeypatch.setattr("tdhil.cli.conclude.print_result", lambda document, _: print(json.dumps(document)))
+        code = main(["identify", "--simulate", "--seed", "1", *arguments])
+        said = capsys.readouterr()
+        return code, said.out, " ".join(said.err.split())
+
+    return ends
+
+
+@pytest.mark.parametrize("cause", [cause for cause in CAUSES if cause != "none"])
+def test_at_rest_the_cause_s_code(ends, cause):
+    error, code = CAUSES[cause]
+    got, out, err = ends(error, REST)
+    assert (got, out) == (code, "")
+    assert str(error) in err and "the shaft is at rest (seen at 12.2 s) and the drive is disabled" in err
+    assert "tdhil replay run.mcap" in err and "hard-wired" not in err
+    assert ("ZeroDivisionError: ours" in err) is (cause == "mistake")      # where it is ours, with its traceback
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_a_stop_that_nobody_saw_through_ends_with_8_whatever_came_before(ends, cause):
+    error, _ = CAUSES[cause]
+    got, _, err = ends(error, TURNING)
+    assert got == 8
+    assert "NOT confirmed: no feedback from the drive any more" in err
+    assert "Use the hard-wired emergency stop now" in err
+    assert error is None or str(error) in err
+    assert "at rest (seen" not in err and "nothing has moved" not in err
+
+
+def test_before_motion_nothing_moved(ends):
+    got, _, err = ends(CAUSES["bus"][0], None)
+    assert got == 5 and "the drive was never enabled; nothing has moved" in err
+
+
+@pytest.mark.parametrize(("stop", "code", "said"), [(REST, 7, "at rest"), (TURNING, 8, "hard-wired emergency stop")])
+def test_the_document_says_the_same(ends, stop, code, said):
+    got, out, _ = ends(CAUSES["limit"][0], stop, ExitCode.OK, "--json")
+    document = json.loads(out)
+    assert got == document["exit_code"] == code
+    assert document["error"] == {"kind": "LimitHit", "message": str(CAUSES["limit"][0])}
+    assert said in document["stop"] and document["log"] == "run.mcap"
+    assert document["stages"] == [
+        {"name": "setup", "outcome": "ok", "duration_s": 3.0},
+        {"name": "speed", "outcome": "aborted", "duration_s": 7.0},
+    ]
+
+
+@pytest.mark.parametrize("verdict", [ExitCode.OK, ExitCode.NOT_IDENTIFIABLE])
+def test_a_run_that_went_to_its_end_has_its_verdict_s_code(ends, verdict):
+    got, out, err = ends(None, REST, verdict)
+    assert got == verdict and json.loads(out) == {"verdict": "as the test has it"}
+    assert "tdhil:" not in err
+
+
+@pytest.mark.parametrize(("cause", "verdict", "code"), [
+    ("none", ExitCode.OK, 3), ("none", ExitCode.NOT_IDENTIFIABLE, 9), ("limit", ExitCode.OK, 7),
+])
+def test_a_log_that_could_not_be_finished_is_never_exit_0(ends, monkeypatch, cause, verdict, code):
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Container, "finish", full)
+    got, out, err = ends(CAUSES[cause][0], REST, verdict)
+    assert got == code
+    assert err.count("the log can't be written any more: No space left on device") == 1
+    assert bool(out) is (cause == "none")
+
+
+def test_what_the_log_ended_by_is_told_once(ends, monkeypatch):
+    """The run ended by it; closing it finds the same."""
+    plain = RunLog.close
+
+    def broken(self):
+        plain(self)
+        raise LogBroken("the log can't be written any more")
+
+    monkeypatch.setattr(RunLog, "close", broken)
+    got, _, err = ends(CAUSES["log"][0], REST)
+    assert got == 3 and err.count("can't be written any more") == 1
+
+
+def test_the_result_stands_in_the_log(ends):
+    from tdhil.recording.log_reader import read_run
+
+    assert ends(None, REST)[0] == 0
+    assert read_run(Path("run.mcap")).result == {"verdict": "as the test has it"}
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP"])
+def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
+    number, former = signal.Signals[name], signal.getsignal(signal.Signals[name])
+    with stop_on_signals() as request:
+        assert request.signum is None
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert (request.signum, request.count) == (number, 2)
+    assert signal.getsignal(number) is former

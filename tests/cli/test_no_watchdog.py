@@ -1,0 +1,74 @@
+"""What is said of a run whose drive does not watch its host, and who may accept that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers.drive import Identity, Mode, Preflight
+from drivers.errors import CommunicationLost, DriveFault
+from tdhil.cli.task import machine_limits
+from tdhil.commands.confirm import summary
+from tdhil.config.rig import load_rig, simulated_default_rig
+from tdhil.errors import exit_code
+from tdhil.protocol import no_watchdog
+from tdhil.run.settings import ExcitationRequest, MachineLimits
+
+LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
+ACTS = "Check the cable; the drive's own watchdog stops the shaft"
+
+
+def preflight(watchdog_s: float) -> Preflight:
+    return Preflight(
+        Identity(1, 2, 3, 4, "a drive", False), (), frozenset(Mode), True, True, 1000.0, 1.0, 0.01, watchdog_s,
+        "quick_stop" if watchdog_s else "none",
+    )
+
+
+def test_the_confirmation_says_it_and_asks_for_somebody_at_the_stop() -> None:
+    armed = summary(preflight(0.5), LIMITS, ExcitationRequest())
+    assert "watchdog        0.5 s in the drive, then quick stop" in armed
+    assert "--accept" not in armed
+    unarmed = summary(preflight(0.0), LIMITS, ExcitationRequest())
+    assert "watchdog        NONE, accepted by --accept-no-watchdog: the drive will not stop by itself" in unarmed
+    assert "[ ] somebody stands at that stop for the whole run" in unarmed
+    assert unarmed.count("[ ]") == armed.count("[ ]") + 1
+
+
+def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:
+    assert not LIMITS.accept_no_watchdog
+    assert not machine_limits(simulated_default_rig()).accept_no_watchdog
+    assert machine_limits(simulated_default_rig(), accept_no_watchdog=True).accept_no_watchdog
+    rig = tmp_path / "rig.yaml"
+    for text in ("accept_no_watchdog: true\n", "run: {accept_no_watchdog: true}\n"):
+        rig.write_text(text)
+        with pytest.raises(Exception, match=r"rig\.yaml:1: .*accept_no_watchdog"):
+            load_rig(rig)
+
+
+@pytest.mark.parametrize("found", [None, preflight(0.5)])
+def test_where_one_is_armed_nothing_is_changed(found: Preflight | None) -> None:
+    error = CommunicationLost("no feedback", next_step=ACTS)
+    no_watchdog.correct(error, found)
+    assert error.next_step == ACTS
+    assert found is None or no_watchdog.configuration(found) == {}
+
+
+def test_where_none_is_armed_nobody_is_told_that_it_acts() -> None:
+    found = preflight(0.0)
+    error = CommunicationLost("no feedback", where="node 1", next_step=ACTS)
+    no_watchdog.correct(error, found)
+    assert "own watchdog" not in str(error)
+    assert str(error).startswith("node 1: no feedback. If the shaft still turns, use the hard-wired emergency stop now")
+    assert exit_code(error) == 5
+    other = DriveFault("EMCY 7305h", next_step="Mend the sensor")
+    no_watchdog.correct(other, found)
+    assert other.next_step == "Mend the sensor"
+    assert len(no_watchdog.warnings(no_watchdog.configuration(found))) == 1
+
+
+@pytest.mark.parametrize("run", [{}, {"watchdog": None}, {"watchdog": 3}, {"watchdog": {"armed": True}},
+                                 {"watchdog": {"armed": 0}}, {"watchdog": ["armed"]}])
+def test_a_log_that_does_not_say_so_warns_of_nothing(run: dict[str, object]) -> None:
+    assert no_watchdog.warnings(run) == ()

@@ -1,0 +1,91 @@
+"""What a person at the shaft answers for is said on the command line of the run; no file says it for him."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DataFileError, PreflightRefused
+from tdhil.cli.main import main
+from tdhil.commands.confirm import confirm_motion
+from tdhil.config.options import OPTIONS, resolve
+from tdhil.config.rig import load_rig
+
+LIMITS = """\
+limits:
+  speed_min_rad_s: 0.5
+  speed_max_rad_s: 10
+  torque_nm: 400
+  time_s: 900
+  quick_stop_rad_s2: 2
+  probe_torque_nm: 200
+  probe_travel_rad: 3
+"""
+
+
+def rig(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("value", ["true", "false"])
+def test_a_file_does_not_confirm(tmp_path, capsys, monkeypatch, value):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("CI", "true")
+    path = rig(tmp_path, f"{LIMITS}run:\n  seed: 3\n  yes: {value}\n")
+    assert main(["identify", "--rig", str(path), "-i", "socketcan", "-c", "can0"]) == 2
+    said = capsys.readouterr().err
+    assert "rig.yaml:11:" in said
+    assert "a file never speaks for who stands at the shaft" in said
+    assert "--yes" in said
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("section", ["", "run:\n  "])
+@pytest.mark.parametrize("key", [
+    "yes", "accept_no_watchdog", "accept_shared_watchdog", "accept_wider_limit", "accept_speed_unit",
+    "reset_fault",
+])
+def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, section, key):
+    with pytest.raises(DataFileError) as caught:
+        load_rig(rig(tmp_path, f"node: 3\n{section}{key}: true\n"))
+    (problem,) = caught.value.problems
+    assert problem.line == (3 if section else 2)
+    assert f"--{key.replace('_', '-')}" in problem.message
+
+
+def test_no_option_takes_the_confirmation_from_a_rig():
+    assert {option.name for option in OPTIONS if not option.at} == {"yes"}
+    assert resolve({"yes": True}, None).yes is True
+    assert resolve({}, None).yes is False
+
+
+def test_consent_in_a_file_is_for_the_profile_of_that_file(tmp_path):
+    bench = load_rig(rig(tmp_path, "profile: danfoss/fc302\naccept_unverified: [likely]\n"))
+    assert resolve({}, bench).accept_unverified == ("likely",)
+    assert resolve({"profile": "danfoss/fc302"}, bench).accept_unverified == ("likely",)
+    other = resolve({"profile": "abb/acs880-enhanced"}, bench)
+    assert other.accept_unverified == ()
+    assert other.source("accept_unverified") == "rig.yaml:2 is for the profile of that file, not for --profile"
+    both = resolve({"profile": "abb/acs880-enhanced", "accept_unverified": ["watchdog"]}, bench)
+    assert (both.accept_unverified, both.source("accept_unverified")) == (("watchdog",), "--accept-unverified")
+
+
+def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
+    from types import SimpleNamespace
+
+    from rich.console import Console
+
+    from drivers.drive import Identity
+    from tdhil.run.settings import ExcitationRequest, MachineLimits
+
+    monkeypatch.setattr("sys.stdin", None)
+    monkeypatch.setattr("tdhil.cli.confirm.summary", lambda *_: "")
+    task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
+    preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
+    with pytest.raises(PreflightRefused, match="nobody is there"):
+        confirm_motion(
+            task, preflight, lambda: None, yes=False, console=Console(quiet=True), pause_display=lambda: None
+        )

@@ -1,0 +1,80 @@
+"""Real-time priority: of one thread, where it is allowed, said where it isn't, and given back."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+
+from tdhil.cli import real_time
+from tdhil.cli.real_time import HOW, real_time_priority
+from tdhil.commands.doctor_host import priority_finding
+
+linux = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux alone has it")
+
+
+def policy() -> int:
+    return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+
+
+@linux
+def test_only_this_thread_is_raised_and_it_is_lowered_again():
+    if real_time.allowed()[0]:
+        pytest.skip(f"not allowed here: {real_time.allowed()[0]}")
+    found = []
+    elder = threading.Event()
+    before = threading.Thread(target=lambda: (elder.wait(), found.append(policy())))
+    before.start()
+    with real_time_priority(True) as raised:
+        assert policy() == os.SCHED_FIFO
+        assert raised.priority == os.sched_getparam(0).sched_priority > 0
+        assert raised.said.startswith("real-time priority: SCHED_FIFO")
+        elder.set()
+        before.join()
+        began_inside = threading.Thread(target=lambda: found.append(policy()))
+        began_inside.start()
+        began_inside.join()
+    assert found == [os.SCHED_OTHER, os.SCHED_OTHER]
+    assert policy() == os.SCHED_OTHER
+
+
+@linux
+def test_a_loop_that_never_pauses_loses_its_priority():
+    if real_time.allowed()[0]:
+        pytest.skip(f"not allowed here: {real_time.allowed()[0]}")
+    usual = signal.getsignal(signal.SIGXCPU)
+    try:
+        with real_time_priority(True):
+            end_s = time.monotonic() + 30.0
+            while policy() == os.SCHED_FIFO:
+                assert time.monotonic() < end_s
+        assert policy() == os.SCHED_OTHER
+    finally:
+        signal.signal(signal.SIGXCPU, usual)
+
+
+@linux
+def test_where_it_is_not_allowed_the_run_goes_on_and_is_told_how(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(real_time, "_memory_limit", lambda: "only 8.39 MB of it may be")
+    with real_time_priority(True) as raised:
+        assert (raised.priority, raised.memory_locked) == (0, False)
+        assert "no real-time priority: Operation not permitted" in raised.said
+        assert "memory not locked: only 8.39 MB" in raised.said
+        assert HOW in raised.said
+    finding = priority_finding(*real_time.allowed())
+    assert finding.grade == "note"
+    assert HOW in finding.do
+
+
+def test_nobody_asked_or_stepped_time():
+    with real_time_priority(False) as raised:
+        assert raised.said == ""
+    with real_time_priority(True, stepped=True) as raised:
+        assert "stepped" in raised.said
+        assert raised.priority == 0
+    assert priority_finding("", "").grade == "ok"

@@ -1,0 +1,79 @@
+"""`drivers.modbus.quick_stop` against simulated drives that somebody has left turning, judged on the true shaft."""
+
+import csv
+
+import pytest
+
+from drivers.clock import SteppedClock
+from drivers.drive import Command, Limits, Mode
+from drivers.modbus.drive import ModbusDrive
+from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.quick_stop import ModbusTarget
+from drivers.quick_stop import Ended, bare_stop
+from profiles.library import load_profile, profile_names
+from profiles.modbus import ModbusProfile
+from sim_bus.modbus.embedded import EmbeddedModbusDrive
+from sim_bus.params import RigParams
+
+LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
+MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
+FAST_RAD_S = 4.0
+
+
+class Left:
+    """A drive in motion that nobody talks to any more."""
+
+    def __init__(self, profile, mode, folder):
+        self.trace = folder / "shaft.csv"
+        self.clock = SteppedClock()
+        self.simulated = EmbeddedModbusDrive(RigParams(), profile, trace=self.trace)
+        self.profile = profile
+        self.link = EmbeddedLink(self.simulated.serve, self.clock)
+        drive = ModbusDrive(
+            self.link, profile, unit=1, given=dict(self.simulated.untold),
+            rated_torque_nm=None if profile.rated_torque else self.simulated.rated_torque_nm,
+        )
+        drive.connect()
+        assert not drive.preflight(LIMITS).refused
+        drive.enable(Mode.SPEED)
+        sample = None
+        while sample is None or sample.speed_rad_s < FAST_RAD_S - 0.3:
+            assert self.clock.now_s() < 60.0
+            sample = drive.exchange(Command(Mode.SPEED, FAST_RAD_S, 0.0))
+        while mode is Mode.TORQUE and sample.mode is not Mode.TORQUE:
+            sample = drive.exchange(Command(Mode.TORQUE, FAST_RAD_S, sample.torque_nm))
+        for _ in range(10):
+            drive.exchange(Command(mode, FAST_RAD_S, 100.0))
+
+    def rows(self):
+        self.simulated.close()
+        with self.trace.open() as file:
+            return [(float(row[0]), float(row[1]), row[3]) for row in list(csv.reader(file))[1:]]
+
+
+@pytest.mark.parametrize(("profile", "mode"), [
+    (profile, mode) for profile in MODBUS for mode in Mode if mode is Mode.SPEED or profile.modes.torque
+], ids=lambda one: one.name)
+def test_it_brakes_to_rest_and_never_lets_go(profile, mode, tmp_path):
+    left = Left(profile, mode, tmp_path)
+    began_s = left.clock.now_s()
+    report = bare_stop(ModbusTarget(left.link, profile, unit=1), left.clock)
+    assert report.ended is Ended.AT_REST, report
+    after = [row for row in left.rows() if row[0] >= began_s]
+    assert abs(after[0][1]) > 2.0
+    free = {"switch on disabled", "ready to switch on", "switched on", "fault"}
+    assert not [row for row in after if row[2] in free and abs(row[1]) > 0.1], "a turning shaft was let go"
+    assert abs(after[-1][1]) < 0.05 and left.clock.now_s() - began_s < 15.0
+    said = any("speed mode at zero" in remark for remark in report.remarks)
+    needed = profile.modes.torque and not profile.quick_stop.decelerates_in_torque_mode
+    unknown = profile.modes.display is None            # then it is asked for in any case
+    assert said is (needed and (unknown or mode is Mode.TORQUE))
+
+
+def test_a_drive_that_stays_in_torque_mode_gets_its_quick_stop_and_that_is_said(tmp_path):
+    profile = next(one for one in MODBUS if one.name == "siemens/g120")
+    left = Left(profile, Mode.TORQUE, tmp_path)
+    left.simulated.machine.application.keeps_mode = True
+    report = bare_stop(ModbusTarget(left.link, profile, unit=1), left.clock)
+    assert any("did not change to speed mode" in remark for remark in report.remarks)
+    assert report.first is not None and abs(left.rows()[-1][1]) < 1.0

@@ -1,0 +1,81 @@
+"""Status word in, control word out: the generic profile against the standard's own table, typed in power_machine."""
+
+import itertools
+
+import pytest
+
+from drivers.drive import Mode, PowerState
+from drivers.modbus.state_machine import Wish, controlword_towards, decode, power_state, seen
+from profiles.library import load_modbus_profile
+from profiles.modbus import Bits
+from tests.drivers.power_machine import (
+    ENABLED,
+    FAULT,
+    OFF,
+    ON,
+    REACTION,
+    READY,
+    STATUS_PATTERNS,
+    STOPPING,
+    PowerMachine,
+    matches,
+)
+
+CONTROL = load_modbus_profile("generic/modbus").control
+POWER = {
+    "not ready": PowerState.NOT_READY, OFF: PowerState.OFF, READY: PowerState.READY, ON: PowerState.READY,
+    ENABLED: PowerState.ENABLED, STOPPING: PowerState.QUICK_STOP, REACTION: PowerState.FAULT, FAULT: PowerState.FAULT,
+}
+
+
+def test_every_status_word():
+    for low in range(0x100):
+        meant = [POWER[state] for state, pattern in STATUS_PATTERNS.items() if matches(low, pattern)]
+        assert power_state(decode(CONTROL, 0xA200 | low)) is (meant[0] if meant else PowerState.NOT_READY)
+
+
+def walk(machine, wish, cycles=10, turning=False):
+    states = [machine.state]
+    for _ in range(cycles):
+        word = controlword_towards(CONTROL, decode(CONTROL, machine.status), wish, Mode.SPEED, turning=turning)
+        machine.obey(word)
+        machine.step()
+        states.append(machine.state)
+    return [state for state, _ in itertools.groupby(states)]
+
+
+def test_the_way_in_and_out():
+    machine = PowerMachine()
+    assert walk(machine, Wish.ENABLED) == [OFF, READY, ON, ENABLED]
+    assert walk(machine, Wish.QUICK_STOP) == [ENABLED, STOPPING]
+    assert walk(machine, Wish.ENABLED) == [STOPPING]            # a quick stop is not ended by enabling
+    assert walk(machine, Wish.OFF) == [STOPPING, OFF]
+
+
+@pytest.mark.parametrize("wish", list(Wish))
+def test_no_wish_resets_a_fault(wish):
+    machine = PowerMachine(FAULT)
+    assert walk(machine, wish) == [FAULT]
+
+
+@pytest.mark.parametrize("state", [ENABLED, STOPPING])
+def test_a_turning_shaft_is_braked_not_disabled(state):
+    machine = PowerMachine(state)
+    assert walk(machine, Wish.OFF, turning=True)[-1] == STOPPING
+    assert walk(machine, Wish.OFF)[-1] == OFF
+
+
+def test_bits_of_the_mode_and_the_direction_stand_in_every_word():
+    control = CONTROL.model_copy(update={"speed_bits": 0x0400, "torque_bits": 0x0C00, "reverse_bits": 0x2000})
+    for state, wish in itertools.product((None, *control.states), Wish):
+        plain = controlword_towards(CONTROL, state, wish, Mode.SPEED)
+        assert controlword_towards(control, state, wish, Mode.SPEED) == plain | 0x0400
+        assert controlword_towards(control, state, wish, Mode.TORQUE) == plain | 0x0C00
+        assert controlword_towards(control, state, wish, Mode.SPEED, reverse=True) == plain | 0x2400
+
+
+def test_bits():
+    bits = Bits(mask=0x0A00, value=0x0200)
+    assert seen(bits, 0xF2FF)
+    assert not seen(bits, 0x0A00)
+    assert not seen(None, 0xFFFF)

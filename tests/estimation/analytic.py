@@ -1,0 +1,58 @@
+"""Recordings in closed form: exact lines of an exact transfer function, with a small seeded disturbance on top."""
+
+import numpy as np
+
+from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
+
+LINES = (0.1, 0.2, 0.3, 0.4)
+
+
+def closed_form(
+    inertia=104.0,
+    viscous=8.0,
+    coulomb=60.0,
+    speed_lag=0.40,
+    torque_lag=0.15,
+    skew=0.0,
+    offsets=(4.0, 7.0),
+    lines=LINES,
+    amplitudes=(1.5, 0.8, 0.25, 0.25),
+    periods=7,
+    noise=0.3,
+    start=0.0,
+    rate_hz=50.0,
+    lag_prior=None,
+    seed=5,
+):
+    """``noise``: sd of white torque per sample, N·m, on the reported torque."""
+    rng = np.random.default_rng(seed)
+    omega = 2.0 * np.pi * np.array(lines)
+    s = 1j * omega
+    speed_lines = np.array(amplitudes) * np.exp(1j * np.array([0.3, 1.7, 4.0, 5.1][: len(lines)]))
+    through = (inertia * s + viscous) * (1 + speed_lag * s) / (1 + torque_lag * s) * np.exp(-skew * s)
+    times, speeds, torques, segments = [], [], [], []
+    begin = 0.0
+    period = 10.0
+    for offset in offsets:
+        t = np.arange(round(periods * period * rate_hz)) / rate_hz
+        turned = np.exp(1j * np.outer(t, omega))
+        times.append(start + begin + t)
+        speeds.append(offset + (turned @ speed_lines).real)
+        torques.append(coulomb + viscous * offset + (turned @ (through * speed_lines)).real)
+        segments.append(
+            Segment(start + begin, start + begin + periods * period, period, 1, offset, tuple(lines),
+                    tuple(amplitudes), tuple(np.angle(speed_lines)))
+        )
+        begin += periods * period
+    time = np.concatenate(times)
+    count = len(time)
+    return Recording(
+        time_s=time,
+        speed_rad_s=np.concatenate(speeds),
+        torque_nm=np.concatenate(torques) + noise * rng.standard_normal(count),
+        fresh=np.ones(count, dtype=bool),
+        limited=np.zeros(count, dtype=bool),
+        excitation=Excitation("multisine" if len(lines) > 1 else "sine", "torque", tuple(segments)),
+        lag_prior=lag_prior or LagPrior(),
+        torque_limit_nm=1000.0,
+    )

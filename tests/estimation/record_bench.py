@@ -1,0 +1,277 @@
+"""Records without periodic excitation, simulated in plain numpy, many seeds at once; shares no code with what it tests.
+
+The shaft is stepped by the midpoint rule with Coulomb friction that sticks at rest; the drive has a speed PI behind a
+filter of 10 ms, a torque lag of 10 ms, a torque mode and an off state. What is reported is filtered, disturbed, sampled
+(at a rate, with jitter, errors of the stamps, late speed, holes) and rounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tdhil.recording.recording import LagPrior, Recording
+
+SPEED, TORQUE, OFF = 0.0, 1.0, 2.0
+
+
+@dataclass(frozen=True)
+class Report:
+    """Poles (s), moving average (s) and delay (s) in a row."""
+
+    poles: tuple[float, ...] = ()
+    average: float = 0.0
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Machine:
+    """SI at the motor shaft. ``pace`` stretches the motion's time; noises as sd, white ones per step."""
+
+    name: str
+    inertia: float
+    viscous: float
+    coulomb: float
+    speed_report: Report
+    torque_report: Report
+    top: float                      # rad/s, highest speed asked for
+    limit: float                    # N·m
+    pace: float = 1.0
+    dt: float = 0.002
+    load_sd: float = 3.0
+    load_time: float = 0.5
+    ripple_sd: float = 10.0
+    sensor_sd: float = 0.02
+    speed_noise: float = 0.003
+    torque_noise: float = 2.0
+    speed_quantum: float = 0.0105
+    torque_quantum: float = 1.0
+    quadratic: float = 0.0          # friction ∝ ω|ω|
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How the record was made."""
+
+    rate_hz: float = 100.0
+    jitter_s: float = 0.003
+    stamp_error_s: float = 0.0
+    speed_early_s: float = 0.0      # speed is read so much before torque
+    lost: float = 0.0               # share of rows missing, single
+    hole_s: float = 0.0             # one hole of this length in the middle
+    coarse: float = 1.0             # quanta are so much coarser
+
+
+@dataclass
+class Script:
+    """What is asked for at every step, (steps,) or (steps, seeds): regime, target speed, torque."""
+
+    regime: np.ndarray
+    target: np.ndarray
+    torque: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+def filtered(x: np.ndarray, report: Report, dt: float) -> np.ndarray:
+    from scipy.signal import lfilter
+
+    for tau in report.poles:
+        a = np.exp(-dt / tau)
+        g = 1.0 - (1.0 - a) * tau / dt
+        f = (1.0 - a) * tau / dt - a
+        x, _ = lfilter([g, f], [1.0, -a], x, axis=0, zi=x[:1] * (1.0 - g))
+    n = round(report.average / dt)
+    if n > 1:
+        total = np.cumsum(np.concatenate([np.zeros_like(x[:1]), np.repeat(x[:1], n - 1, axis=0), x]), axis=0)
+        x = (total[n:] - total[:-n]) / n
+    n = round(report.delay / dt)
+    return x if n == 0 else np.concatenate([np.repeat(x[:1], n, axis=0), x[:-n]])
+
+
+def turn(machine: Machine, script: Script, rngs: list[np.random.Generator]) -> tuple[np.ndarray, np.ndarray]:
+    """True speed as sensed and torque, (steps, seeds)."""
+    from scipy.signal import lfilter
+
+    m, dt, many = machine, machine.dt, len(rngs)
+    steps = len(script.regime)
+    white = np.stack([r.standard_normal((3, steps)) for r in rngs], axis=2)
+    keep = np.exp(-dt / m.load_time)
+    load, _ = lfilter([m.load_sd * np.sqrt(1 - keep**2)], [1.0, -keep], white[0], axis=0,
+                      zi=keep * m.load_sd * np.stack([r.standard_normal(1) for r in rngs], axis=1))
+    ripple, sensor = m.ripple_sd * white[1], m.sensor_sd * white[2]
+    target = np.broadcast_to(script.target.reshape(steps, -1), (steps, many))
+    torque = np.broadcast_to(script.torque.reshape(steps, -1), (steps, many))
+    speed_out, torque_out = np.empty((steps, many)), np.empty((steps, many))
+    omega, motor, seen = target[0].copy(), np.zeros(many), target[0].copy()
+    moving = np.abs(omega) > 0
+    integral = np.where(moving, m.viscous * omega + m.coulomb * np.sign(omega), 0.0)
+    motor = integral.copy()
+    bandwidth = 3.0 / m.pace
+    kp, ki = m.inertia * bandwidth, m.inertia * bandwidth**2 / 4.0
+    a_motor, a_seen = np.exp(-dt / (0.01 * min(m.pace, 1.0))), np.exp(-dt / (0.01 * min(m.pace, 1.0)))
+    for n in range(steps):
+        seen = a_seen * seen + (1 - a_seen) * (omega + sensor[n])
+        regime = script.regime[n]
+        if regime == SPEED:
+            error = target[n] - seen
+            command = kp * error + integral
+            inside = np.abs(command) < m.limit
+            integral = integral + np.where(inside, ki * dt * error, 0.0)
+        elif regime == TORQUE:
+            command = torque[n]
+            integral = command.copy()
+        else:
+            command, integral = np.zeros(many), np.zeros(many)
+        command = np.clip(command, -m.limit, m.limit)
+        motor = a_motor * motor + (1 - a_motor) * command
+        actual = motor + (ripple[n] if regime != OFF else 0.0)
+        if regime == OFF:
+            actual = motor = np.zeros(many)
+        push = actual + load[n]
+        sign = np.where(omega != 0.0, np.sign(omega), np.sign(push))
+        stuck = (omega == 0.0) & (np.abs(push) <= m.coulomb)
+        smooth = m.viscous * omega + m.quadratic * omega * np.abs(omega)
+        half = omega + 0.5 * dt / m.inertia * (push - smooth - m.coulomb * sign)
+        smooth = m.viscous * half + m.quadratic * half * np.abs(half)
+        after = omega + dt / m.inertia * (push - smooth - m.coulomb * sign)
+        crossing = (after * sign < 0.0) & (np.abs(push) <= m.coulomb)
+        after = np.where(stuck | crossing, 0.0, after)
+        speed_out[n] = 0.5 * (omega + after)
+        torque_out[n] = actual
+        omega = after
+    return speed_out + sensor, torque_out
+
+
+def report(
+    machine: Machine, reading: Reading, speed: np.ndarray, torque: np.ndarray, rngs: list[np.random.Generator],
+    prior: LagPrior | None = None,
+) -> list[Recording]:
+    m, dt = machine, machine.dt
+    speed, torque = filtered(speed, m.speed_report, dt), filtered(torque, m.torque_report, dt)
+    grid = np.arange(len(speed)) * dt
+    found = []
+    for k, rng in enumerate(rngs):
+        at = np.arange(0.2, grid[-1] - 0.2, 1.0 / reading.rate_hz)
+        at = at + rng.uniform(-reading.jitter_s, reading.jitter_s, len(at))
+        at = at[rng.random(len(at)) >= reading.lost]
+        if reading.hole_s > 0.0:
+            middle = 0.5 * grid[-1]
+            at = at[(at < middle) | (at > middle + reading.hole_s)]
+        w = np.interp(at - 0.5 * reading.speed_early_s, grid, speed[:, k])
+        t = np.interp(at + 0.5 * reading.speed_early_s, grid, torque[:, k])
+        w = w + m.speed_noise * rng.standard_normal(len(at))
+        t = t + m.torque_noise * rng.standard_normal(len(at))
+        q_w, q_t = m.speed_quantum * reading.coarse, m.torque_quantum * reading.coarse
+        w, t = np.round(w / q_w) * q_w, np.round(t / q_t) * q_t
+        stamps = np.sort(at + rng.uniform(-reading.stamp_error_s, reading.stamp_error_s, len(at)))
+        found.append(Recording(
+            time_s=stamps, speed_rad_s=w, torque_nm=t, fresh=np.ones(len(at), dtype=bool),
+            limited=np.zeros(len(at), dtype=bool), lag_prior=prior or LagPrior(),
+            speed_resolution_rad_s=q_w, torque_resolution_nm=q_t, simulated=True,
+        ))
+    return found
+
+
+# -- motions -------------------------------------------------------------------------------------------------
+
+
+def _grid(machine: Machine, duration: float) -> np.ndarray:
+    return np.arange(round(duration * machine.pace / machine.dt)) * machine.dt / machine.pace
+
+
+def speed_steps(machine: Machine, rng: np.random.Generator) -> Script:
+    """Speed command in steps of a PI loop, every 4 to 9 s, within 15 to 100 % of the top speed."""
+    t = _grid(machine, 100.0)
+    edges = np.cumsum(rng.uniform(4.0, 9.0, 40))
+    levels = machine.top * rng.uniform(0.15, 1.0, 41)
+    return Script(np.full(len(t), SPEED), levels[np.searchsorted(edges, t)], np.zeros(len(t)))
+
+
+def up_down(machine: Machine, rng: np.random.Generator) -> Script:
+    """Triangles of the speed command, 3 to 8 s a flank."""
+    t = _grid(machine, 100.0)
+    knots = np.concatenate([[0.0], np.cumsum(rng.uniform(3.0, 8.0, 40))])
+    levels = machine.top * np.where(np.arange(41) % 2 == 0, rng.uniform(0.15, 0.3, 41), rng.uniform(0.7, 1.0, 41))
+    return Script(np.full(len(t), SPEED), np.interp(t, knots, levels), np.zeros(len(t)))
+
+
+def ramp_coast(machine: Machine, rng: np.random.Generator) -> Script:
+    """From standstill: ramp up, hold, coast down to rest, wait; four times."""
+    t = _grid(machine, 120.0)
+    cycle = 30.0
+    phase = np.mod(t, cycle)
+    number = (t // cycle).astype(int)
+    top = machine.top * rng.uniform(0.7, 1.0, 8)[number]
+    rise = rng.uniform(3.0, 6.0, 8)[number]
+    target = top * np.clip((phase - 2.0) / rise, 0.0, 1.0)
+    regime = np.where(phase < 2.0, OFF, np.where(phase < 14.0, SPEED, OFF))
+    return Script(regime, target, np.zeros(len(t)))
+
+
+def _about(machine: Machine) -> tuple[float, float]:
+    middle = 0.55 * machine.top
+    return middle, machine.viscous * middle + machine.coulomb + machine.quadratic * middle**2
+
+
+def torque_pulses(machine: Machine, rng: np.random.Generator) -> Script:
+    """Speed loop to a mean speed, then pairs of torque pulses up and down with friction's torque under them."""
+    t = _grid(machine, 100.0)
+    middle, hold = _about(machine)
+    extra = np.zeros(len(t))
+    begin = 5.0
+    while begin < 98.0:
+        width = rng.uniform(0.8, 1.6)
+        size = 0.25 * machine.top * machine.inertia / (width * machine.pace) * rng.choice([-1.0, 1.0])
+        size = np.clip(size, -0.8 * (machine.limit - hold), 0.8 * (machine.limit - hold))
+        gap = rng.uniform(1.0, 3.0)
+        extra[(t >= begin) & (t < begin + width)] = size
+        extra[(t >= begin + width + gap) & (t < begin + 2 * width + gap)] = -size
+        begin += 2 * width + gap + rng.uniform(1.0, 3.0)
+    regime = np.where(t < 4.0, SPEED, TORQUE)
+    return Script(regime, np.full(len(t), middle), hold + extra)
+
+
+def torque_steps(machine: Machine, rng: np.random.Generator) -> Script:
+    """Random torque levels, each held 0.7 to 3 s; pulled back towards the mean speed by their own sum."""
+    t = _grid(machine, 100.0)
+    middle, hold = _about(machine)
+    extra = np.zeros(len(t))
+    begin, gone = 5.0, 0.0
+    while begin < 100.0:
+        width = rng.uniform(0.7, 3.0)
+        change = np.clip(0.28 * machine.top * rng.standard_normal() - 0.8 * gone, -0.5, 0.5 * machine.top)
+        change = np.clip(gone + change, -0.33 * machine.top, 0.33 * machine.top) - gone
+        level = np.clip(machine.inertia * change / (width * machine.pace), -0.9 * (machine.limit - hold),
+                        0.9 * (machine.limit - hold))
+        extra[(t >= begin) & (t < begin + width)] = level
+        gone += level * width * machine.pace / machine.inertia
+        begin += width
+    regime = np.where(t < 4.0, SPEED, TORQUE)
+    return Script(regime, np.full(len(t), middle), hold + extra)
+
+
+MOTIONS = {
+    "speed steps": speed_steps, "torque pulses": torque_pulses, "up-down ramps": up_down, "ramp + coast": ramp_coast,
+    "torque steps": torque_steps,
+}
+FOREIGN = Reading(rate_hz=10.0, jitter_s=0.010, stamp_error_s=0.005, speed_early_s=0.020, lost=0.02, coarse=5.0)
+
+FIELD = Machine("field", 104.0, 8.0, 60.0, Report((0.40,)), Report((0.15,)), 8.0, 400.0)
+SERVO = Machine("servo", 0.8, 0.05, 1.5, Report(), Report(), 80.0, 60.0, 0.5, 0.001, 0.3, 0.3, 1.0, 0.05, 0.01, 0.1,
+                0.0105, 0.05)
+HEAVY = Machine("heavy", 900.0, 74.3, 82.4, Report((0.25,)), Report((0.10,)), 10.0, 4500.0, 1.0, 0.002, 25.0, 0.5,
+                60.0, 0.01, 0.003, 10.0, 0.0105, 5.0)
+
+
+def simulate(
+    machine: Machine, motion: str, seeds: list[int], reading: Reading | None = None, prior: LagPrior | None = None
+) -> list[Recording]:
+    """One recording per seed. The motion "foreign" is speed steps read as a PLC would, ten times a second."""
+    reading = reading or (FOREIGN if motion == "foreign" else Reading(250.0, 0.001) if machine.pace < 1 else Reading())
+    make = MOTIONS["speed steps" if motion == "foreign" else motion]
+    rngs = [np.random.default_rng([seed, 77]) for seed in seeds]
+    scripts = [make(machine, rng) for rng in rngs]
+    stacked = Script(scripts[0].regime, np.stack([s.target for s in scripts], axis=1),
+                     np.stack([s.torque for s in scripts], axis=1))
+    speed, torque = turn(machine, stacked, rngs)
+    return report(machine, reading, speed, torque, rngs, prior)

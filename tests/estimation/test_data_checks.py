@@ -1,0 +1,141 @@
+"""Each recogniser alone: it sees its own fault, and nothing in a sound signal however that is rounded or sampled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.samples import stretches, usable_samples
+from tdhil.identify.faults.clipped import flat_share
+from tdhil.identify.faults.frozen import frozen
+from tdhil.identify.faults.spikes import spikes
+from tdhil.identify.faults.timebase import wrong_period
+from tdhil.identify.faults.undeclared import undeclared_warning
+from tdhil.identify.lines.warming import warming_of
+from tests.estimation.analytic import closed_form
+
+
+def wave(seed, quantum, noise, flat=False):
+    """A minute of two or three tones at 100 Hz; ``flat``: with a crest as flat as x⁴."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(6000) / 100.0
+    third = 1.0 / 9.0 if flat else rng.uniform(0.0, 0.5)
+    phase = np.pi if flat else rng.uniform(0.0, 2.0 * np.pi)
+    x = np.cos(2 * np.pi * 0.1 * t) + third * np.cos(2 * np.pi * 0.3 * t + phase) + noise * rng.standard_normal(len(t))
+    return np.round(x / quantum) * quantum if quantum else x
+
+
+@pytest.mark.parametrize("flat", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+@pytest.mark.parametrize("quantum", [0.0, 0.001, 0.01, 0.1, 0.3])
+def test_a_rounded_wave_is_not_clipped(quantum, noise, flat):
+    for seed in range(10):
+        assert flat_share(wave(seed, quantum, noise, flat), quantum) is None, seed
+        assert flat_share(wave(seed, quantum, noise, flat), 0.0) is None, seed       # nor if nobody knows the rounding
+
+
+@pytest.mark.parametrize(("quantum", "noise", "share"), [
+    (0.0, 0.0, 0.02), (0.0, 0.0, 0.3), (0.0, 0.02, 0.02), (0.0, 0.02, 0.3), (0.01, 0.02, 0.1), (0.01, 0.02, 0.3),
+    (0.001, 0.0, 0.2),
+])
+def test_a_flat_top_is_seen(quantum, noise, share):
+    for seed in range(10):
+        x = wave(seed, quantum, noise)
+        x = np.minimum(x, np.quantile(x, 1.0 - share))
+        assert flat_share(x, quantum) == pytest.approx(share, abs=0.05)
+        assert flat_share(-x, quantum) == pytest.approx(share, abs=0.05)
+
+
+def rounded(recording, speed_step, torque_step):
+    return replace(recording, speed_rad_s=np.round(recording.speed_rad_s / speed_step) * speed_step,
+                   torque_nm=np.round(recording.torque_nm / torque_step) * torque_step)
+
+
+@pytest.mark.parametrize(("speed_step", "torque_step"), [(1e-3, 0.1), (0.01, 1.0), (0.1, 5.0)])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_coarsely_rounded_record_is_neither_stuck_nor_spiked(speed_step, torque_step, noise):
+    recording = rounded(closed_form(noise=noise), speed_step, torque_step)
+    assert frozen(recording) is None
+    assert spikes(recording) is None
+
+
+def test_spikes_are_found_one_by_one():
+    recording = closed_form()
+    speed = recording.speed_rad_s.copy()
+    at = [3, 500, 1234, len(speed) - 2]
+    speed[at] += 50.0
+    found = spikes(replace(recording, speed_rad_s=speed))
+    assert list(np.flatnonzero(found)) == at
+    assert not np.any(np.abs(usable_samples(replace(recording, speed_rad_s=speed)).speed_rad_s) > 20.0)
+
+
+def test_a_stuck_stretch_is_found_from_its_second_sample():
+    recording = closed_form()
+    speed, torque = recording.speed_rad_s.copy(), recording.torque_nm.copy()
+    speed[1000:1100], torque[1000:1100] = speed[1000], torque[1000]
+    found = np.flatnonzero(frozen(replace(recording, speed_rad_s=speed, torque_nm=torque)))
+    assert (found[0], found[-1], len(found)) == (1001, 1099, 99)
+
+
+def test_good_samples_are_not_copied():
+    recording = closed_form()
+    samples = usable_samples(recording)
+    assert np.shares_memory(samples.speed_rad_s, recording.speed_rad_s)
+    shifted = usable_samples(replace(recording, torque_offset_nm=5.0))
+    assert shifted.torque_nm == pytest.approx(recording.torque_nm - 5.0)
+    assert recording.torque_nm[0] == closed_form().torque_nm[0]
+
+
+def lines_of(recording):
+    samples = usable_samples(recording)
+    cut = stretches(samples, recording.excitation.segments)
+    return cut, tuple(period_lines(one, samples) for one in cut)
+
+
+@pytest.mark.parametrize("share", [-0.02, -0.001, 0.0007, 0.003, 0.01])
+def test_the_true_period_is_told(share):
+    recording = closed_form()
+    slow = replace(recording, time_s=recording.time_s * (1.0 + share))
+    assert wrong_period(*lines_of(slow)) == pytest.approx(share, abs=5e-4)
+    assert wrong_period(*lines_of(recording)) is None
+
+
+def test_rounding_does_not_decide_whether_a_period_is_wrong():
+    """A record in closed form, and the same with its last bits otherwise, as another processor computes it."""
+    recording = closed_form()
+    slow = replace(recording, time_s=recording.time_s * 1.0007)
+    for seed in range(12):
+        ulps = np.random.default_rng(seed).integers(-2, 3, len(slow.time_s)) * np.finfo(float).eps
+        other = replace(slow, speed_rad_s=slow.speed_rad_s * (1.0 + ulps))
+        assert wrong_period(*lines_of(other)) == pytest.approx(0.0007, abs=5e-4), seed
+
+
+@pytest.mark.parametrize("hertz", [0.15, 0.25, 0.77, 2.1])
+def test_an_undeclared_tone_is_told_with_its_frequency(hertz):
+    recording = closed_form(rate_hz=50.0)
+    assert undeclared_warning(*lines_of(recording)) == ()
+    tone = 0.4 * np.cos(2 * np.pi * hertz * recording.time_s)
+    said = undeclared_warning(*lines_of(replace(recording, speed_rad_s=recording.speed_rad_s + tone)))
+    assert len(said) == 1
+    assert f"at {hertz:.4g} Hz" in said[0] or abs(float(said[0].split(" at ")[1].split(" Hz")[0]) - hertz) < 0.02
+
+
+@pytest.mark.parametrize("periods", [3, 5, 10, 60])
+def test_a_drift_is_seldom_seen_where_there_is_none(periods):
+    """The warning at 3.5 sd: once in two thousand runs, if the scatter is well known and if it isn't."""
+    rng = np.random.default_rng(periods)
+    time = [10.0 * np.arange(periods), 10.0 * np.arange(periods) + 1000.0]
+    found = [warming_of(time, list(rng.standard_normal((2, periods)))) for _ in range(2000)]
+    assert sum(one.clear for one in found) <= 5
+    assert 0.02 < np.mean([one.rate != 0.0 for one in found]) < 0.08
+
+
+def test_a_drift_is_told_with_its_size():
+    rng = np.random.default_rng(1)
+    time = [10.0 * np.arange(6), 10.0 * np.arange(6) + 80.0]
+    found = [warming_of(time, [0.2 * t + rng.standard_normal(6) for t in time]) for _ in range(200)]
+    assert all(one.clear for one in found)
+    rates = np.array([one.rate for one in found])
+    assert np.mean(rates) == pytest.approx(0.2, abs=4 * np.std(rates) / np.sqrt(200))
+    assert np.sqrt(np.mean([one.variance for one in found])) == pytest.approx(np.std(rates), rel=0.15)

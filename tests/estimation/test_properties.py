@@ -1,0 +1,182 @@
+"""What must hold of any recording: scaling, shifting, turning round; and the closed form as oracle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from tdhil.estimation import Verdict, identify
+from tests.estimation.analytic import closed_form
+
+pytestmark = pytest.mark.one_worker
+
+few = settings(max_examples=5, deadline=None, derandomize=True, phases=[Phase.generate])   # no minutes of shrinking
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return identify(closed_form())
+
+
+@few
+@given(scale=st.floats(1e-3, 1e3))
+def test_torque_scale_scales_what_has_torque_in_it(plain, scale):
+    recording = closed_form()
+    found = identify(replace(recording, torque_nm=recording.torque_nm * scale, torque_limit_nm=None))
+    for name in ("inertia", "viscous_nm_s_rad", "coulomb_nm"):
+        for end in ("value", "low", "high"):
+            expected = getattr(getattr(plain, name), end) * scale
+            assert getattr(getattr(found, name), end) == pytest.approx(expected, rel=2e-4)
+    assert found.speed_lag_s.value == pytest.approx(plain.speed_lag_s.value, abs=1e-3)
+    assert found.paper.stepped.inertia_kg_m2 == pytest.approx(plain.paper.stepped.inertia_kg_m2 * scale, rel=1e-9)
+
+
+@few
+@given(shift=st.floats(-1e5, 1e5))
+def test_the_clock_may_start_anywhere(plain, shift):
+    found = identify(closed_form(start=shift))
+    assert found.inertia.value == pytest.approx(plain.inertia.value, rel=2e-4)
+    assert found.inertia.low == pytest.approx(plain.inertia.low, rel=5e-4)
+    assert found.paper.stepped.inertia_kg_m2 == pytest.approx(plain.paper.stepped.inertia_kg_m2, rel=5e-3)
+
+
+def test_rotation_may_be_either_way(plain):
+    recording = closed_form()
+    found = identify(replace(recording, speed_rad_s=-recording.speed_rad_s, torque_nm=-recording.torque_nm))
+    assert found.inertia.value == pytest.approx(plain.inertia.value, rel=1e-6)
+    assert found.coulomb_nm.value == pytest.approx(plain.coulomb_nm.value, rel=1e-4)
+
+
+@pytest.mark.heavy
+@settings(few, max_examples=8)
+@given(
+    # J/B stays clear of what a lag may be (2 s): below, a lag and the shaft can change places, and J is refused
+    inertia=st.floats(60.0, 500.0),
+    viscous=st.floats(0.0, 15.0),
+    coulomb=st.floats(0.0, 100.0),
+    speed_lag=st.floats(0.0, 0.8),
+    torque_lag=st.floats(0.0, 0.5),
+    skew=st.floats(-0.05, 0.05),
+)
+def test_finds_the_truth_of_the_closed_form(inertia, viscous, coulomb, speed_lag, torque_lag, skew):
+    recording = closed_form(inertia, viscous, coulomb, speed_lag, torque_lag, skew, noise=0.02)
+    found = identify(replace(recording, torque_limit_nm=None))
+    assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
+    width = found.inertia.high - found.inertia.low
+    # twice the interval's width is 8 sd: no seed of such a test may fall outside
+    assert abs(found.inertia.value - inertia) <= max(2.0 * width, 1e-4 * inertia)
+    assert found.viscous_nm_s_rad.value == pytest.approx(viscous, abs=0.05)
+    assert found.coulomb_nm.value == pytest.approx(coulomb, abs=0.3)
+
+
+def test_a_shaft_that_a_lag_can_impersonate_is_refused_or_wide():
+    """J/B = 1 s: (J s + B) = B (1 + s), so the shaft could be a lag of 1 s, and a lag the shaft."""
+    found = identify(closed_form(20.0, 20.0, 0.0, 0.0, 0.0, 0.0, noise=0.02))
+    assert found.verdict is Verdict.NOT_IDENTIFIABLE
+    assert found.inertia is None
+
+
+def test_torque_offset_is_taken_off():
+    recording = closed_form()
+    found = identify(replace(recording, torque_nm=recording.torque_nm + 25.0, torque_offset_nm=25.0))
+    assert found.coulomb_nm.value == pytest.approx(60.0, abs=0.5)
+
+
+THETA = np.array([104.0, 8.0, 0.4, 0.1, 0.15, 0.3, 0.2, 0.02])
+SMALL = np.array([1e-3, 1e-4, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6])
+
+
+@pytest.mark.parametrize("u", (0.2, -0.3, 1e-6, 0.0))
+def test_jacobian_is_the_derivative(u):
+    from tdhil.estimation.frequency_domain.model import Model
+
+    s = 2j * np.pi * np.array([0.05, 0.2, 0.7])
+    theta = THETA.copy()
+    theta[6] = u
+    g, jacobian = Model().impedance_jacobian(theta, s)
+    assert np.allclose(g, Model().impedance(theta, s), rtol=1e-12)
+    for index, step in enumerate(SMALL):
+        ahead, behind = theta.copy(), theta.copy()
+        ahead[index] += step
+        behind[index] -= step
+        slope = (Model().impedance(ahead, s) - Model().impedance(behind, s)) / (2.0 * step)
+        assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-7 * np.abs(g).max())
+
+
+def test_impedance_against_a_simulated_filter():
+    """An independent oracle: scipy's frequency response of the same rational function."""
+    from scipy.signal import freqs
+
+    from tdhil.estimation.frequency_domain.model import Model
+
+    omega = np.array([0.3, 1.0, 4.0])
+    numerator = np.polymul([104.0, 8.0], [0.1 * 0.4**2, 0.4, 1.0])
+    _, expected = freqs(numerator, [0.3 * 0.15**2, 0.15, 1.0], omega)
+    found = Model().impedance(np.array([104.0, 8.0, 0.4, 0.1, 0.15, 0.3, 0.0, 0.0]), 1j * omega)
+    assert np.allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("over", ("speed", "torque"))
+def test_an_average_is_one_of_the_family(over):
+    """A mean over w of a rotating phasor, summed up sample by sample: half of w is delay, the rest u."""
+    from tdhil.estimation.frequency_domain.signal_filters import log_ratio
+
+    w, omega = 0.5, np.array([0.6, 2.0, 5.0])
+    steps = (np.arange(20000) + 0.5) * w / 20000
+    averaged = np.exp(-1j * np.outer(omega, steps)).mean(axis=1)
+    sign = 1.0 if over == "torque" else -1.0
+    found = np.exp(log_ratio(np.array([0.0, 0.0, 0.0, 0.0, sign * w * w, sign * w / 2]), 1j * omega))
+    assert np.allclose(found, averaged**sign, rtol=1e-7)
+
+
+def test_likelihood_jacobian_is_the_derivative():
+    from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+    from tdhil.estimation.frequency_domain.likelihood import Likelihood
+    from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+    from tdhil.estimation.frequency_domain.spectrum import Line
+
+    rng = np.random.default_rng(3)
+
+    def line(hertz):
+        speed = rng.standard_normal(2) + 1j * rng.standard_normal(2)
+        return Line(hertz, speed, 60.0 * speed * (1 + 2j), np.array([5.0, 6.0]), 0.02, 30.0, 0.1 + 0.2j, 9.0)
+
+    problem = Likelihood((line(0.1), line(0.3)), Model(), ViscousTie(8.0, 0.01, 0.1, 9.0),
+                         (GaussianPrior(2, 0.3, 0.05),))
+    residuals, jacobian = problem.linearised(THETA)
+    assert np.allclose(residuals, problem.residuals(THETA), rtol=1e-12)
+    for index, step in enumerate(SMALL):
+        ahead, behind = THETA.copy(), THETA.copy()
+        ahead[index] += step
+        behind[index] -= step
+        slope = (problem.residuals(ahead) - problem.residuals(behind)) / (2.0 * step)
+        assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-6 * np.max(np.abs(slope)))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_descent_against_scipy(seed):
+    """The same bounded minimum as scipy's solver, on a curved valley with a bound across it."""
+    from scipy.optimize import least_squares
+
+    from tdhil.estimation.frequency_domain.optimiser import Box, descend
+
+    rng = np.random.default_rng(seed)
+    a, b = rng.uniform(0.5, 3.0, 2)
+
+    def residuals(x):
+        return np.array([10.0 * (x[1] - a * x[0] ** 2), b - x[0], 0.3 * (x[2] - x[0] * x[1])])
+
+    def linearised(x):
+        slopes = np.array([[-20.0 * a * x[0], 10.0, 0.0], [-1.0, 0.0, 0.0], [-0.3 * x[1], -0.3 * x[0], 0.3]])
+        return residuals(x), slopes
+
+    low, high = np.array([-5.0, -5.0, -5.0]), np.array([5.0, rng.uniform(0.5, 20.0), 5.0])
+    start = np.clip(rng.uniform(-2.0, 2.0, 3), low, high)
+    found = descend(linearised, residuals, start, np.ones(3, bool), Box(low, high, np.ones(3)))
+    oracle = least_squares(residuals, start, bounds=(low, high), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    assert found.objective <= 2.0 * oracle.cost + 1e-5
+    assert np.all((found.theta >= low) & (found.theta <= high))
+
+

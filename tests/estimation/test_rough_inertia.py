@@ -1,0 +1,58 @@
+"""A rough inertia from one change of speed, through reporting lags: within a fifth, and it knows its own error."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter, lsim
+
+from tdhil.estimation import rough_friction, rough_inertia
+from tdhil.recording.recording import Level
+
+
+def ramp(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, torque_lag=0.15, seed=0, down=False, hold=5.0):
+    """A speed ramp from 2 to 6 rad/s in 4 s between two holds; the torque is what the balance asks for."""
+    dt = 0.004
+    time = np.arange(0.0, 2.0 * hold + 4.0, dt)
+    u = np.clip((time - hold) / 4.0, 0.0, 1.0)
+    speed = 2.0 + 4.0 * (0.5 - 0.5 * np.cos(np.pi * u))
+    if down:
+        speed = 8.0 - speed
+    rng = np.random.default_rng(seed)
+    keep = np.exp(-dt / 0.5)
+    load = lfilter([1.0], [1.0, -keep], 3.0 * np.sqrt(1 - keep**2) * rng.standard_normal(len(time)))
+    torque = inertia * np.gradient(speed, dt) + viscous * speed + coulomb - load
+
+    def lagged(x, tau):
+        return x[0] + lsim(([1.0], [tau, 1.0]), x - x[0], time)[1] if tau else x
+
+    seen = np.round((lagged(speed, speed_lag) + 0.003 * rng.standard_normal(len(time))) / 0.0105) * 0.0105
+    return time, seen, np.round(lagged(torque, torque_lag) + 2.0 * rng.standard_normal(len(time)))
+
+
+@pytest.mark.parametrize("down", [False, True])
+@pytest.mark.parametrize("lags", [(0.4, 0.15), (0.0, 0.0), (0.5, 0.0), (0.15, 0.5)])
+def test_within_a_fifth_whatever_the_lags(lags, down):
+    errors, claimed = [], []
+    for seed in range(20):
+        signals = ramp(speed_lag=lags[0], torque_lag=lags[1], seed=seed, down=down)
+        found = rough_inertia(*signals, Level(1.0, 5.0), Level(11.0, 14.0))
+        errors.append(found.inertia_kg_m2 / 104.0 - 1.0)
+        claimed.append(found.rel_error)
+    assert np.max(np.abs(errors)) < 0.2
+    assert np.mean(np.abs(errors) <= claimed) >= 0.9
+    assert np.median(claimed) < 0.25
+
+
+def test_friction_from_two_levels():
+    found = rough_friction(*ramp(), Level(0.5, 5.0), Level(11.0, 14.0))
+    assert found.viscous_nm_s_rad == pytest.approx(8.0, abs=2.0)
+    assert found.coulomb_nm == pytest.approx(60.0, abs=8.0)
+
+
+def test_nothing_to_go_by_gives_nothing():
+    time, speed, torque = ramp()
+    assert rough_inertia(time, np.full_like(speed, 3.0), torque, Level(1.0, 5.0), Level(11.0, 14.0)) is None
+    assert rough_inertia(time, speed, torque, Level(11.0, 14.0), Level(1.0, 5.0)) is None
+    assert rough_inertia(time, speed, torque, Level(30.0, 31.0), Level(32.0, 33.0)) is None
+    assert rough_inertia(time, speed, -torque, Level(1.0, 5.0), Level(11.0, 14.0)) is None
+    nan = np.full_like(torque, np.nan)
+    assert rough_inertia(time, speed, nan, Level(1.0, 5.0), Level(11.0, 14.0)) is None

@@ -1,0 +1,211 @@
+"""Second opinions: each covers by its own interval, says no by chance as seldom as it should, finds what is wrong."""
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from tdhil.estimation import Compliant, Estimate, Options
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.cross_checks.second_opinion import disagreements, second_opinions
+from tdhil.estimation.frequency_domain.friction_levels import measure_levels
+from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.samples import Samples, stretches, usable_samples
+from tdhil.identify.beside.momentum_rows import through
+from tdhil.recording.recording import Recording
+from tdhil.run.excitation import ExcitationWish
+from tests.estimation.planned_motions import planned
+from tests.estimation.shaft_bench import Rig, simulate
+from tests.estimation.stages_bench import Stages, run_stages, usual_runs
+
+pytestmark = pytest.mark.one_worker("friction")     # both look at the same runs
+
+TRUE = 104.0
+
+
+def around(value, half):
+    return Estimate(value, value - half, value + half)
+
+
+def result(inertia=TRUE, half=0.45, delay=0.25, delay_sd=0.018):
+    """What the lines may have said; delay None: nothing of the lags."""
+    lag = None if delay is None else around(delay, 1.96 * delay_sd)
+    zero = None if delay is None else around(0.0, 0.0)
+    return Finding(inertia=around(inertia, half), speed_lag_s=lag, torque_lag_s=zero, skew_s=zero)
+
+
+def levels_of(recording, samples):
+    cut = stretches(samples, recording.excitation.segments)
+    fits = tuple(period_lines(stretch, samples) for stretch in cut)
+    return measure_levels(cut, fits, samples, recording.levels, TRUE)
+
+
+def opinions_of(recording, found=None, levels=True):
+    samples = usable_samples(recording)
+    own = levels_of(recording, samples) if levels else None
+    return second_opinions(Case(recording, Options(), samples=samples, levels=own), found or result())
+
+
+@pytest.fixture(scope="module")
+def usual():
+    """Per route (seeds, 4): value, low, high, agrees; the result's J and delay as uncertain as they say they are."""
+    rng = np.random.default_rng(5)
+    rows = {}
+    for recording in usual_runs():
+        j, delay = TRUE + 0.23 * rng.standard_normal(), 0.25 + 0.018 * rng.standard_normal()
+        for opinion in opinions_of(recording, result(j, 1.96 * 0.23, delay)):
+            e = opinion.inertia_kg_m2
+            rows.setdefault(opinion.route, []).append((e.value, e.low, e.high, opinion.agrees))
+    return {route: np.array(found, dtype=float) for route, found in rows.items()}
+
+
+@pytest.mark.parametrize("route", ["speed change", "coast-down"])
+def test_its_own_interval_covers(usual, route):
+    found = usual[route]
+    assert len(found) == len(usual_runs())
+    covered = int(np.sum((found[:, 1] <= TRUE) & (found[:, 2] >= TRUE)))
+    assert covered >= binom.ppf(0.005, len(found), 0.95)
+    error = found[:, 0] - TRUE
+    assert abs(error.mean()) <= 0.2 + 3.0 * error.std() / math.sqrt(len(error))
+    # neither too wide to say anything, nor far from the scatter that there is
+    half = 0.5 * (found[:, 2] - found[:, 1])
+    assert 1.6 < half.mean() / error.std() < 3.0
+    assert half.mean() < 0.04 * TRUE
+
+
+def test_disagreement_by_chance_comes_once_in_a_hundred_runs(usual):
+    said_no = sum((found[:, 3] == 0.0).astype(int) for found in usual.values())
+    runs = len(usual_runs())
+    assert np.sum(said_no > 0) <= binom.ppf(0.995, runs, 0.01)
+
+
+def test_without_knowing_the_lags_it_is_wider_and_still_covers():
+    recordings = usual_runs()[:60]
+    known = [opinions_of(r)[0].inertia_kg_m2 for r in recordings]
+    unknown = [opinions_of(r, result(delay=None))[0].inertia_kg_m2 for r in recordings]
+    assert all(u.high - u.low > k.high - k.low for u, k in zip(unknown, known, strict=True))
+    assert sum(e.low <= TRUE <= e.high for e in unknown) >= binom.ppf(0.005, 60, 0.95)
+
+
+def test_without_excited_segments_the_rows_tell_the_scatter():
+    """As after a refusal, or in a foreign trace: no levels, nothing of the lags, no result."""
+    nothing = replace(result(delay=None), inertia=None)
+    covered = 0
+    for recording in usual_runs()[:60]:
+        first, *_ = opinions_of(replace(recording, excitation=None), nothing, levels=False)
+        assert first.agrees is None
+        covered += first.inertia_kg_m2.low <= TRUE <= first.inertia_kg_m2.high
+        assert disagreements((first,), nothing) == ()
+    assert covered >= binom.ppf(0.005, 60, 0.95)
+
+
+def test_a_result_that_is_wrong_is_contradicted():
+    recording = usual_runs()[0]
+    wrong = result(1.15 * TRUE)
+    opinions = opinions_of(recording, wrong)
+    assert [opinion.agrees for opinion in opinions] == [False, False]
+    warnings = disagreements(opinions, wrong)
+    assert len(warnings) == 2
+    assert "does not agree" in warnings[0]
+    assert "119.6" in warnings[0]
+
+
+def test_torque_that_nobody_reports_is_found_by_the_coast_down():
+    """10 N·m brake while the drive says that it gives none."""
+    hidden = run_stages(Stages(coast=True, coast_torque=-10.0), list(range(8)))
+    verdicts = [{o.route: o.agrees for o in opinions_of(recording)} for recording in hidden]
+    assert sum(v["coast-down"] is False for v in verdicts) >= 6
+    assert sum(v["speed change"] is True for v in verdicts) >= 6
+
+
+def test_a_compliant_shaft_is_compared_with_all_that_turns():
+    recording = usual_runs()[1]
+    motor_only = result(80.0)
+    whole = Compliant(around(TRUE, 0.5), around(24.0, 1.0), None, None, None, None)
+    assert {o.agrees for o in opinions_of(recording, motor_only)} == {False}
+    assert {o.agrees for o in opinions_of(recording, replace(motor_only, compliant=whole))} == {True}
+
+
+def test_plateaus_of_a_square_wave_are_torque_steps():
+    motion, _ = planned(ExcitationWish(kind="step", periods=3))
+    found = []
+    for recording in simulate(Rig(), motion, list(range(12)), rate_hz=100.0):
+        opinions = opinions_of(recording)
+        assert [o.route for o in opinions] == ["torque steps"]
+        found.append(opinions[0].inertia_kg_m2)
+    assert sum(e.low <= TRUE <= e.high for e in found) >= 10
+    assert np.mean([e.high - e.low for e in found]) < 0.08 * TRUE
+
+
+@pytest.mark.parametrize(("speed_lags", "torque_lags"), [((0.4,), (0.15,)), ((0.2, 0.2), (0.15,)), ((), (0.1, 0.2))])
+def test_a_balance_from_calm_to_calm_knows_of_the_reports_their_delay_only(speed_lags, torque_lags):
+    """2 to 6 rad/s on a half cosine, without noise: the balance closes for any filters once B δ is put in."""
+    dt = 0.002
+    time = np.arange(0.0, 20.0, dt)
+    u = np.clip((time - 6.0) / 4.0, 0.0, 1.0)
+    speed = 4.0 - 2.0 * np.cos(np.pi * u)
+    torque = TRUE * np.gradient(speed, dt) + 8.0 * speed + 60.0
+
+    def keep(lag):
+        return math.exp(-dt / lag)
+
+    def lagged(x, lags):
+        for lag in lags:
+            x = lfilter([1.0 - keep(lag)], [1.0, -keep(lag)], x - x[0]) + x[0]
+        return x
+
+    def delay_of(lags):
+        """Of these discrete filters: Σ n keepⁿ / Σ keepⁿ steps."""
+        return sum(dt * keep(lag) / (1.0 - keep(lag)) for lag in lags)
+
+    row = through(Samples(time, lagged(speed, speed_lags), lagged(torque, torque_lags)), 2.0, 18.0, 1.0)
+    delay = delay_of(speed_lags) - delay_of(torque_lags)
+    b_part = 8.0 * (row.travel_rad + delay * row.change_rad_s)
+    assert (row.impulse_nm_s - b_part - 60.0 * row.time_s) / row.change_rad_s == pytest.approx(TRUE, rel=2e-5)
+    assert row.change_rad_s == pytest.approx(4.0, abs=1e-4)
+    assert row.energy_s == pytest.approx(14.0 + 2.0 / 3.0)
+
+
+def test_a_coarse_speed_widens_the_interval():
+    recording = usual_runs()[2]
+    coarse = replace(
+        recording, speed_rad_s=np.round(recording.speed_rad_s / 0.3) * 0.3, speed_resolution_rad_s=0.3
+    )
+    fine_half, coarse_half = (
+        0.5 * (o.inertia_kg_m2.high - o.inertia_kg_m2.low) for o in (opinions_of(recording)[0], opinions_of(coarse)[0])
+    )
+    assert coarse_half > 1.5 * fine_half
+
+
+def test_the_same_record_gives_the_same_bits():
+    recording = usual_runs()[3]
+    assert opinions_of(recording) == opinions_of(recording)
+
+
+def record(time, speed, torque):
+    n = len(time)
+    return Recording(np.asarray(time, float), np.asarray(speed, float), np.asarray(torque, float),
+                     np.ones(n, bool), np.zeros(n, bool))
+
+
+def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
+    time = np.arange(0.0, 40.0, 0.01)
+    rng = np.random.default_rng(1)
+    ramp = np.clip(time - 15.0, 0.0, 4.0)
+    signals = {
+        "rest": 0.0 * time, "steady": 3.0 + 0.0 * time, "noise": rng.standard_normal(len(time)), "ramp": 2.0 + ramp,
+        "huge": 1e300 * np.ones(len(time)), "reversing": np.sin(time),
+    }
+    stamps = (time, time[::-1].copy(), np.zeros(len(time)), time * 1e9, time[:12])
+    for (name, speed), (_, torque), stamp in itertools.product(signals.items(), signals.items(), stamps):
+        recording = record(stamp, speed[: len(stamp)], torque[: len(stamp)])
+        samples = Samples(recording.time_s, recording.speed_rad_s, recording.torque_nm)
+        with np.errstate(all="ignore"):
+            opinions = second_opinions(Case(recording, Options(), samples=samples), result())
+        if name != "ramp":
+            assert opinions == ()
+        assert all(math.isfinite(o.inertia_kg_m2.high) and o.inertia_kg_m2.value > 0.0 for o in opinions)

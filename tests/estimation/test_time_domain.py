@@ -1,0 +1,188 @@
+"""Records without periodic excitation: the interval covers, and what can't tell the inertia is refused in words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import Options, Verdict, identify
+from tdhil.estimation.samples import usable_samples
+from tdhil.estimation.time_domain.equation import PARAMETERS, evaluate
+from tdhil.estimation.time_domain.windows import joined, measure, windows
+from tdhil.identify.record_route.stretches import runs, thinned
+from tdhil.identify.record_route.tapers import flat_top
+from tdhil.recording.recording import LagPrior
+from tdhil.studies.coverage import plants
+from tdhil.studies.coverage.simulate import simulate as simulate_plan
+from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
+
+pytestmark = pytest.mark.one_worker
+
+
+def found(recording, **options):
+    return identify(replace(recording, excitation=None), Options(**options))
+
+
+def quiet(machine):
+    return replace(machine, load_sd=0.0, ripple_sd=0.0, sensor_sd=0.0, speed_noise=0.0, torque_noise=0.0,
+                   speed_quantum=1e-9, torque_quantum=1e-9)
+
+
+def bins_of(recording):
+    usable = runs(thinned(usable_samples(recording)), recording.speed_resolution_rad_s, 2.5)
+    return joined([measure(window) for window in windows(usable)])
+
+
+@pytest.fixture(scope="module")
+def steps():
+    return simulate(FIELD, "speed steps", [1])[0]
+
+
+# -- the equations -------------------------------------------------------------------------------------------
+
+
+def test_without_noise_the_truth_solves_every_bin():
+    recording = simulate(quiet(FIELD), "ramp + coast", [1])[0]
+    bins = bins_of(recording)
+    truth = np.zeros(PARAMETERS)
+    truth[:5], truth[7:9] = (104.0, 8.0, 0.40, 0.15, 0.0), (60.0, -60.0)
+    low = bins.hertz < 0.5
+    error = np.abs(evaluate(truth, bins).error[low])
+    assert np.max(error) < 1e-3 * np.max(np.abs(bins.torque[low, 0]))
+    wrong = truth.copy()
+    wrong[0] *= 1.02
+    assert np.sum(np.abs(evaluate(wrong, bins).error[low]) ** 2) > 20.0 * np.sum(error**2)
+
+
+def test_slopes_are_the_derivatives(steps):
+    bins = bins_of(steps)
+    theta = np.array([104.0, 8.0, 0.4, 0.15, -0.02, 0.2, 0.3, 60.0, -60.0, 0.1])
+    for index in range(PARAMETERS):
+        step = np.zeros(PARAMETERS)
+        step[index] = 1e-6 * max(1.0, abs(theta[index]))
+        numeric = (evaluate(theta + step, bins).error - evaluate(theta - step, bins).error) / (2.0 * step[index])
+        slope = evaluate(theta, bins).slopes[:, index]
+        assert np.max(np.abs(numeric - slope)) <= 1e-6 * max(np.max(np.abs(slope)), 1e-9)
+
+
+def test_tapers_add_up_to_one():
+    time = np.linspace(10.0, 12.0, 101)
+    first, second = flat_top(time, 12.0, 2.0), flat_top(time - 10.0, 12.0, 2.0)
+    assert np.allclose(first[:, 0] + second[:, 0], 1.0, atol=1e-12)
+    assert np.allclose(first[:, 1:] + second[:, 1:], 0.0, atol=1e-9)
+
+
+# -- coverage, a few seeds of many (the rest: benchmarks/record_route_coverage.py) ----------------------------
+
+ROWS = [(FIELD, "foreign"), (SERVO, "up-down ramps"), (HEAVY, "ramp + coast"),
+        (Machine("averages", 180.0, 12.0, 70.0, Report((), 0.40), Report((), 0.16), 10.0, 700.0, load_sd=6.0),
+         "torque pulses")]
+
+
+@pytest.mark.parametrize(("machine", "motion"), ROWS, ids=lambda value: getattr(value, "name", value))
+def test_the_interval_covers(machine, motion):
+    assert motion in (*MOTIONS, "foreign")
+    for recording in simulate(machine, motion, [11]):
+        said = found(recording)
+        assert said.verdict in (Verdict.VALID, Verdict.VALID_WIDE), said.reason
+        inertia = said.inertia
+        assert inertia.low <= machine.inertia <= inertia.high
+        assert inertia.high - inertia.low < 0.4 * machine.inertia
+        assert {line.source for line in said.budget} >= {"noise", "lags", "lag structure", "friction model"}
+
+
+def test_known_lags_narrow_the_interval_and_the_torque_scale_widens_the_total_only():
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    alone = found(recording).inertia
+    assert (alone.low, alone.high) == (alone.low_total, alone.high_total)
+    prior = LagPrior(0.40, 0.01, 0.15, 0.01, "the drive")
+    known = found(replace(recording, lag_prior=prior, torque_scale_rel_sd=0.03)).inertia
+    assert known.low <= 104.0 <= known.high
+    assert known.high - known.low < 0.8 * (alone.high - alone.low)
+    assert any("the drive" in condition for condition in known.conditional_on)
+    assert known.high_total - known.value >= 1.9 * 0.03 * known.value
+
+
+def test_holes_and_lost_rows_do_no_harm_and_the_bits_repeat(steps):
+    kept = np.random.default_rng(3).random(len(steps.time_s)) > 0.1
+    kept &= np.abs(steps.time_s - 50.0) > 4.0
+    names = ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")
+    recording = replace(steps, **{name: getattr(steps, name)[kept] for name in names})
+    said = found(recording)
+    assert said.inertia.low <= 104.0 <= said.inertia.high
+    assert said == found(recording)
+
+
+# -- what can't tell -----------------------------------------------------------------------------------------
+
+
+def noise(recording, sd):
+    return sd * np.random.default_rng(9).standard_normal(len(recording.time_s))
+
+
+def constant_speed(r):
+    return replace(r, speed_rad_s=5.0 + noise(r, 0.003), torque_nm=100.0 + noise(r, 3.0))
+
+
+def coasting(r):
+    speed = 7.0 * np.exp(-r.time_s / 40.0)
+    return replace(r, speed_rad_s=speed + noise(r, 0.003), torque_nm=noise(r, 2.0))
+
+
+def no_torque(r):
+    return replace(r, torque_nm=np.zeros_like(r.torque_nm))
+
+
+def standing(r):
+    return replace(r, speed_rad_s=np.zeros_like(r.speed_rad_s))
+
+
+def slow_ramp(r):
+    speed = 2.0 + 0.05 * r.time_s
+    return replace(r, speed_rad_s=speed + noise(r, 0.003), torque_nm=60.0 + 8.0 * speed + 5.2 + noise(r, 3.0))
+
+
+def only_noise(r):
+    return replace(r, speed_rad_s=noise(r, 1.0), torque_nm=noise(r, 50.0)[::-1].copy())
+
+
+def unrelated(r):
+    return replace(r, torque_nm=100.0 + noise(r, 50.0))
+
+
+def turned_round(r):
+    return replace(r, torque_nm=-r.torque_nm)
+
+
+def at_the_limit(r):
+    return replace(r, torque_limit_nm=200.0)
+
+
+HOPELESS = [(constant_speed, "constant"), (coasting, "coast"), (no_torque, "torque did not change"),
+            (standing, "speed did not change"), (slow_ramp, "one change of speed"), (only_noise, ""), (unrelated, ""),
+            (turned_round, ""), (at_the_limit, "limit")]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("spoil", "said"), HOPELESS, ids=lambda value: getattr(value, "__name__", ""))
+def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, spoil, said):
+    refused = found(spoil(steps))
+    assert refused.verdict in (Verdict.NOT_IDENTIFIABLE, Verdict.MODEL_REJECTED)
+    assert refused.inertia is None
+    assert said in refused.reason
+    assert refused.advice
+
+
+def test_what_stands_beside_a_line_need_not_stand_clear():
+    """A multisine that nobody declared, in much noise: just above its last line the speed is what noise makes of it.
+    Bins there had counted as clear for their neighbours' sake, and spoken against the model."""
+    plant = plants.CoveragePlant(
+        "lines", "noise of 3 % of the torque limit", 178.0, 5.0, 30.0, (1.0, 11.7), 435.0,
+        plants.Report((0.06, 0.04)), plants.Report((0.03,)),
+        plants.Noise(5.5, 1.0, 14.0, 0.037, 0.0075, 3.5, 0.01, 1.0),
+        plants.Reading(jitter_s=0.001), lowest_hz=0.2,
+    )
+    for recording in simulate_plan(plant, [(1, 2, 0), (1, 2, 1)], 20):
+        got = found(recording)
+        assert got.verdict in (Verdict.VALID, Verdict.VALID_WIDE), got.reason
+        assert got.inertia.low <= plant.inertia_kg_m2 <= got.inertia.high

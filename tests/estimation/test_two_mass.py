@@ -1,0 +1,184 @@
+"""Two masses on a spring: the impedance against the equations of motion, and what is found in recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from tdhil.commands.models import MODELS as OFFERED
+from tdhil.estimation import Options, Verdict, identify
+from tdhil.estimation.frequency_domain.compliant_fit import fit_compliant, inertias
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
+from tdhil.estimation.frequency_domain.rigid import fit_rigid
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import Refusal
+from tdhil.identify.compliant.choice import Chosen, choose, may_swing
+from tdhil.identify.compliant.string_shaft import StringShaft
+from tdhil.identify.compliant.two_mass import TwoMassShaft, resonances, stiffness
+from tdhil.identify.compliant.views import RESONANCE, STIFFNESS, TOTAL, ViewedShaft
+from tdhil.identify.options import MODELS
+from tdhil.recording.recording import LagPrior
+from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
+
+S = 2j * np.pi * np.array(LINES)
+MILD = Noise(load_nm=55.0, sensor_rad_s=0.025)
+KNOWN = LagPrior(0.40, 0.004, 0.15, 0.0015, "the manual")
+NO_LEVELS = Levels(*(np.zeros(0),) * 4, 0.0, 0.0)
+
+sizes = st.floats(0.05, 20.0)
+few = settings(max_examples=20, deadline=None, derandomize=True, phases=[Phase.generate])
+
+
+def parameters(plant):
+    return np.array([plant.motor, plant.motor_viscous + plant.load_viscous, plant.load,
+                     np.sqrt(plant.stiffness / plant.load), plant.damping, plant.load_viscous])
+
+
+def synthetic(plant, seed, noise_nm, hertz=LINES, amplitude=0.2, lags=(0.4, 0.15)):
+    """Lines as six periods about each of two mean speeds would leave them, and B from the levels."""
+    rng, found = np.random.default_rng(seed), []
+    for hz in hertz:
+        s = 2j * np.pi * hz
+        speed = [amplitude + 0.0005 * (rng.normal(size=6) + 1j * rng.normal(size=6)) for _ in range(2)]
+        g = plant.impedance(hz) * (1.0 + lags[0] * s) / (1.0 + lags[1] * s)
+        torque = [g * amplitude + noise_nm * (rng.normal(size=6) + 1j * rng.normal(size=6)) for _ in range(2)]
+
+        def scatter(one, other):
+            return sum(np.sum((a - a.mean()) * np.conj(b - b.mean())) for a, b in zip(one, other, strict=True)) / 10.0
+
+        found.append(Line(hz, np.array([x.mean() for x in speed]), np.array([x.mean() for x in torque]),
+                          np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
+                          complex(scatter(torque, speed)), 10.0))
+    sd = 0.05 * noise_nm
+    return tuple(found), ViscousTie(plant.impedance(1e-5).real + sd * rng.normal(), 0.0, sd, 10.0)
+
+
+@few
+@given(motor=sizes, load=sizes, k=sizes, c=st.floats(0.0, 1.0), b=st.floats(0.0, 1.0), hz=st.floats(0.01, 3.0))
+def test_impedance_solves_the_equations_of_motion(motor, load, k, c, b, hz):
+    plant = TwoMass(motor, load, k, c, 0.3, b)
+    found = TwoMassShaft().impedance(parameters(plant), np.array([2j * np.pi * hz]))[0]
+    assert found == pytest.approx(plant.impedance(hz), rel=1e-9)
+
+
+def test_slow_motion_turns_both_and_fast_motion_the_motor_alone():
+    plant = replace(TwoMass(), damping=0.0, load_viscous=0.0)
+    slow, fast = TwoMassShaft().impedance(parameters(plant), 2j * np.pi * np.array([1e-3, 50.0])).imag
+    assert slow == pytest.approx(plant.total * 2e-3 * np.pi, rel=1e-4)
+    assert fast == pytest.approx(plant.motor * 100.0 * np.pi, rel=1e-4)
+
+
+def test_resonances_are_the_notes_and_those_of_the_matrix():
+    found = resonances(parameters(TwoMass()))
+    p = TwoMass()
+    free = np.linalg.eigvals(np.array([[p.stiffness, -p.stiffness]] * 2) * [[1 / p.motor], [-1 / p.load]])
+    assert np.array(found) / (2.0 * np.pi) == pytest.approx([0.179, 0.200], abs=5e-4)
+    assert found[1] == pytest.approx(np.sqrt(np.max(free.real)), rel=1e-9)
+    assert stiffness(parameters(p)) == pytest.approx(473.0)
+
+
+@pytest.mark.parametrize("view", (None, TOTAL, STIFFNESS, RESONANCE), ids=("plain", "total", "stiffness", "resonance"))
+@pytest.mark.parametrize("shaft", (TwoMassShaft(), StringShaft()), ids=("lumps", "string"))
+def test_jacobian_is_the_derivative_through_every_view(shaft, view):
+    m = parameters(TwoMass())
+    m = np.append(m, 0.3) if isinstance(shaft, StringShaft) else m
+    plain = shaft.impedance(m, S)
+    if view is not None:
+        shaft, seen = ViewedShaft(shaft, view), m.copy()
+        seen[view.index] = view.of(m)
+        m = seen
+        assert np.allclose(shaft.impedance(m, S), plain, rtol=1e-12)
+    jacobian = shaft.jacobian(m, S)
+    for index in range(len(m)):
+        step = np.zeros(len(m))
+        step[index] = 1e-6 * m[index]
+        slope = (shaft.impedance(m + step, S) - shaft.impedance(m - step, S)) / (2.0 * step[index])
+        assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return run(TwoMass(), [3], noise=MILD, lag_prior=KNOWN)[0]
+
+
+def test_auto_finds_two_masses_and_says_so(recording):
+    found = identify(recording)
+    shaft = found.compliant
+    assert found.model == "two-mass"
+    assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
+    assert found.inertia.value == pytest.approx(1500.0, rel=0.01)
+    assert shaft.load_inertia.value == pytest.approx(374.0, rel=0.1)
+    assert shaft.stiffness_nm_rad.value == pytest.approx(473.0, rel=0.1)
+    assert shaft.total_inertia.value == pytest.approx(1874.0, rel=0.01)
+    # seeded: within twice the interval's reach in any case
+    for one, truth in ((found.inertia, 1500.0), (shaft.total_inertia, 1874.0), (shaft.load_inertia, 374.0)):
+        assert abs(one.value - truth) < one.high - one.low
+    assert "contradict a rigid shaft" in found.reason or "residuals contradict" in found.reason
+    assert any("resonance at 0.2 Hz lies inside the excited band" in warning for warning in found.warnings)
+    half = 0.5 * (found.inertia.high - found.inertia.low)
+    squares = sum(line.half_width_kg_m2**2 for line in found.budget if line.source != "torque scale")
+    assert np.sqrt(squares) == pytest.approx(half, rel=0.05)
+
+
+def test_a_model_that_is_asked_for_is_the_one_that_is_fitted(recording):
+    two = identify(recording, Options(model="two-mass"))
+    assert two.model == "two-mass"
+    assert "the spring weighs nothing" in two.inertia.conditional_on
+    rigid = identify(recording, Options(model="rigid"))
+    assert rigid.verdict is Verdict.MODEL_REJECTED
+    assert rigid.inertia is None
+
+
+def test_the_same_recording_gives_the_same_bits(recording):
+    asked = Options(model="two-mass")
+    assert identify(recording, asked) == identify(recording, asked)
+
+
+def test_intervals_hold_over_seeds():
+    """Of five seeds and four quantities at 95 %, four misses or more would have a chance of 2 %."""
+    plant, misses = TwoMass(), 0
+    truth = {"inertia": plant.motor, "load": plant.load, "stiffness": plant.stiffness, "total": plant.total}
+    for seed in range(5):
+        lines, tie = synthetic(plant, seed, 20.0)
+        found = inertias(fit_compliant(TwoMassShaft(), lines, tie, (), {}), 0.95)
+        for name, value in truth.items():
+            one = found[name]
+            assert one.value == pytest.approx(value, rel=0.15)
+            misses += not one.low <= value <= one.high
+    assert misses < 4
+
+
+def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
+    """Rejected outright, or doubted and then explained by a load that swings."""
+    plant = TwoMass(83.0, 21.0, 21.0 * (2.0 * np.pi * 0.55) ** 2, 2.0, 6.0, 2.0)
+    for seed in range(3):
+        lines, tie = synthetic(plant, seed, 1.0, (0.05, 0.1, 0.15, 0.25, 0.35, 0.5))
+        rigid = fit_rigid(lines, NO_LEVELS, tie, (), {}, 0.95)
+        assert may_swing(rigid)
+
+
+def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line():
+    """At 0.08 Hz the load takes the motor's motion away: two lines have torque and hardly speed, the other nine fit a
+    rigid shaft, with an inertia that is neither the motor's nor the whole's."""
+    total = TwoMass().total
+    plant = TwoMass(motor=0.7 * total, load=0.3 * total, stiffness=0.3 * TwoMass().stiffness)
+    for recording in run(plant, [1, 5], noise=Noise(), lags_s=(0.40, 0.15), settle=4):
+        found = identify(recording)
+        assert found.model == "two-mass", found.reason
+        assert found.inertia.low <= plant.motor <= found.inertia.high
+        assert identify(recording, Options(model="rigid")).residual.p_value < 0.01
+
+
+def test_too_few_lines_are_counted_and_refused():
+    lines, tie = synthetic(TwoMass(), 0, 20.0, LINES[:3])
+    found = choose("two-mass", lines, tie, (), {})
+    assert isinstance(found, Refusal)
+    assert "9 unknowns" in found.reason
+    assert "at least 4 lines" in found.advice
+    assert isinstance(choose("two-mass", *synthetic(TwoMass(), 0, 20.0), (), {}), Chosen)
+
+
+def test_the_command_line_offers_what_identification_takes():
+    assert OFFERED == MODELS

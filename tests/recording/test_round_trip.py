@@ -1,0 +1,136 @@
+"""What goes in comes out, to the last bit, for us and for MCAP's own reader."""
+
+import math
+import random
+import tempfile
+from collections import Counter
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from drivers.drive import Command, Mode
+from tdhil.record.event import Event
+from tdhil.recording.builder import FACTS as FACT_NAMES
+from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.log_reader import read_frames, read_run, read_samples
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.recording import LagPrior, Recording
+from tests.recording.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
+from tests.recording.test_wire import SAMPLES
+
+
+def test_a_run_comes_back_as_it_was(tmp_path):
+    path, builder = tmp_path / "run.mcap", RecordingBuilder()
+    with RunWriter(path, epoch_ns=0, block=True) as writer:
+        logged = fill(writer, builder, 700)
+    assert writer.dropped == 0
+    run = read_run(path)
+    assert (run.complete, run.problems) == (True, ())
+    assert same(run.recording, builder.recording())
+    assert run.stages == run.recording.stages == STAGES
+    assert run.configuration == CONFIGURATION
+    assert repr(run.result) == repr(RESULT)
+    assert run.events == (Event(700 * PERIOD_S, "warning", "bus error-passive", "Traceback …"),)
+    assert list(read_frames(path)) == logged
+    rng = random.Random(1)
+    for cycle, one in enumerate(read_samples(path)):
+        rng.randbytes(8), rng.randbytes(8)
+        assert one == sample(cycle, rng)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(SAMPLES, max_size=20))
+def test_any_samples_to_the_bit(samples):
+    with tempfile.TemporaryDirectory() as folder:
+        path, builder = Path(folder) / "run.mcap", RecordingBuilder()
+        with RunWriter(path, epoch_ns=0, block=True) as writer:
+            for one in samples:
+                writer.sample(one)
+                builder.add(one)
+        run = read_run(path)
+        assert same(run.recording, builder.recording())
+        assert repr(list(read_samples(path))) == repr(samples)
+
+
+def test_every_fact_of_a_recording_is_kept():
+    assert set(FACTS) <= FACT_NAMES
+    builder = RecordingBuilder()
+    builder.learn(**FACTS)
+    recording = builder.recording()
+    assert recording.torque_limit_nm == 400.0
+    assert isinstance(recording.torque_limit_nm, float)
+    assert recording.lag_prior == LagPrior(speed_lag_s=0.4, speed_lag_sd_s=0.01, source="drive")
+    assert {field.name for field in fields(Recording)} == FACT_NAMES | {
+        "time_s", "speed_rad_s", "torque_nm", "fresh", "limited", "excitation", "levels", "ramps", "stages", "complete"}
+
+
+def test_numpy_numbers_do_not_make_the_live_run_differ(tmp_path):
+    builder = RecordingBuilder()
+    builder.learn(torque_offset_nm=np.float64(0.1), gear_ratio=np.int64(3), lag_prior=LagPrior(np.float32(0.25)))
+    with RunWriter(tmp_path / "run.mcap", epoch_ns=0, block=True) as writer:
+        writer.configuration({}, builder.facts)
+    assert same(read_run(tmp_path / "run.mcap").recording, builder.recording())
+
+
+def test_a_fact_that_no_recording_has_is_refused():
+    with pytest.raises(TypeError, match="has no speed_of_light"):
+        RecordingBuilder().learn(speed_of_light=1)
+
+
+def test_collecting_goes_on_after_a_recording_was_taken():
+    builder, rng = RecordingBuilder(), random.Random(3)
+    builder.add(sample(0, rng))
+    first = builder.recording()
+    builder.add(sample(1, rng))
+    assert (len(first.time_s), len(builder.recording().time_s)) == (1, 2)
+
+
+def test_mcap_reads_it_and_the_times_are_right(tmp_path):
+    path, epoch_ns = tmp_path / "run.mcap", 1_700_000_000_123_456_789
+    make_run(path, 500, epoch_ns)
+    counts = Counter()
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().library.startswith("tdhil ")
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            counts[channel.topic] += 1
+            assert schema.name == type(decoded).DESCRIPTOR.full_name
+            assert message.log_time == message.publish_time
+            if channel.topic in ("/sample", "/command", "/can"):
+                assert message.log_time == epoch_ns + round(decoded.time_s * 1e9)
+        statistics = reader.get_summary().statistics
+    assert counts == {"/sample": 500, "/command": 500, "/can": 500, "/stage": 2, "/excitation": 2, "/event": 1,
+                      "/log": 1, "/configuration": 1, "/result": 1}
+    assert statistics.message_count == counts.total()
+    assert statistics.message_start_time == epoch_ns
+    assert statistics.chunk_count >= 500 * PERIOD_S / 0.5
+
+
+def test_a_simulated_run_repeats_in_content(tmp_path):
+    contents = []
+    for name in ("one", "two"):
+        make_run(tmp_path / name, 400)
+        with (tmp_path / name).open("rb") as file:
+            contents.append([
+                (message.channel_id, message.log_time, message.data)
+                for _, _, message in make_reader(file).iter_messages(log_time_order=False)])
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("time_s", [math.nan, math.inf, -5.0, 1e300])
+def test_a_time_that_is_none_is_logged_at_the_one_before(tmp_path, time_s):
+    path, rng = tmp_path / "run.mcap", random.Random(5)
+    with RunWriter(path, epoch_ns=0, block=True) as writer:
+        writer.sample(sample(100, rng))
+        writer.command(time_s, Command(Mode.SPEED, 1.0, 0.0))
+        writer.event(Event(time_s, "warning", "odd \udcff name"))
+    with path.open("rb") as file:
+        times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    assert max(times) == 400_000_000
+    assert read_run(path).events[0].text == "odd ? name"

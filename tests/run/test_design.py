@@ -1,0 +1,146 @@
+"""The excitation that is chosen: within the limits, as wished, never worse than the usual one, and as good as said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation.samples import Samples
+from tdhil.protocol.design.noise import assumed_theta
+from tdhil.recording.recording import LagPrior
+from tdhil.run.design import Knowledge, Noise, assumed_noise, choose, expected_half_width, measured_noise
+from tdhil.run.excitation import ExcitationWish, MachineLimits, PlanRefused, RigGuess, make_plan
+from tdhil.run.guard import Guard
+from tdhil.run.settings import ControlAssumptions
+from tdhil.studies.coverage.bound import density
+from tdhil.study.coverage_fleet import FLEET
+
+FORESIGHT_S = Guard.foresight_s(ControlAssumptions())
+PLANTS = {plant.name: plant for plant in FLEET}
+LIMITS = MachineLimits(0.5, 10.0, 400.0, FORESIGHT_S)
+GUESS = RigGuess(104.0, 8.0, 60.0)
+KNOWN = Knowledge(assumed_noise(400.0, 10.0), LagPrior())
+
+
+def machine(plant):
+    limits = MachineLimits(*plant.window_rad_s, plant.torque_limit_nm, FORESIGHT_S)
+    return limits, RigGuess(plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.coulomb_nm)
+
+
+def true_noise(plant):
+    noise = plant.noise
+    return Noise(2.0 * noise.load_nm**2 * noise.load_time_s, noise.sensor_rad_s**2 * plant.step_s, noise.load_time_s)
+
+
+# -- noise ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["field", "paper", "heavy"])
+def test_the_error_s_density_is_the_one_that_follows_from_the_plant(name):
+    plant = PLANTS[name]
+    stated = LagPrior(plant.speed_report.total_delay_s, 0.0, plant.torque_report.total_delay_s, 0.0)
+    theta = assumed_theta(plant.inertia_kg_m2, plant.viscous_nm_s_rad, stated)
+    hertz = np.array([0.05, 0.1, 0.2, 0.4])
+    assert true_noise(plant).error_density(hertz, theta) == pytest.approx(density(plant, hertz), rel=0.2)
+
+
+def steady_stretch(seed, speed, load_sd, seconds=6.0, step_s=0.004):
+    """A shaft under a PI speed control, pushed about by a wandering load; reports without lag."""
+    rng = np.random.default_rng(seed)
+    inertia, viscous, coulomb = 104.0, 8.0, 60.0
+    keep, load, integral, omega = np.exp(-step_s / 0.5), load_sd * rng.standard_normal(), 0.0, speed
+    rows = []
+    for step in range(round((seconds + 10.0) / step_s)):
+        error = speed - omega
+        integral += 300.0 * error * step_s
+        torque = coulomb + viscous * speed + 300.0 * error + integral
+        load = keep * load + load_sd * np.sqrt(1.0 - keep**2) * rng.standard_normal()
+        omega += step_s / inertia * (torque + load - coulomb - viscous * omega)
+        rows.append((step * step_s, omega, torque))
+    return Samples(*np.array(rows[-round(seconds / step_s) :]).T)
+
+
+def test_the_noise_is_measured_at_steady_speed():
+    fallback = assumed_noise(400.0, 10.0)
+    theta = assumed_theta(104.0, 8.0, LagPrior(0.0, 0.0, 0.0, 0.0))
+    found = [
+        measured_noise((steady_stretch(seed, 3.0, 5.0), steady_stretch(seed + 100, 7.0, 5.0)), theta, fallback)
+        for seed in range(16)
+    ]
+    assert {one.source for one in found} == {"measured"}
+    assert np.mean([one.load_nm2_s for one in found]) == pytest.approx(2.0 * 25.0 * 0.5, rel=0.3)
+    assert measured_noise((), theta, fallback) is fallback
+    silent = Samples(np.arange(1500) * 0.004, np.full(1500, 3.0), np.full(1500, 84.0))
+    assert measured_noise((silent,), theta, fallback).load_nm2_s > 0.0       # nothing is ever without noise
+
+
+# -- the choice ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", ["servo", "heavy"])
+def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
+    plant = PLANTS[name]
+    limits, guess = machine(plant)
+    known = Knowledge(true_noise(plant), LagPrior())
+    usual, chosen = make_plan(limits, guess), choose(limits, guess, ExcitationWish(), known, 0.95)
+    plan = chosen.plan
+    assert plan.duration_s <= 1.02 * usual.duration_s
+    assert chosen.half_width < 0.96 * chosen.usual_half_width
+    assert max(plan.segments[0].reference.lines_hz) <= 0.6 + 1e-9     # 0.24/τ: higher, and unknown filters matter
+    times = np.linspace(0.0, plan.segments[0].reference.period_s, 800)
+    for segment in plan.segments:
+        speed, torque = np.array([segment.reference.reference(t) for t in times]).T
+        swing = (speed - segment.reference.offset_rad_s) / (1.0 - guess.inertia_rel_error)
+        assert segment.reference.offset_rad_s + swing.min() > limits.speed_low_rad_s
+        assert segment.reference.offset_rad_s + swing.max() < limits.speed_high_rad_s
+        assert np.abs(torque).max() <= 0.85 * limits.torque_limit_nm * (1.0 + 1e-6)
+
+
+@pytest.mark.heavy
+def test_it_repeats_and_says_what_the_estimator_would():
+    first, again = (choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95) for _ in range(2))
+    assert first == again
+    assert first.half_width < first.usual_half_width
+    theta = KNOWN.theta(GUESS)
+    assert first.half_width == expected_half_width(first.plan, theta, KNOWN.noise, KNOWN.prior, 0.95)
+    quieter = replace(KNOWN.noise, load_nm2_s=KNOWN.noise.load_nm2_s / 4.0, speed_rad2_s=KNOWN.noise.speed_rad2_s / 4.0)
+    assert expected_half_width(first.plan, theta, quieter, KNOWN.prior, 0.95) < 0.6 * first.half_width
+
+
+@pytest.mark.heavy
+def test_stated_lags_tighten_what_is_expected_and_move_the_lines():
+    stated = Knowledge(KNOWN.noise, LagPrior(0.02, 0.002, 0.01, 0.001, "rig.yaml"))
+    chosen = choose(LIMITS, GUESS, ExcitationWish(), stated, 0.95)
+    assert chosen.half_width < 0.7 * choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95).half_width
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        ExcitationWish(frequency_hz=0.2),
+        ExcitationWish(periods=9),
+        ExcitationWish(kind="step"),
+        ExcitationWish(kind="sine", frequency_hz=0.3),
+    ],
+)
+def test_what_the_user_fixes_rules(wish):
+    assert choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan == make_plan(LIMITS, GUESS, wish)
+
+
+def test_amplitude_and_offset_are_kept_while_the_lines_are_chosen():
+    wish = ExcitationWish(amplitude_rad_s=0.8, offsets_rad_s=(3.0, 6.5))
+    plan = choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan
+    assert [segment.reference.offset_rad_s for segment in plan.segments] == [3.0, 6.5]
+    for segment in plan.segments:
+        speeds = [segment.reference.reference(t)[0] for t in np.linspace(0.0, segment.reference.period_s, 2000)]
+        assert np.abs(np.array(speeds) - segment.reference.offset_rad_s).max() == pytest.approx(0.8, rel=2e-3)
+
+
+def test_the_time_allowed_is_kept():
+    for time_s in (120.0,):
+        plan = choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95, time_s).plan
+        assert 0.8 * time_s < plan.duration_s <= time_s
+        assert all(segment.periods - segment.settle_periods >= 6 for segment in plan.segments)
+    with pytest.raises(PlanRefused, match="time"):
+        choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95, 40.0)

@@ -1,0 +1,88 @@
+"""What the stages keep to by themselves, before the guard would have to: the torque limit, and an end to coasting.
+
+A setpoint that the guard rejects is a mistake of this program, and ends the run; so no stage may make one.
+"""
+
+import pytest
+
+from drivers.drive import Mode
+from tdhil.protocol.control import MeanSpeedControl
+from tdhil.protocol.stage_swing import run_swings
+from tdhil.run.excitation import MachineLimits as Room
+from tdhil.run.excitation import RigGuess, SwingPlan
+from tdhil.run.excitation.pulses import CALM_S, Way
+from tdhil.run.settings import ControlAssumptions
+from tdhil.run.stages.acquire import Follower
+from tdhil.run.stages.hold import run_hold
+from tests.run.fake_drive import LIMITS, FakeDrive
+
+ROOM = Room(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
+
+
+class Seen(Exception):
+    """Enough cycles."""
+
+
+def turning(world, drive=None, speed=5.0, cycles=50):
+    """In torque mode, at a speed; the display ends it after so many cycles more."""
+    here = world(drive or FakeDrive())
+    here.turn(speed, Mode.TORQUE)
+    here.drive.commands.clear()
+    here.display.seen = 0
+
+    def on_cycle(_stage, seen):
+        if seen >= cycles:
+            raise Seen
+
+    here.display.on_cycle = on_cycle
+    return here
+
+
+def torques(here):
+    return [command.torque_nm for command in here.drive.commands]
+
+
+@pytest.mark.parametrize(("start_rad_s", "target_rad_s", "friction_nm", "end_nm"), [
+    (5.0, 8.0, 500.0, 400.0), (0.5, 1.0, 0.0, -400.0),
+])
+def test_hold_keeps_to_the_torque_limit(world, start_rad_s, target_rad_s, friction_nm, end_nm):
+    """A model with too much friction, or a shaft that is much faster than it was taken for."""
+    model = RigGuess(200.0, 0.0, friction_nm)
+    here = turning(world, FakeDrive(inertia=1e4), speed=9.0 if end_nm < 0.0 else start_rad_s)
+    control = MeanSpeedControl(model, 1000.0, ControlAssumptions())
+    with pytest.raises(Seen):
+        run_hold(here.bench, LIMITS, model, control, target_rad_s, start_rad_s, 0.01)
+    asked = torques(here)
+    assert end_nm in asked
+    assert max(map(abs, asked)) == LIMITS.torque_nm
+
+
+@pytest.mark.parametrize("asked_nm", [900.0, -900.0])
+def test_acquire_keeps_to_the_torque_limit(world, asked_nm):
+    here = turning(world, FakeDrive(inertia=1e4), cycles=20)
+    follower = Follower(here.bench, LIMITS, Mode.TORQUE, None)
+    with pytest.raises(Seen):
+        follower.follow(lambda _: (5.0, asked_nm), 10.0)
+    assert set(torques(here)) == {LIMITS.torque_nm if asked_nm > 0.0 else -LIMITS.torque_nm}
+
+
+def test_acquire_keeps_to_it_with_what_the_slow_loop_adds(world):
+    here = turning(world, FakeDrive(inertia=1e4), cycles=20)
+    control = MeanSpeedControl(RigGuess(200.0, 8.0, 60.0), 1000.0, ControlAssumptions())
+    follower = Follower(here.bench, LIMITS, Mode.TORQUE, control)
+    with pytest.raises(Seen):
+        follower.follow(lambda _: (9.0, 300.0), 10.0)
+    assert max(torques(here)) == LIMITS.torque_nm
+
+
+def test_coasting_ends_where_nothing_slows_the_shaft(world):
+    """Friction was taken too high by far: after twice the planned time it is held again."""
+    guess = RigGuess(100.0, 2.0, 20.0)
+    way = Way(6.0, 2.0, 5.0, guess, coasting=True)
+    plan = SwingPlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)
+    drive = FakeDrive(coulomb=0.0, viscous=0.0)
+    longest = 2.0 * CALM_S + 2.0 * way.duration_s
+    here = turning(world, drive, speed=6.0, cycles=round((longest + 2.0) / drive.period_s))
+    run_swings(here.bench, LIMITS, plan, None, ControlAssumptions(), lambda _: None)
+    coasted = sum(command.torque_nm == 0.0 for command in here.drive.commands)
+    assert coasted * drive.period_s == pytest.approx(2.0 * way.duration_s, abs=0.1)

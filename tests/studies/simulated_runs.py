@@ -1,0 +1,10 @@
+"""The simulated studies by name, run with their defaults but for what a test names."""
+
+from tdhil.studies.registry import simulated_studies
+
+STUDIES = {study.name: study for study in simulated_studies()}
+
+
+def run(name, **settings):
+    study = STUDIES[name]
+    return study.run(study.settings_model(**settings), lambda share, what: None)
