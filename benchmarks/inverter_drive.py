@@ -12,9 +12,8 @@ import numpy as np
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState, Preflight, Sample
-from sim_bus.inverter import Inverter
+from sim_bus.inverter import RPM, Inverter
 from sim_bus.params import RigParams
-from sim_bus.reporting import RPM
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
 

@@ -186,7 +186,7 @@ def _check_shaft(found: Outcome, shaft: Shaft) -> None:
 
 
 def _check_log(found: Outcome, log: Path | None, shaft: Shaft, killed_ns: int) -> None:
-    from tdhil.record.errors import NothingRecoverable
+    from tdhil.errors import NothingRecoverable
     from tdhil.recording.log_reader import read_run
 
     assert log is not None

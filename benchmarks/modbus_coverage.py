@@ -21,14 +21,13 @@ from statistics import fmean, median, stdev
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Preflight, Sample
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
-from sim_bus.modbus.embedded import EmbeddedModbusDrive
-from sim_bus.modbus.timing import LineTiming
+from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
 from sim_bus.params import RigParams
 from tdhil.estimation import identify
-from tdhil.identify.options import Options
+from tdhil.estimation.result import Options
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Recording, Stage
 from tdhil.recording.run_log import RunLog

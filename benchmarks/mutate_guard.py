@@ -4,7 +4,7 @@
     python benchmarks/mutate_guard.py --branches      # which branches of them the same tests leave out; 1 if any
     python benchmarks/mutate_guard.py guard --jobs 2
     python benchmarks/mutate_guard.py --named         # single lines changed by hand that no test noticed once
-    python benchmarks/mutate_guard.py ticks --limit 20 --skip 40
+    python benchmarks/mutate_guard.py clock --limit 20 --skip 40
 
 Guard and stop, the protocol's stages, the drivers' time, limits, watchdogs and bare stops, the log's writer, and the
 end of `tdhil identify`. Works on copies in memory: a child process per mutant is forked off this one, loads the changed
@@ -36,7 +36,10 @@ OURS = ("drivers", "profiles", "sim_bus", "tdhil")
 
 @dataclass(frozen=True)
 class Subject:
-    """A module below the root, the tests (below ``tests/``) that guard it, and the functions meant (none: all)."""
+    """A module below the root, the tests (below ``tests/``) that guard it, and what of it is meant (none: all).
+
+    ``within``: names that stand at the module's top: functions, classes, constants.
+    """
 
     path: str
     tests: tuple[str, ...]
@@ -47,76 +50,110 @@ class Subject:
         return self.path.removesuffix(".py").replace("/", ".")
 
 
-def _protocol(name: str, *tests: str) -> Subject:
-    return Subject(f"tdhil/protocol/{name}.py", tuple(f"protocol/{test}" for test in tests))
+def _run(name: str, *tests: str, within: str = "") -> Subject:
+    return Subject(f"tdhil/run/{name}.py", tuple(f"run/{test}" for test in tests), frozenset(within.split()))
 
 
-def _driver(name: str, *tests: str) -> Subject:
-    return Subject(f"drivers/{name}.py", tuple(f"drivers/{test}" for test in tests))
+def _driver(name: str, *tests: str, within: str = "") -> Subject:
+    return Subject(f"drivers/{name}.py", tuple(f"drivers/{test}" for test in tests), frozenset(within.split()))
 
 
 _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_looks.py",
 )
-_RUNS = ("test_bench.py", "test_runner.py", "test_run_goes_wrong.py")
+_RUNS = ("test_control_loop.py", "test_runner.py", "test_run_goes_wrong.py")
 SUBJECTS = {
-    "guard": _protocol("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py"),
-    "stop": _protocol("stop", *_STOP),
-    "let_go": _protocol("let_go", *_STOP),
-    "stop_patience": _protocol("stop_patience", *_STOP),
-    "stop_looks": _protocol("stop_looks", "test_stop_looks.py"),
-    "string_rules": _protocol("string_rules", "test_stop_string.py"),
-    "bench": _protocol("bench", "test_bench.py", "test_deaf.py", "test_run_goes_wrong.py"),
-    "steady": _protocol("steady", "test_steady.py"),
-    "stage_setup": _protocol("stage_setup", *_RUNS, "test_run_refused.py"),
-    "stage_speed": _protocol("stage_speed", *_RUNS),
-    "stage_torque": _protocol("stage_torque", *_RUNS, "test_braking_probe.py"),
-    "stage_hold": _protocol("stage_hold", "test_kept_within.py", *_RUNS, "test_control.py"),
-    "stage_acquire": _protocol("stage_acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_enough.py"),
-    "stage_swing": _protocol("stage_swing", "test_kept_within.py", "test_swing.py"),
-    "cia402/drive": _driver("cia402/drive", "test_late_host.py", "test_drive_faults.py"),
-    "ticks": _driver("ticks", "test_late_host.py", "test_drive_faults.py"),
-    "cia402/limits": _driver("cia402/limits", "test_preflight.py", "test_profile_preflight.py"),
-    "cia402/sign_of_life": _driver(
-        "cia402/sign_of_life", "test_preflight.py", "test_guarding.py", "test_strangers.py", "test_watch.py"
+    "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py"),
+    "stop": _run("stop", *_STOP),
+    "string_release": _run("string_release", *_STOP),
+    "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
+    "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
+    "steady": _run("stages/steady", "test_steady.py"),
+    "setup": _run("stages/setup", *_RUNS, "test_run_refused.py"),
+    "speed": _run("stages/speed", *_RUNS),
+    "torque": _run("stages/torque", *_RUNS, "test_brake_test.py"),
+    "hold": _run(
+        "stages/hold", "test_kept_within.py", *_RUNS, "test_control.py",
+        within="WINDOW_SHARE SETTLED_S MEAN_S TIMEOUT_S HoldResult run_hold",
     ),
-    "cia402/arming": _driver("cia402/arming", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py"),
-    "cia402/bare_stop": _driver("cia402/bare_stop", "test_bare_stop.py"),
+    "acquire": _run(
+        "stages/acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_adaptive_duration.py",
+        within="AcquireResult Follower run_acquire _beside _Course",
+    ),
+    "acquire pulses": _run(
+        "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"
+    ),
+    "canopen/drive": _driver("canopen/drive", "test_late_host.py", "test_drive_faults.py"),
+    "clock": _driver(
+        "clock", "test_late_host.py", "test_drive_faults.py",
+        within="RECENT LATE_SHARE RATES_HZ STALL_S STALL_CYCLES how_late quantile Ticks",
+    ),
+    "canopen/limits": _driver(
+        "canopen/limits", "test_preflight.py", "test_profile_preflight.py",
+        within="_LIMIT _TITLES set_limits note_temperature _set _count _rounded _limit _same",
+    ),
+    "canopen/supervision": _driver(
+        "canopen/supervision", "test_preflight.py", "test_guarding.py", "test_other_master.py", "test_supervision.py",
+        within="HEARTBEAT_S ANSWER_S SignOfLife _guarded",
+    ),
+    "canopen/watchdog": _driver(
+        "canopen/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py"
+    ),
+    "canopen/quick_stop": _driver(
+        "canopen/quick_stop", "test_quick_stop.py",
+        within="HALT BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S NEAR_ZERO_RAD_S NEAR_ZERO_LSB MODE_S MODE_PAUSE_S "
+        "_RPDOS _CONTROLWORD _COAST _BRAKE_AND_HOLD Cia402Target",
+    ),
     "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
-    "modbus/echoes": _driver("modbus/echoes", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
-    "modbus/arming": _driver("modbus/arming", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
-    "modbus/limits": _driver("modbus/limits", "test_modbus_preflight.py", "test_modbus_wrongs.py"),
-    "modbus/bare_stop": _driver("modbus/bare_stop", "test_modbus_bare_stop.py"),
-    "writer": Subject("tdhil/recording/log_writer.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
-    "pump": Subject("tdhil/record/pump.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
-    "backlog": Subject("tdhil/record/backlog.py", ("recording/test_writer.py",)),
-    "container": Subject("tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")),
+    "modbus/preflight": _driver(
+        "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py",
+        within="SHARES LOOKS ECHO_LOOK_S clear_setpoints check_setpoints _check_one",
+    ),
+    "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
+    "modbus/parameters": _driver(
+        "modbus/parameters", "test_modbus_preflight.py", "test_modbus_wrongs.py",
+        within="_SLACK Setting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting _unit",
+    ),
+    "modbus/quick_stop": _driver("modbus/quick_stop", "test_modbus_quick_stop.py"),
+    "log_writer": Subject(
+        "tdhil/recording/log_writer.py", ("recording/test_writer.py", "recording/test_round_trip.py"),
+        frozenset({
+            "STEPPED_QUEUE", "REAL_TIME_QUEUE", "ALIVE_EVERY_S", "_FULL", "RunWriter",
+            "POLL_S", "CHUNK_WALL_S", "CHUNK_LOG_NS", "CHUNK_BYTES", "FRAMES", "Pump",
+            "NUDGE", "WAKE_S", "LAG_S", "SPARE", "Backlog",
+        }),
+    ),
+    "mcap_container": Subject(
+        "tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")
+    ),
     "identify": Subject(
         "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
     ),
-    "stop_signals": Subject("tdhil/commands/stop_signals.py", ("cli/test_identify_end.py",)),
+    "stop_on_signals": Subject(
+        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_NAMES", "stop_on_signals"})
+    ),
 }
 NAMED: tuple[tuple[str, str, str], ...] = (
-    ("cia402/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
-    ("cia402/limits", 'limits.torque_nm, lsb, 16, "N·m", math.floor', 'limits.torque_nm, lsb, 16, "N·m", math.ceil'),
-    ("cia402/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
+    ("canopen/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
+    ("canopen/limits", 'limits.torque_nm, lsb, 16, "N·m", math.floor', 'limits.torque_nm, lsb, 16, "N·m", math.ceil'),
+    ("canopen/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
      "return _rounded(one, limits.torque_nm * nm, per_lsb, math.ceil)"),
-    ("cia402/sign_of_life", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
+    ("canopen/supervision", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
-    ("modbus/arming", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
-    ("modbus/echoes", "            access.write(register, 0)\n", "            pass\n"),
-    ("stage_hold", "max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))", "ahead_nm + correction"),
-    ("stage_acquire", "max(-limits.torque_nm, min(limits.torque_nm, torque_nm))", "torque_nm"),
-    ("stage_swing", "while follower.time_s < end_s:", "while True:"),
+    ("modbus/watchdog", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
+    ("modbus/preflight", "            access.write(register, 0)\n", "            pass\n"),
+    ("hold", "max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))", "ahead_nm + correction"),
+    ("acquire", "max(-limits.torque_nm, min(limits.torque_nm, torque_nm))", "torque_nm"),
+    ("acquire pulses", "while follower.time_s < end_s:", "while True:"),
     ("identify", "code = code or int(exit_code(error))", "pass"),
     ("identify", "        code = ExitCode.STOP_NOT_CONFIRMED\n", "        pass\n"),
     ("guard", "elif sample.fresh and not self._mode.see(command.mode, sample):", "elif False:"),
     ("guard", "elif sample.fresh and not following.see(command.speed_rad_s, sample):", "elif False:"),
     ("stop", "if not (self._fed and self._watched and", "if not (self._fed and"),
-    ("string_rules", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
-    ("container", "if found.st_size < self._offset:", "if False:"),
-    ("stop_signals", '"SIGQUIT", ', ""),
+    ("preconditions", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
+    ("mcap_container", "if found.st_size < self._offset:", "if False:"),
+    ("stop_on_signals", '"SIGQUIT", ', ""),
 )
 """(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
 
@@ -128,8 +165,8 @@ EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
     "stop.py, _see_rest: return None (last)": _FALLS_THROUGH,
     "stop.py, _gets_slower: return False (last)": _FALLS_THROUGH,
-    "stop_looks.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
-    "let_go.py, _yielding: assert self._reference_nm is not None": "says to mypy what the only caller has just set",
+    "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
+    "string_release.py, _yielding: assert self._reference_nm is not None": "says to mypy what its caller has just set",
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
 
@@ -176,6 +213,14 @@ def deletable(tree: ast.Module) -> list[tuple[list[ast.stmt], int]]:
     return found
 
 
+def at_the_top(tree: ast.Module, statement: ast.stmt) -> set[str]:
+    """Names that the statement, or the definition around it, binds at the module's top."""
+    outer = next(top for top in tree.body if any(node is statement for node in ast.walk(top)))
+    if isinstance(outer, (ast.FunctionDef, ast.ClassDef)):
+        return {outer.name}
+    return {node.id for node in ast.walk(outer) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+
+
 def mutants(subject: str):
     """(line, what and where in words, tree without that statement), one by one."""
     text = path_of(subject).read_text("utf-8")
@@ -185,7 +230,7 @@ def mutants(subject: str):
         gone = block[place]
         within = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and gone in ast.walk(node)]
         name = within[-1].name if within else "module"
-        if SUBJECTS[subject].within and not {node.name for node in within} & SUBJECTS[subject].within:
+        if SUBJECTS[subject].within and not at_the_top(tree, gone) & SUBJECTS[subject].within:
             continue
         last = " (last)" if within and within[-1].body[-1] is gone else ""
         block[place] = ast.copy_location(ast.Pass(), gone)
@@ -363,8 +408,9 @@ def named(subjects: list[str]) -> list[str]:
 def branches(subject: str) -> list[str]:
     """The ways that no test takes."""
     tree = ast.parse(path_of(subject).read_text("utf-8"))
-    counted = Counted()
-    tree = ast.fix_missing_locations(counted.visit(tree))
+    counted, meant = Counted(), SUBJECTS[subject].within
+    tree.body = [counted.visit(node) if not meant or at_the_top(tree, node) & meant else node for node in tree.body]
+    tree = ast.fix_missing_locations(tree)
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "went.json"
         _, status = os.waitpid(fork(subject, Changed(SUBJECTS[subject].module, tree, path_of(subject)), report), 0)

@@ -20,9 +20,8 @@ from pathlib import Path
 import can
 
 from drivers.canopen.drive import Cia402Drive
-from drivers.clock import MonotonicClock
+from drivers.clock import MonotonicClock, quantile
 from drivers.drive import Command, Limits, Mode
-from drivers.ticks import quantile
 from profiles.library import load_canopen_profile
 from tdhil.cli.real_time import real_time_priority
 from tdhil.recording.log_writer import RunWriter

@@ -21,8 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tdhil.estimation.identify import identify
-from tdhil.estimation.result import Identification
-from tdhil.identify.options import Options
+from tdhil.estimation.result import Identification, Options
 from tdhil.recording.recording import LagPrior, Recording
 from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
 

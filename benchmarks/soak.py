@@ -97,7 +97,7 @@ class Course:
 
 
 def canopen_fault(rng: Random) -> str:
-    from sim_bus.fault_catalogue import KINDS
+    from sim_bus.canopen.faults import KINDS
 
     name = rng.choice(sorted(KINDS))
     moment = f"@{rng.choice(STAGES)}+{rng.uniform(0.0, 8.0):.2f}s"

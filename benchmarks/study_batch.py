@@ -11,9 +11,8 @@ import argparse
 import sys
 import time
 
-from tdhil.studies.paper.loop import simulate
+from tdhil.studies.paper.loop import LoopSettings, simulate
 from tdhil.studies.registry import simulated_studies
-from tdhil.study.settings import LoopSettings
 
 RUNS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 NOISE = 1.15      # of the clock, not of the claim

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 
 from tdhil.estimation import Identification, Options, identify
-from tdhil.identify.options import Model
+from tdhil.estimation.result import Model
 from tdhil.recording.recording import LagPrior, Recording
 from tests.estimation.compliant_bench import Noise, Pipe, TwoMass, run
 

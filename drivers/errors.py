@@ -13,7 +13,7 @@
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
     └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
 
-Those of one bus only are leaves of these (`drivers.modbus.errors`). `tdhil.errors` says which of them ends with which
+Those of one bus only are leaves of these (`drivers.modbus.pdu`). `tdhil.errors` says which of them ends with which
 exit code.
 """
 

@@ -15,7 +15,7 @@ from collections.abc import Collection
 from drivers.drive import Check, Outcome
 from drivers.preflight import Table
 
-FLAG = "--accept-wider-limit"
+WIDER_FLAG = "--accept-wider-limit"
 TORQUE, SPEED, QUICK_STOP = "torque", "speed", "quick-stop"
 NAMES = (TORQUE, SPEED, QUICK_STOP)
 _SLACK = 1e-6
@@ -40,7 +40,7 @@ class OwnLimits:
         self.kept[limit] = min(abs(found_si), self.kept.get(limit, abs(found_si)))
         effect = "it brakes harder" if limit == QUICK_STOP else "the run keeps within it"
         text = f"{found}, kept: tighter than rig.yaml's, {effect}"
-        table.checks.append(Check(title, wanted, text, Outcome.NOTE, where, f"{FLAG} {limit} sets rig.yaml's"))
+        table.checks.append(Check(title, wanted, text, Outcome.NOTE, where, f"{WIDER_FLAG} {limit} sets rig.yaml's"))
 
     def written(
         self, table: Table, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,
@@ -49,7 +49,7 @@ class OwnLimits:
         """The row of one that was written, with what stood there before; whether it reads back as wanted."""
         changed = "" if before == now else f" (was {before})"
         if wider and good:
-            text = f"{now} (was {before}: wider, accepted by {FLAG} {limit})"
+            text = f"{now} (was {before}: wider, accepted by {WIDER_FLAG} {limit})"
             table.checks.append(Check(title, wanted, text, Outcome.NOTE, where))
             return True
         return table.row(title, wanted, now + changed, good, where, mend)

@@ -12,9 +12,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import Confidence, Entry, Positive, ProfileName
+from profiles.entry import Confidence, Entry, Positive, ProfileName, Require
 from profiles.model import DataModel, Finding, refuse_if
-from profiles.requirement import Require
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 Word = Annotated[int, Field(ge=0, le=0xFFFF)]

@@ -4,6 +4,8 @@ Built on PyYAML's event stream and on nothing above it: its constructors follow 
 overwrite earlier ones, and resolve tags and aliases, none of which a data file here needs.
 """
 
+import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,10 +25,122 @@ from yaml.events import (
 )
 
 from profiles.errors import Problem
-from profiles.yaml_scalars import plain
-from profiles.yaml_syntax import syntax_error
 
-Path = tuple[str | int, ...]
+# ---------------------------------------------------------------------------------------------------------------------
+# What a bare word in a YAML file means: the core rules of YAML 1.2, with 1.1's surprises defused.
+#
+# =================================  ==========================================================
+# written                            read as
+# =================================  ==========================================================
+# ``12`` ``+12`` ``0x1F`` ``0o17``   whole number
+# ``1.5`` ``.5`` ``5.`` ``1e3``      number (YAML 1.1 takes ``1e3`` for text)
+# ``true`` ``false``                 truth value (also True, TRUE …)
+# ``null`` ``~``, nothing            empty
+# ``010`` ``-08``                    refused: 8 in YAML 1.1, 10 in YAML 1.2
+# ``.nan`` ``.inf`` ``1e999``        refused: no quantity in these files is one
+# ``on`` ``off`` ``yes`` ``no``      text (a truth value in YAML 1.1)
+# ``1_000`` ``12:30`` ``0b11``       text (numbers in YAML 1.1; ``12:30`` is 750 there)
+# ``2024-05-01``                     text (a date in YAML 1.1)
+# anything in quotes                 text
+# =================================  ==========================================================
+#
+# Text where a number or a truth value is wanted is refused later; `hint` then says what was meant.
+
+
+Scalar = None | bool | int | float | str
+
+MAX_NUMBER_LENGTH = 40
+"""Characters; longer ones are typing errors, and Python's conversion of them is quadratic."""
+
+_NULL = frozenset({"", "~", "null", "Null", "NULL"})
+_BOOL = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_INT = re.compile(r"[-+]?[0-9]+")
+_LEADING_ZERO = re.compile(r"([-+]?)0+([0-9]+)")
+_OCTAL = re.compile(r"0o[0-7]+")
+_HEX = re.compile(r"0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_NOT_FINITE = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_TRUTH_WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
+
+
+def plain(text: str) -> Scalar:
+    """The value of an unquoted scalar; ValueError, in words for the user, where it is refused."""
+    if text in _NULL:
+        return None
+    if text in _BOOL:
+        return _BOOL[text]
+    if _NOT_FINITE.fullmatch(text):
+        raise ValueError(f"{text} is no usable value; write a finite number, or leave the key out")
+    return _number(text)
+
+
+def _number(text: str) -> Scalar:
+    if not any(pattern.fullmatch(text) for pattern in (_INT, _OCTAL, _HEX, _FLOAT)):
+        return text
+    if len(text) > MAX_NUMBER_LENGTH:
+        raise ValueError(f"a number of {len(text)} characters; at most {MAX_NUMBER_LENGTH} are read")
+    if zeros := _LEADING_ZERO.fullmatch(text):
+        raise ValueError(_leading_zero(text, zeros[1], zeros[2]))
+    if _INT.fullmatch(text):
+        return int(text)
+    if _OCTAL.fullmatch(text) or _HEX.fullmatch(text):
+        return int(text, 0)
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is too large for a number")
+    return value
+
+
+def _leading_zero(text: str, sign: str, digits: str) -> str:
+    decimal = f"write {sign}{digits}"
+    octal = f" or 0o{digits}" if not sign and not set(digits) & set("89") else ""
+    return f"{text} is ambiguous (octal in YAML 1.1, decimal in YAML 1.2); {decimal}{octal}, or put text in quotes"
+
+
+def hint(text: str) -> str:
+    """What the writer of ``text`` may have meant where a number or a truth value is wanted; '' if unknown."""
+    if text.lower() in _TRUTH_WORDS:
+        return f"write {_TRUTH_WORDS[text.lower()]}"
+    if re.fullmatch(r"[-+]?[0-9][0-9_]*_[0-9_]*(\.[0-9_]*)?", text):
+        return f"write {text.replace('_', '')}"
+    if re.fullmatch(r"[-+]?[0-9]+(:[0-9]+)+(\.[0-9]*)?", text):
+        return "write the value in the unit that the key names, without ':'"
+    if re.fullmatch(r"[-+]?[0-9]+(,[0-9]+)+(\.[0-9]*)?", text):
+        return "write it with a decimal point and without a comma"
+    if len(text) <= MAX_NUMBER_LENGTH and _FLOAT.fullmatch(text):
+        return f"write {text} without quotes"
+    return ""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# PyYAML's syntax errors in the words of somebody who edits the file.
+
+
+_WORDS = (
+    (r"'\t' that cannot start", "a tab; indent and separate with spaces"),
+    ("mapping values are not allowed", "a ':' where no key can stand; mend the indentation, or put the text in quotes"),
+    ("could not find expected ':'", "a key without ':', or a text that runs over the line without quotes"),
+    ("expected <block end>", "the indentation does not fit the lines above"),
+    ("unexpected end of stream", "a quote or bracket is opened and never closed"),
+    ("expected ',' or", "a bracket is not closed, or a ',' is missing"),
+    ("that cannot start any token", "a text can't begin with this character; put it in quotes"),
+)
+
+
+def syntax_error(error: yaml.MarkedYAMLError) -> tuple[int, str]:
+    """Line (from 1; 0 if unknown) and plain words."""
+    mark = error.problem_mark or error.context_mark
+    line = int(mark.line) + 1 if mark is not None else 0
+    problem = error.problem or error.context or "can't be parsed"
+    for part, words in _WORDS:
+        if part in problem:
+            return line, words
+    return line, f"not YAML: {problem}" + (f" ({error.context})" if error.context and error.problem else "")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+KeyPath = tuple[str | int, ...]
 
 MAX_DEPTH = 24
 MAX_NODES = 20_000
@@ -52,13 +166,13 @@ class Tree:
 
     file: str
     data: Any = None
-    lines: dict[Path, int] = field(default_factory=dict)
-    value_lines: dict[Path, int] = field(default_factory=dict)
-    refused: set[Path] = field(default_factory=set)
-    written: dict[Path, str] = field(default_factory=dict)
+    lines: dict[KeyPath, int] = field(default_factory=dict)
+    value_lines: dict[KeyPath, int] = field(default_factory=dict)
+    refused: set[KeyPath] = field(default_factory=set)
+    written: dict[KeyPath, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
-    def line(self, path: Path) -> int:
+    def line(self, path: KeyPath) -> int:
         """The line of ``path``, or of the nearest thing above it that stands in the file; 1 at the top."""
         while path and path not in self.lines:
             path = path[:-1]
@@ -83,7 +197,7 @@ class _Builder:
         if not isinstance(event, StreamEndEvent):
             self._problem(event, "a second document (---); one file holds one")
 
-    def node(self, event: Event, path: Path) -> Any:
+    def node(self, event: Event, path: KeyPath) -> Any:
         self._nodes += 1
         if self._nodes > MAX_NODES:
             raise Broken(_line(event), f"more than {MAX_NODES} entries; this is no file of this program")
@@ -109,7 +223,7 @@ class _Builder:
             return None
         return value
 
-    def _mapping(self, path: Path) -> dict[str, Any]:
+    def _mapping(self, path: KeyPath) -> dict[str, Any]:
         result: dict[str, Any] = {}
         while not isinstance(event := next(self._events), MappingEndEvent):
             key = self._key(event, path)
@@ -126,7 +240,7 @@ class _Builder:
             result[key] = self.node(next(self._events), here)
         return result
 
-    def _key(self, event: Event, path: Path) -> str | None:
+    def _key(self, event: Event, path: KeyPath) -> str | None:
         """The key's text; None, with a problem noted, for what can't be one."""
         if not isinstance(event, ScalarEvent):
             self.node(event, (*path, ""))
@@ -145,13 +259,13 @@ class _Builder:
         self._tree.refused.discard((*path, ""))
         return None
 
-    def _sequence(self, path: Path) -> list[Any]:
+    def _sequence(self, path: KeyPath) -> list[Any]:
         result: list[Any] = []
         while not isinstance(event := next(self._events), SequenceEndEvent):
             result.append(self.node(event, (*path, len(result))))
         return result
 
-    def _scalar(self, event: Event, path: Path) -> Any:
+    def _scalar(self, event: Event, path: KeyPath) -> Any:
         assert isinstance(event, ScalarEvent)
         if any("\ud800" <= sign <= "\udfff" for sign in event.value):
             return self._refuse(event, path, "half a surrogate pair is no character")
@@ -162,7 +276,7 @@ class _Builder:
         except ValueError as error:
             return self._refuse(event, path, str(error))
 
-    def _refuse(self, event: Event, path: Path, message: str) -> None:
+    def _refuse(self, event: Event, path: KeyPath, message: str) -> None:
         self._tree.refused.add(path)
         self._problem(event, message)
 

@@ -9,15 +9,121 @@ that the drive began by itself (6007h) is not undone by an enable-operation word
 command has to be seen first.
 """
 
+
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import Enum, IntEnum
 from math import inf
 
-from sim_bus import cia402_states as sm
-from sim_bus.cia402_states import Command, State
 from sim_bus.inverter import Inverter
 
+# ---------------------------------------------------------------------------------------------------------------------
+# CiA 402-2 power drive system state machine, drive side: states, commands, transitions. Pure.
+#
+# Controlword 6040h (CiA 402-2, "command coding"); x = doesn't matter::
+#
+#     bit            7  3  2  1  0
+#     shutdown       ·  x  1  1  0     transitions 2, 6, 8
+#     switch on      ·  0  1  1  1     3; in operation enabled: disable operation, 5
+#     enable op.     ·  1  1  1  1     4, 16; from ready to switch on 3 and 4 at once
+#     quick stop     ·  x  0  1  x     7, 10, 11
+#     disable volt.  ·  x  x  0  x     7, 9, 10, 12
+#     fault reset    ↑                 15, rising edge only
+#
+# Statusword 6041h, low byte: 0 ready to switch on · 1 switched on · 2 operation enabled · 3 fault · 4 voltage enabled
+# · 5 quick stop (0 = active) · 6 switch on disabled · 7 warning.
+
+
+FAULT_RESET = 0x0080
+HALT = 0x0100
+RELEASED = 0x0070          # velocity mode: ramp enabled (4), not locked (5), reference used (6)
+
+VOLTAGE_ENABLED = 0x0010
+WARNING = 0x0080
+REMOTE = 0x0200
+TARGET_REACHED = 0x0400
+INTERNAL_LIMIT = 0x0800
+MODE_SPECIFIC = 0x1000
+
+
+class State(Enum):
+    """The states by name; `STATUS` has their statusword bits."""
+
+    NOT_READY = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    ENABLED = "operation enabled"
+    QUICK_STOP = "quick stop active"
+    FAULT_REACTION = "fault reaction active"
+    FAULT = "fault"
+
+
+class Command(Enum):
+    """What a controlword's bits 0 to 3 ask for."""
+
+    SHUTDOWN = "shutdown"
+    SWITCH_ON = "switch on"
+    ENABLE = "enable operation"
+    QUICK_STOP = "quick stop"
+    DISABLE_VOLTAGE = "disable voltage"
+
+
+STATUS: dict[State, int] = {
+    State.NOT_READY: 0x00,
+    State.SWITCH_ON_DISABLED: 0x40,
+    State.READY: 0x21,
+    State.SWITCHED_ON: 0x23,
+    State.ENABLED: 0x27,
+    State.QUICK_STOP: 0x07,
+    State.FAULT_REACTION: 0x0F,
+    State.FAULT: 0x08,
+}
+
+TRANSITIONS: dict[tuple[State, Command], State] = {
+    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY,                      # 2
+    (State.READY, Command.SWITCH_ON): State.SWITCHED_ON,                            # 3
+    (State.READY, Command.ENABLE): State.SWITCHED_ON,                               # 3, then 4
+    (State.READY, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,                    # 7
+    (State.READY, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,               # 7
+    (State.SWITCHED_ON, Command.ENABLE): State.ENABLED,                             # 4
+    (State.SWITCHED_ON, Command.SHUTDOWN): State.READY,                             # 6
+    (State.SWITCHED_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,              # 10
+    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,         # 10
+    (State.ENABLED, Command.SWITCH_ON): State.SWITCHED_ON,                          # 5
+    (State.ENABLED, Command.SHUTDOWN): State.READY,                                 # 8
+    (State.ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,             # 9
+    (State.ENABLED, Command.QUICK_STOP): State.QUICK_STOP,                          # 11
+    (State.QUICK_STOP, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,          # 12
+    (State.QUICK_STOP, Command.ENABLE): State.ENABLED,                              # 16, see `next_state`
+}
+"""Transitions on command. Those without one: 0 and 1 (start), 12 (quick stop done), 13 and 14 (fault), 15 (reset)."""
+
+
+def decode(controlword: int) -> Command:
+    """The command in bits 0 to 3; every word is one."""
+    if not controlword & 0b0010:
+        return Command.DISABLE_VOLTAGE
+    if not controlword & 0b0100:
+        return Command.QUICK_STOP
+    if not controlword & 0b0001:
+        return Command.SHUTDOWN
+    return Command.ENABLE if controlword & 0b1000 else Command.SWITCH_ON
+
+
+def next_state(state: State, command: Command, quick_stop_option: int) -> State:
+    """Where ``command`` leads; ``state`` itself where it is not allowed. 16 needs an option code 605Ah of 5 to 8."""
+    if state is State.QUICK_STOP and command is Command.ENABLE and quick_stop_option < 5:
+        return state
+    return TRANSITIONS.get((state, command), state)
+
+
+def fault_reset_edge(before: int, now: int) -> bool:
+    """Bit 7 has risen."""
+    return bool(now & ~before & FAULT_RESET)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Mode(IntEnum):
     """Modes of operation, 6060h."""
@@ -85,10 +191,10 @@ class Application:
         if self.deaf or self._weighed == (word, self.state):
             return
         before, self.controlword = self.controlword, word
-        if self.state is State.FAULT and sm.fault_reset_edge(before, word):
+        if self.state is State.FAULT and fault_reset_edge(before, word):
             self._enter(State.SWITCH_ON_DISABLED)
             self.on_fault_reset()
-        command = sm.decode(word)
+        command = decode(word)
         if self._own_stop and command is not Command.ENABLE:
             self._own_stop = False
         coasts = self.mode in {Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
@@ -161,7 +267,7 @@ class Application:
     @property
     def halted(self) -> bool:
         """Halt is asked for in operation enabled."""
-        return self.state is State.ENABLED and bool(self.controlword & sm.HALT)
+        return self.state is State.ENABLED and bool(self.controlword & HALT)
 
     @property
     def stopping(self) -> bool:
@@ -170,12 +276,12 @@ class Application:
 
     def statusword(self) -> int:
         """6041h."""
-        word = sm.STATUS[self.state] | sm.VOLTAGE_ENABLED | sm.REMOTE
+        word = STATUS[self.state] | VOLTAGE_ENABLED | REMOTE
         if self.warning:
-            word |= sm.WARNING
+            word |= WARNING
         control = self.inverter.control
         if control.limited:
-            word |= sm.INTERNAL_LIMIT
+            word |= INTERNAL_LIMIT
         stopping = self.stopping
         if stopping:
             reached = self.standstill
@@ -186,13 +292,13 @@ class Application:
         else:
             reached = self.mode is Mode.PROFILE_TORQUE and control.ramp_done
         if reached:
-            word |= sm.TARGET_REACHED
+            word |= TARGET_REACHED
         if self.mode is Mode.PROFILE_VELOCITY:
             specific = self.standstill                                        # speed is zero
         else:
             cyclic = self.mode in {Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE}
             specific = cyclic and self.state is State.ENABLED and not stopping  # follows the setpoint
-        return word | sm.MODE_SPECIFIC if specific else word
+        return word | MODE_SPECIFIC if specific else word
 
     # -- time --------------------------------------------------------------------------------------------
 
@@ -215,10 +321,10 @@ class Application:
             control.stop(self._ramp(self._stop_option))
         elif self.state is not State.ENABLED:
             control.off()
-        elif self.controlword & sm.HALT:
+        elif self.controlword & HALT:
             control.stop(self._ramp(settings.halt_option))
         elif self.mode is Mode.VELOCITY:
-            released = self.controlword & sm.RELEASED == sm.RELEASED
+            released = self.controlword & RELEASED == RELEASED
             target = self.target_speed_rad_s if released else 0.0
             control.speed(target, settings.accel_rad_s2, settings.decel_rad_s2)
         elif self.mode is Mode.CYCLIC_TORQUE:
@@ -236,7 +342,7 @@ class Application:
         """Carries out one transition on command; True where the state changed, so that the next may follow."""
         if self._own_stop and command is Command.ENABLE:
             return False
-        target = sm.next_state(self.state, command, self.settings.quick_stop_option)
+        target = next_state(self.state, command, self.settings.quick_stop_option)
         if target is self.state:
             if command is Command.ENABLE and self.state is State.ENABLED:
                 self._after_stop = None                  # taken back while slowing down

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pydantic import Field
 
+from profiles.model import NonNegative, Positive, Validated
 from sim_bus.plant.kinds import AnyPlantParams
 from sim_bus.plant.rigid import Params as PlantParams
-from sim_bus.validated import NonNegative, Positive, Validated
 
 
 class DriveParams(Validated):

@@ -12,7 +12,7 @@
     ├── LimitHit                    speed left its window; torque or time limit reached          7
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
     ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
-    ├── LogError                    in `tdhil.recording.errors`: each brings its own `exit_code`
+    ├── LogError                    in `tdhil.errors`: each brings its own `exit_code`
     │   ├── LogUnopened             no such folder                                               2
     │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
     │   ├── LogRefused              too little space to begin with; nothing moved                4
@@ -36,8 +36,6 @@ from drivers.errors import (
     StopNotConfirmed,
     TdhilError,
 )
-
-__all__ = ["ExitCode", "Interrupted", "TdhilError", "UsageError", "exit_code"]
 
 
 class ExitCode(IntEnum):
@@ -97,3 +95,85 @@ def exit_code(error: BaseException) -> ExitCode:
         if kind in _CODES:
             return _CODES[kind]
     return ExitCode.INTERNAL
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What can be wrong with a log, below the root of the tree in `drivers.errors`.
+#
+# ::
+#
+#     LogError                    empty, not MCAP, not a run of ours                               as the command says
+#     ├── LogUnopened             no such folder, no right to write there; nothing has moved       exit 2
+#     ├── LogRefused              too little space on the disk to begin with; nothing has moved    exit 4
+#     ├── LogBroken               the disk failed or ran full in mid-run: the shaft was stopped    exit 3
+#     ├── NothingRecoverable      of this file nothing can be read back                            exit 10
+#     └── NothingRecorded         the run was refused, or ended in setup: nothing to identify      exit as the run's
+#
+# A run whose log broke off is a partial result, not an internal error: what had been written by then replays.
+
+
+class LogError(TdhilError):
+    """The log can't be written (disk full, no such folder) or can't be read (empty, not MCAP, not a run of ours)."""
+
+
+class LogUnopened(LogError):
+    """There can be no file at the place that was named."""
+
+    exit_code = ExitCode.USAGE
+
+
+class LogRefused(LogError):
+    """The disk is too full for a run to be begun."""
+
+    exit_code = ExitCode.REFUSED
+
+
+class LogBroken(LogError):
+    """The log ended before its run did."""
+
+    exit_code = ExitCode.PARTIAL
+
+
+class NothingRecoverable(LogError):
+    """A log of which nothing can be read."""
+
+    exit_code = ExitCode.NOTHING_RECOVERABLE
+
+
+class NothingRecorded(LogError):
+    """A log of a run that ended before there was anything to identify from; it ends as that run did."""
+
+    def __init__(self, what: str, code: int, *, where: str = "", next_step: str = "") -> None:
+        super().__init__(what, where=where, next_step=next_step)
+        self.exit_code = ExitCode(code)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What can be wrong with a trace in CSV, below `LogError` and so below the root of the tree.
+#
+# ::
+#
+#     LogError
+#     ├── CsvMisnamed      trace.csv:4: no column 'n_rmp'; did you mean 'n_rpm'?         exit 2
+#     └── CsvUnusable      trace.csv:88: the time goes back, here and in 512 more rows   exit 10
+
+
+class CsvMisnamed(LogError):
+    """A column or a unit that was asked for is not there, or not clear: the command line can mend it."""
+
+    exit_code = ExitCode.USAGE
+
+
+class CsvUnusable(LogError):
+    """Nothing of the file can be used as a trace: another export is needed."""
+
+    exit_code = ExitCode.NOTHING_RECOVERABLE
+
+
+def shown(text: str) -> str:
+    """``text`` for a message: printable, on one line, at most 40 characters."""
+    clean = "".join(sign if sign.isprintable() else "·" for sign in text[:41])
+    return clean if len(text) <= 40 else clean[:39] + "…"
+
+
+__all__ = ["ExitCode", "Interrupted", "TdhilError", "UsageError", "exit_code"]

@@ -8,12 +8,12 @@ that caused it, and nothing is ever sent behind the loop's back.
 from __future__ import annotations
 
 import contextlib
+import errno
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from enum import Enum
+from typing import TYPE_CHECKING, Final
 
-from drivers.cia402.stamps import FrameStamps
-from drivers.cia402.trouble import Condition, condition, queue_is_full
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
@@ -21,6 +21,91 @@ from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 
 if TYPE_CHECKING:
     import can
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The stamps that frames bear, mapped to control time: only to know where the two stand, nothing is timed by them.
+#
+# SocketCAN stamps with the wall clock, which somebody may set while a run goes on. A sample's time is the control time
+# of its SYNC, its age is control time too; so a jump changes nothing, but it is noticed, for whoever lays a candump
+# beside the log.
+
+
+WINDOW_S: Final = 0.5
+WINDOW_FRAMES: Final = 4
+JUMP_S: Final = 0.1
+_EPOCH_S: Final = 1e9
+"""Stamps below it count from a start of the adapter's (or there are none: 0); they are no wall clock's."""
+
+
+class FrameStamps:
+    """``offset_s`` is wall clock minus control time; None as long as it isn't known.
+
+    A frame that waited in a buffer looks as if the offset were smaller. So of each half second the largest counts:
+    a burst that was taken late is over long before.
+    """
+
+    def __init__(self) -> None:
+        self.offset_s: float | None = None
+        self.jumps = 0
+        self._best_s = 0.0
+        self._frames = 0
+        self._begun_s = 0.0
+
+    def take(self, stamp_s: float, now_s: float) -> None:
+        """One received frame: its stamp, and the control time at which it was taken off the bus."""
+        if stamp_s < _EPOCH_S:
+            return
+        offset_s = stamp_s - now_s
+        if self._frames == 0:
+            self._best_s, self._begun_s = offset_s, now_s
+        elif offset_s > self._best_s:
+            self._best_s = offset_s
+        self._frames += 1
+        if self._frames >= WINDOW_FRAMES and now_s - self._begun_s >= WINDOW_S:
+            if self.offset_s is not None and abs(self._best_s - self.offset_s) > JUMP_S:
+                self.jumps += 1
+            self.offset_s = self._best_s
+            self._frames = 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What the adapter says of the bus: SocketCAN's error frames, and a transmit queue that is full.
+#
+# An error frame's identifier holds classes, its second byte the controller's state (Linux, `linux/can/error.h`). Other
+# interfaces send error frames without either: those are counted only.
+
+
+CONTROLLER, BUS_OFF = 0x04, 0x40
+_PASSIVE = 0x10 | 0x20
+"""Receiver or transmitter error-passive: more than 127 errors, CiA 301 and ISO 11898-1."""
+_FULL = ("buffer full", "queue full", "no buffer space")
+
+
+class Condition(Enum):
+    """What one error frame means for the run."""
+
+    ERROR = "an error on the bus"
+    PASSIVE = "the adapter is error-passive"
+    OFF = "the adapter is bus-off"
+
+
+def condition(identifier: int, data: bytes) -> Condition:
+    """Of one error frame."""
+    if identifier & BUS_OFF:
+        return Condition.OFF
+    if identifier & CONTROLLER and len(data) > 1 and data[1] & _PASSIVE:
+        return Condition.PASSIVE
+    return Condition.ERROR
+
+
+def queue_is_full(error: BaseException) -> bool:
+    """Did a frame not go out because those before it are still waiting?"""
+    numbers = getattr(error, "error_code", None), getattr(error, "errno", None)
+    return errno.ENOBUFS in numbers or any(text in str(error).lower() for text in _FULL)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 Handler = Callable[[bytes], None]
 LONGEST_DRAIN_S = 0.25

@@ -19,31 +19,23 @@ from typing import TYPE_CHECKING
 from drivers.canopen import preflight as checks
 from drivers.canopen import watchdog as arming
 from drivers.canopen.bus import PEER_DEAD_S, CanLink
-from drivers.canopen.limits import note_temperature, set_limits
+from drivers.canopen.limits import check_parameters, note_temperature, set_limits
 from drivers.canopen.other_master import Strangers
-from drivers.canopen.pdo import shape_of
+from drivers.canopen.pdo import RPDO2, Feedback, Reported, Units, encode_speed, encode_torque, shape_of
 from drivers.canopen.pdo_mapping import slow_syncs
 from drivers.canopen.position import Angle, find_angle
+from drivers.canopen.preflight import find_free_node, find_units, read_identity, refuse_in_doubt
+from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
 from drivers.canopen.sdo_feedback import keep_stepping, look, push
 from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
-from drivers.canopen.supervision import STOPPED, Watch
-from drivers.cia402.feedback import Feedback
-from drivers.cia402.find_node import find_free_node, read_identity, refuse_in_doubt
-from drivers.cia402.objects import RPDO2, Units, encode_speed, encode_torque
-from drivers.cia402.parameters import check_parameters
-from drivers.cia402.read_back import ReadBack
-from drivers.cia402.reported import Reported
-from drivers.cia402.sign_of_life import HEARTBEAT_S, SignOfLife
-from drivers.cia402.standing import Standing
-from drivers.cia402.units import find_units
-from drivers.clock import Clock
+from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, ReadBack, SignOfLife, Watch
+from drivers.clock import RATES_HZ, Clock, Ticks, how_late
 from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.left_behind import LeftBehind
 from drivers.own_limits import OwnLimits
 from drivers.preflight import Table
-from drivers.ticks import RATES_HZ, Ticks, how_late
 from profiles.canopen import CanopenProfile
 from profiles.simulator_marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 

@@ -6,22 +6,194 @@
   speed: then TPDO1 is torque and speed, and TPDO2 brings the statusword with every SYNC.
 """
 
+import math
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from struct import Struct
+from struct import Struct, error
 
-from drivers.canopen.state_machine import ENABLE_OPERATION
-from drivers.cia402.objects import (
-    RPDO1,
-    TARGET_VELOCITY,
-    TORQUE_ACTUAL,
-    TPDO1,
-    TPDO2_MODE,
-    TPDO2_MODE_DEMAND,
-    VELOCITY_ACTUAL,
-    VL_ACTUAL,
-    VL_TARGET,
+from drivers.canopen.state_machine import (
+    ENABLE_OPERATION,
+    INTERNAL_LIMIT,
+    SPEED_ZERO,
+    TARGET_REACHED,
+    State,
+    decode,
+    power_state,
 )
-from profiles.canopen import CanopenProfile
+from drivers.drive import Mode, PowerState, Sample
+from drivers.errors import CommandRejected, ObjectRefused
+from profiles.canopen import CanopenProfile, ObjectType
+from profiles.simulator_marker import CYCLES_END, LAST_CYCLE_OVER
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The CiA 402 objects that tdhil uses, and the pure codec between them and SI.
+#
+# Cyclic data, little endian, one instant for torque and speed::
+#
+#     RPDO1  6040h controlword u16 | 6071h target torque i16 ‰ | 60FFh target velocity i32 LSB
+#     TPDO1  6041h statusword  u16 | 6077h torque actual i16 ‰ | 606Ch velocity actual i32 LSB
+#     RPDO2  6060h modes of operation i8
+#     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰]
+#
+# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
+
+
+RPDO1 = struct.Struct("<Hhi")
+TPDO1 = struct.Struct("<Hhi")
+RPDO2 = struct.Struct("<b")
+TPDO2_MODE = struct.Struct("<b")
+TPDO2_MODE_DEMAND = struct.Struct("<bh")
+
+RPM = 2.0 * math.pi / 60.0
+"""rad/s in one rev/min."""
+
+# (index, subindex, bits), as mapped into PDOs.
+CONTROLWORD = (0x6040, 0, 16)
+STATUSWORD = (0x6041, 0, 16)
+MODE = (0x6060, 0, 8)
+MODE_DISPLAY = (0x6061, 0, 8)
+VELOCITY_ACTUAL = (0x606C, 0, 32)
+TARGET_TORQUE = (0x6071, 0, 16)
+TORQUE_DEMAND = (0x6074, 0, 16)
+TORQUE_ACTUAL = (0x6077, 0, 16)
+TARGET_VELOCITY = (0x60FF, 0, 32)
+VL_TARGET, VL_ACTUAL = (0x6042, 0, 16), (0x6044, 0, 16)
+"""Velocity mode (vl): target velocity, and what CiA 402-2 calls vl velocity actual value (or control effort)."""
+
+MODE_NAMES = {2: "velocity mode", 3: "profile velocity", 4: "profile torque", 9: "cyclic sync velocity",
+              10: "cyclic sync torque"}
+"""6060h codes that tdhil may use."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """What one LSB means on this drive: of the speed both ways, of the reported torque, of the target torque 6071h."""
+
+    speed_rad_s_per_lsb: float
+    torque_nm_per_lsb: float
+    target_nm_per_lsb: float | None = None      # None: as reported
+
+
+def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
+    """Rad/s at the motor shaft → 60FFh, or 6042h. Raises CommandRejected outside of it or if not finite."""
+    index, _, bits = target
+    return _encode(speed_rad_s, units.speed_rad_s_per_lsb, bits - 1, f"target velocity {index:04X}h", "rad/s")
+
+
+def encode_torque(torque_nm: float, units: Units) -> int:
+    """N·m at the motor shaft → 6071h. Raises CommandRejected outside i16 or if not finite."""
+    per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
+    return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
+
+
+def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> int:
+    if not math.isfinite(value):
+        raise CommandRejected(f"setpoint {value} {unit} is not finite", where=where)
+    raw = round(value / per_lsb)
+    if not -(1 << bits) <= raw < 1 << bits:
+        raise CommandRejected(f"setpoint {value:g} {unit} doesn't fit into the object", where=where)
+    return raw
+
+
+def mapping_entry(mapped: tuple[int, int, int]) -> int:
+    """Object → the u32 of a PDO mapping parameter (CiA 301: index, subindex, length in bits)."""
+    index, subindex, bits = mapped
+    return index << 16 | subindex << 8 | bits
+
+
+def consumer_heartbeat(node: int, time_ms: int) -> int:
+    """The u32 of 1016h: node-ID in bits 16 to 23, time in ms below."""
+    return node << 16 | time_ms
+
+
+def lsb_decimals(per_lsb: float) -> int:
+    """How many decimals show one LSB without false precision."""
+    return max(0, math.ceil(-math.log10(per_lsb)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a drive reported last, in its own counts, and the Sample in SI at the motor shaft that is made of it.
+
+
+_PROFILE_VELOCITY = 3
+
+
+class Reported:
+    """As TPDOs or single answers brought it; what hasn't come yet is zero."""
+
+    def __init__(self) -> None:
+        self.state = State.NOT_READY
+        self.shown_code = 0            # 6061h
+        self._status = 0
+        self._speed_raw = 0
+        self._torque_raw: float = 0
+        self._demand_raw: int | None = None
+
+    def take(self, status: int, speed_raw: int, torque_raw: float | None) -> None:
+        """6041h, 606Ch and 6077h (or the manufacturer's object) of one instant; None: the torque stays as it was."""
+        self._status, self._speed_raw = status, speed_raw
+        self._torque_raw = self._torque_raw if torque_raw is None else torque_raw
+        self.state = decode(status)
+
+    def take_slow(self, shown_code: int, demand_raw: int | None) -> None:
+        """6061h, and 6074h where the drive has it."""
+        self.shown_code, self._demand_raw = shown_code, demand_raw
+
+    def sample(self, time_s: float, age_s: float, fresh: bool, units: Units, modes: Mapping[int, Mode]) -> Sample:
+        """``time_s`` and ``age_s`` in control time; ``modes`` by their codes of 6061h."""
+        status = self._status
+        power = power_state(self.state)
+        reached = bool(status & TARGET_REACHED) and power is PowerState.QUICK_STOP
+        zero = bool(status & SPEED_ZERO) and self.shown_code == _PROFILE_VELOCITY and power is PowerState.ENABLED
+        demand = self._demand_raw
+        return Sample(
+            time_s,
+            age_s,
+            0.0,
+            fresh,
+            self._speed_raw * units.speed_rad_s_per_lsb,
+            self._torque_raw * units.torque_nm_per_lsb,
+            None if demand is None else demand * units.torque_nm_per_lsb,
+            modes.get(self.shown_code),
+            power,
+            reached or zero,
+            bool(status & INTERNAL_LIMIT),
+            status,
+        )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pure codec between the bytes of an object and a number, for every type that a profile may name (CiA 301, 9.1).
+
+
+_LAYOUTS: dict[str, Struct] = {
+    "u8": Struct("<B"), "u16": Struct("<H"), "u32": Struct("<I"), "i8": Struct("<b"), "i16": Struct("<h"),
+    "i32": Struct("<i"), "f32": Struct("<f"),
+}
+
+
+def decode_value(kind: ObjectType, data: bytes, where: str) -> float:
+    """Bytes → the number in them. Raises ObjectRefused for too few bytes, or what is no finite number."""
+    layout = _LAYOUTS[kind]
+    if len(data) < layout.size:
+        raise ObjectRefused(f"{len(data)} bytes where {layout.size} were expected", where=where)
+    value = float(layout.unpack_from(data)[0])
+    if not math.isfinite(value):
+        raise ObjectRefused(f"{value} is no number to work with", where=where)
+    return value
+
+
+def encode_value(kind: ObjectType, value: float, where: str) -> bytes:
+    """A number → its bytes, whole numbers for whole types. Raises ObjectRefused where it doesn't fit."""
+    try:
+        return _LAYOUTS[kind].pack(value if kind == "f32" else round(value))
+    except (error, OverflowError, ValueError) as trouble:
+        raise ObjectRefused(f"{value:g} doesn't fit into the object ({kind})", where=where) from trouble
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 RPDO1_SPEED = Struct("<Hi")
 """6040h controlword u16 | 60FFh target velocity i32."""
@@ -89,6 +261,180 @@ def shape_of(profile: CanopenProfile) -> Shape:
         return Shape(target, profile.modes.mapped, vl=vl, feedback=feedback["i16"])
     place = (torque.index, torque.sub, _BITS[torque.type])
     return Shape(target, profile.modes.mapped, place, vl=vl, feedback=feedback[torque.type])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What comes back for each SYNC: one TPDO1, the drive's own, and how it is told from others that bear its identifier.
+#
+# A drive answers a SYNC once, and in the order in which they came. So there are never more answers than SYNCs, ours
+# and those of others; one more is a frame that was doubled on its way, or sent by somebody else: a duplicate node-ID,
+# a recording that is played back. The first of a cycle is then taken; which of the two is the drive's can't be told,
+# and while a shaft is being stopped none of several counts (`Feedback.doubted`): old frames of a shaft at rest must
+# not end a stop. One too many that says something else than the first contradicts it.
+#
+# A host or an adapter that was late finds a burst: the answers of all the SYNCs that went out meanwhile. In stepped
+# time, and where a cycle is longer than anything is late, an answer that didn't come within its cycle was lost. In
+# real time it may still come, and the next answer is not the next SYNC's: answers are given to SYNCs in their order,
+# and a cycle's own is the last one. Where a cycle ends with fewer answers than SYNCs, one of them was lost or all are
+# late, and nobody knows which SYNC the last one belongs to: no sample of that cycle. A single one that came as soon
+# after this cycle's SYNC as answers do shows that an older one was lost; should that one come yet, in the next cycle,
+# neither counts.
+
+
+_NO_WORD = b""
+ANSWER_WITHIN_S = 0.5
+"""What hasn't been answered for so long was lost: the host gives up a drive that says nothing for half as long."""
+LONGEST_LATE_S = 0.05
+"""An adapter isn't late by more than a cycle that is longer than this."""
+_USUAL_SHARE, _QUICKEST_SHARE = 0.25, 0.5
+_RECENT = 1000
+
+
+class Feedback:
+    """Of the cycle under way; `begin` starts the next. ``now_s``: control time, in real time; None: nothing is late."""
+
+    def __init__(self, shape: Shape, now_s: Callable[[], float] | None = None, period_s: float = 0.0) -> None:
+        self._wide = shape.wide
+        self._size = shape.data_size()
+        self._now_s = now_s
+        self._period_s = period_s
+        self._waits = now_s is not None and period_s < LONGEST_LATE_S
+        self._half: tuple[float, bool, bytes] | None = None    # when, is it the status, what
+        self._due: deque[float] = deque()      # SYNCs whose answers may come yet, in order; the last is this cycle's
+        self._given_up: deque[float] = deque() # answers that count as lost, and are nobody else's should they come
+        self._begun_s = 0.0
+        self._here = 0                 # answers since `begin`
+        self._last_s = 0.0             # when the last one came
+        self._spoiled = False          # one of another length has come since `begin`
+        self._doubtful = False         # an answer was given up in the cycle before: it may come in this one
+        self._quickest_s: float | None = None
+        self._usual_s = 0.0            # from a SYNC to its answer
+        self._extra = False            # since `believed` was asked last
+        self._ends_cycles = False      # a simulated peer says where a cycle ends
+        self.data = _NO_WORD           # statusword, torque, speed; as `Shape.feedback` packs them
+        self.over = False              # the peer said so of this cycle
+        self.arrived = 0               # TPDO1s, all told
+        self.second = 0                # of them, a second one of a cycle that the peer had not ended yet
+        self.older = 0                 # of them, those of a SYNC before this cycle's
+        self.contradictions = 0        # of them, those that can't be the drive's if the first was
+        self._late_s: deque[tuple[float, float]] = deque(maxlen=_RECENT)   # when one came, how long after its cycle
+
+    def begin(self, now_s: float = 0.0, *, sync: bool = True) -> None:
+        """A SYNC is about to go out; without ``sync`` none is, in this cycle."""
+        if not self._waits:
+            self._given_up += self._due
+            self._due.clear()
+        for waiting in (self._due, self._given_up):
+            while waiting and now_s - waiting[0] > ANSWER_WITHIN_S:
+                waiting.popleft()
+        if not self._due:
+            self._half = None          # a half of another cycle must not complete this one
+        if sync:
+            self._due.append(now_s)
+        self._begun_s = now_s
+        self._here = 0
+        self._spoiled = False
+        self.data = _NO_WORD
+        self.over = False
+
+    def doubted(self) -> bool:
+        """Has more than one TPDO1 come for a SYNC since this was asked last?"""
+        extra, self._extra = self._extra, False
+        return extra
+
+    def on_foreign_sync(self) -> None:
+        """Somebody else's: the drive answers that one too."""
+        self._given_up.append(self._begun_s)
+
+    def late_since(self, since_s: float) -> list[float]:
+        """By how much answers came after their cycles, s; those that came since then."""
+        return [late_s for came_s, late_s in self._late_s if came_s >= since_s]
+
+    @property
+    def done(self) -> bool:
+        """Nothing more is waited for in this cycle."""
+        if self._now_s is None:
+            return self.over or (bool(self.data) and not self._ends_cycles)
+        return bool(self.data) and not self._doubtful
+
+    def settle(self) -> None:
+        """In real time: this cycle's time is up."""
+        if self._doubtful:
+            self._doubtful = False
+            if self._here > 1:         # the one that was given up has come: then the first was not this cycle's
+                self.data = _NO_WORD
+            return
+        if self.data or not self._due:
+            return
+        self._doubtful = self._here == 1 and self._came_as_usual()
+        # A drive that has never answered wasn't listening yet.
+        if self._doubtful or not self.arrived or (self._spoiled and not self._here):
+            self._given_up += self._due
+            self._due.clear()
+
+    def on_tpdo1(self, data: bytes) -> None:
+        """180h + node. A frame of another length says nothing; if no other comes, it was the answer."""
+        if len(data) != self._size:
+            self._spoiled = True
+        elif self._wide:
+            self._join(False, data)
+        else:
+            self._take(data)
+
+    def on_status(self, status: bytes) -> None:
+        """The statusword in a wide drive's TPDO2; its two TPDOs of one SYNC come in whichever order."""
+        self._join(True, status)
+
+    def on_cycle_end(self, data: bytes) -> None:
+        """Of a simulated peer with scripted faults, in stepped time (`profiles.simulator_marker.CYCLE_ID`)."""
+        self._ends_cycles = data != LAST_CYCLE_OVER
+        self.over = data != CYCLES_END
+
+    def _join(self, is_status: bool, data: bytes) -> None:
+        now_s = 0.0 if self._now_s is None else self._now_s()
+        half, self._half = self._half, None
+        if half is not None and self._waits and now_s - half[0] > 0.5 * self._period_s:
+            half = None                # its other half was lost: the two come together
+        if half is None or half[1] is is_status:
+            self._half = (now_s, is_status, data)
+        else:
+            self._take(data + half[2] if is_status else half[2] + data)
+
+    def _take(self, data: bytes) -> None:
+        now_s = 0.0 if self._now_s is None else self._now_s()
+        self.arrived += 1
+        self._here += 1
+        self._last_s = now_s
+        if self._here > 1:
+            self._extra = True
+            self.second += self._ends_cycles
+        if not self._due:
+            if self._given_up:
+                self._given_up.popleft()
+            elif data != self.data:
+                self.contradictions += 1
+            return
+        asked_s = self._due.popleft()
+        if self._due:
+            self.older += 1
+            self._late_s.append((now_s, now_s - asked_s - self._period_s))
+            return
+        self.data = data
+        if self._here == 1:
+            self._learn(now_s - asked_s)
+
+    def _learn(self, took_s: float) -> None:
+        took_s = min(took_s, self._period_s)
+        first = self._quickest_s is None
+        self._quickest_s = took_s if self._quickest_s is None else min(self._quickest_s, took_s)
+        self._usual_s += (1.0 if first else 0.1) * (took_s - self._usual_s)
+
+    def _came_as_usual(self) -> bool:
+        took_s, quickest_s = self._last_s - self._begun_s, self._quickest_s
+        if quickest_s is None:
+            return False
+        near = abs(took_s - self._usual_s) <= _USUAL_SHARE * self._period_s
+        return near and took_s >= _QUICKEST_SHARE * quickest_s
 
 
 __all__ = ["STANDARD", "Shape", "shape_of"]

@@ -7,17 +7,18 @@ transmission type, enable.
 
 from dataclasses import dataclass
 
-from drivers.canopen.pdo import STANDARD, Shape
-from drivers.canopen.sdo import Objects, name
-from drivers.cia402.objects import (
+from drivers.canopen.pdo import (
     CONTROLWORD,
     MODE,
     MODE_DISPLAY,
+    STANDARD,
     STATUSWORD,
     TARGET_TORQUE,
     TORQUE_DEMAND,
+    Shape,
     mapping_entry,
 )
+from drivers.canopen.sdo import Objects, name
 from drivers.errors import PreflightRefused
 
 DISABLED = 1 << 31

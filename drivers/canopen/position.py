@@ -9,15 +9,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from drivers.canopen.pdo import RPM, decode_value
 from drivers.canopen.sdo import Objects, name
-from drivers.cia402.objects import RPM
-from drivers.cia402.values import decode_value
 from drivers.clock import Clock
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, ObjectRefused
 from drivers.preflight import Table
-from profiles.canopen import CanopenProfile
-from profiles.canopen_sections import Position
+from profiles.canopen import CanopenProfile, Position
 
 TURN_RAD = 60.0 * RPM
 FEWEST_COUNTS = 16

@@ -5,18 +5,148 @@ A line that fails does not hide those after it: the whole table is worth more to
 
 from __future__ import annotations
 
+import math
+import struct
 from collections.abc import Callable, Mapping
 
-from drivers.canopen.sdo import Objects, place
+from drivers.canopen.limits import Settings
+from drivers.canopen.pdo import (
+    MODE_NAMES,
+    RPM,
+    TARGET_VELOCITY,
+    VELOCITY_ACTUAL,
+    VL_ACTUAL,
+    VL_TARGET,
+    Units,
+    decode_value,
+)
+from drivers.canopen.sdo import Objects, name, place
 from drivers.canopen.state_machine import State, decode
-from drivers.cia402.filters import read_filters
-from drivers.cia402.objects import MODE_NAMES, TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL, VL_TARGET, Units
-from drivers.drive import Identity, Mode, Preflight
-from drivers.errors import ObjectRefused, PreflightRefused
+from drivers.drive import Identity, Mode, Preflight, ReportingFilters
+from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.left_behind import LeftBehind
 from drivers.own_limits import SPEED, TORQUE
-from drivers.preflight import Table
-from profiles.canopen import CanopenProfile
+from drivers.preflight import Table, agreed_rated_torque
+from profiles.canopen import CanopenProfile, ReportingFilter
+from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
+from profiles.visible import visible
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The smoothing that a drive puts on what it reports, read from the objects its profile names.
+
+
+_FORMATS = {"u8": "<B", "u16": "<H", "u32": "<I", "i8": "<b", "i16": "<h", "i32": "<i", "f32": "<f"}
+
+
+def read_filters(note: Callable[[str, str, str], None], objects: Objects, profile: CanopenProfile) -> ReportingFilters:
+    """First-order lags in seconds, None where the drive doesn't tell; each is noted in the preflight table."""
+    lags: dict[str, float] = {}
+    sources = []
+    for entry in profile.filters:
+        where = name(entry.index, entry.sub)
+        try:
+            lag_s = lag_seconds(entry, objects.read_bytes(entry.index, entry.sub))
+        except ObjectRefused:
+            note(f"{entry.signal} filter", "the drive does not tell", where)
+            continue
+        note(f"{entry.signal} filter", f"{lag_s * 1000.0:.4g} ms", where)
+        lags[entry.signal] = lag_s
+        sources.append(f"{entry.signal} {where}")
+    return ReportingFilters(lags.get("speed"), lags.get("torque"), ", ".join(sources))
+
+
+def lag_seconds(entry: ReportingFilter, data: bytes) -> float:
+    """Raw bytes of the object → time constant. A cut-off frequency f_c is a lag of 1/(2π f_c); 0 means no filter."""
+    layout = struct.Struct(_FORMATS[entry.type])
+    if len(data) < layout.size:
+        raise ObjectRefused(f"{len(data)} bytes where {layout.size} were expected", where=name(entry.index, entry.sub))
+    value = float(layout.unpack_from(data)[0]) * entry.per_lsb
+    if not math.isfinite(value) or value < 0.0:
+        raise ObjectRefused(f"{value} is no filter setting", where=name(entry.index, entry.sub))
+    if entry.quantity == "time_constant_s":
+        return value
+    return 1.0 / (2.0 * math.pi * value) if value > 0.0 else 0.0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What one count of speed and torque means on this drive: from the drive where it has it, else from the rig.
+
+
+SI_UNIT_VELOCITY = 0x60A9
+
+
+def find_units(
+    table: Table, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
+) -> tuple[Units, float]:
+    """Scaling of speed and torque; and the rated torque, N·m."""
+    where = name(profile.torque.rated.index, profile.torque.rated.sub)
+    agreed_nm = agreed_rated_torque(table, _told(objects, profile), rated_torque_nm, where)
+    rated_nm = 1.0 if agreed_nm is None else agreed_nm       # refused, and the rows after it still want a scale
+    speed = speed_unit(table, objects, profile)
+    target = profile.torque.rated_per_lsb * rated_nm
+    actual = profile.torque.actual
+    if actual is None:
+        return Units(speed, target), rated_nm
+    return Units(speed, actual.per_lsb * (rated_nm if actual.unit == "rated" else 1.0), target), rated_nm
+
+
+def _told(objects: Objects, profile: CanopenProfile) -> float | None:
+    """The rated torque that the drive tells, N·m; None where it doesn't, or says 0."""
+    place, per_lsb = profile.torque.rated, profile.torque.rated_torque_nm_per_lsb
+    if per_lsb is None:
+        return None
+    try:
+        raw = decode_value(place.type, objects.read_bytes(place.index, place.sub), name(place.index, place.sub))
+    except ObjectRefused:
+        return None
+    return raw * per_lsb if raw > 0.0 else None
+
+
+def speed_unit(table: Table, objects: Objects, profile: CanopenProfile) -> float:
+    """Rad/s for one count. A drive whose unit can be set is believed only where it reads back what it is set to."""
+    speed = profile.speed
+    if speed.si_unit is not None:
+        wanted = speed.si_unit
+
+        def same() -> tuple[str, bool]:
+            found = objects.read(SI_UNIT_VELOCITY)
+            return f"{found:08X}h", found == wanted
+
+        table.attempt(
+            "unit of speed", f"{wanted:08X}h", name(SI_UNIT_VELOCITY), same,
+            f"Every speed would be scaled wrongly: set 60A9h to {wanted:08X}h, as profile {profile.name} has it",
+        )
+    per_lsb = speed.rpm_per_lsb * RPM
+    if not (speed.times or speed.over):
+        return per_lsb
+    settings = Settings(objects, profile)
+    found = per_lsb
+
+    def work() -> tuple[str, bool]:
+        nonlocal found
+        product = per_lsb
+        for scale in speed.times:
+            product *= _nonzero(settings.value(scale), scale)
+        for scale in speed.over:
+            product /= _nonzero(settings.value(scale), scale)
+        found = product
+        return f"{product / RPM:.6g} rpm for one count", True
+
+    scales = [profile.parameter(scale) for scale in (*speed.times, *speed.over)]
+    table.attempt(
+        "unit of speed", "known", ", ".join(name(one.index, one.sub) for one in scales), work,
+        "Without it no speed can be scaled. " + " ".join(dict.fromkeys(one.advice for one in scales if one.advice)),
+    )
+    return found
+
+
+def _nonzero(value: float, scale: str) -> float:
+    if value <= 0.0:
+        raise ObjectRefused(f"{scale} reads {value:g}")
+    return value
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _HOLDS_FROM, _LAST_OPTION = 5, 8
 """CiA 402-2, 605Ah: codes after which quick stop active is kept; above the second they are reserved."""
@@ -191,3 +321,53 @@ def report(
         kept_speed_rad_s=kept.get(SPEED),
         quick_stop_holds=quick_stop_holds(objects, profile),
     )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Who is at a node-ID: found, read out (CiA 301: 1000h, 1018h, 1008h), and refused where it is in doubt.
+
+
+DOUBLED_ANSWERS = 3
+"""So many answers that came twice are no accident; `Cia402Drive.connect` asks some ten questions."""
+
+
+def find_free_node(objects: Objects) -> None:
+    """Somebody answers, and nobody else drives it. Nothing is written. Raises PreflightRefused."""
+    try:
+        objects.read(0x1000)
+    except CommunicationLost as error:
+        raise PreflightRefused(error.what, where=error.where, next_step=error.next_step) from error
+    refuse_if_driven(objects)
+
+
+def read_identity(objects: Objects) -> Identity:
+    """Vendor, product, revision and serial number (0 where there is none), name, and whether it is simulated."""
+    vendor, product, revision, serial = (objects.read_if_there(0x1018, sub) or 0 for sub in (1, 2, 3, 4))
+    try:
+        title = visible(objects.read_bytes(0x1008).decode("ascii", "replace").rstrip("\0 "))
+    except ObjectRefused:
+        title = "CiA 402 drive"
+    return Identity(vendor, product, revision, serial, title, _is_simulated(objects))
+
+
+def refuse_in_doubt(objects: Objects, identity: Identity, node: int, stepped: bool) -> None:
+    """A real drive in stepped time, and two nodes with one node-ID. Raises PreflightRefused."""
+    if stepped and not identity.simulated:
+        raise PreflightRefused(
+            "stepped time was asked for, but the peer does not bear the simulator's marker",
+            where=name(MARKER_INDEX, 1),
+            next_step="Leave --stepped out: a real shaft moves in real time",
+        )
+    if objects.doubled >= DOUBLED_ANSWERS:
+        raise PreflightRefused(
+            "every question is answered twice: two nodes have the same node-ID",
+            where=f"node {node}",
+            next_step="Take one of them off the bus, or give each a node-ID of its own",
+        )
+
+
+def _is_simulated(objects: Objects) -> bool:
+    try:
+        return objects.read_bytes(MARKER_INDEX, 1).decode("ascii", "replace").rstrip("\0") == MARKER_TEXT
+    except ObjectRefused:
+        return False

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from drivers.canopen.pdo import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
 from drivers.canopen.sdo import Objects, name
 from drivers.canopen.state_machine import State, Wish, controlword_towards, decode
-from drivers.cia402.objects import VELOCITY_ACTUAL, VL_ACTUAL
-from drivers.cia402.values import decode_value
 from drivers.errors import CommunicationLost, ObjectRefused
-from profiles.canopen import CanopenProfile
-from profiles.canopen_parameter import ObjectType
+from profiles.canopen import CanopenProfile, ObjectType
 from profiles.simulator_marker import MARKER_INDEX
 
 ANSWER_S = 0.1

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.canopen.pdo import Shape
+from drivers.canopen.pdo import Shape, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
 from drivers.canopen.sdo import Objects, name
-from drivers.cia402.objects import consumer_heartbeat
 from drivers.errors import ObjectRefused, PreflightRefused
-from drivers.no_watchdog import DIES, settle
-from drivers.preflight import Table
+from drivers.preflight import DIES, Table, settle
 from profiles.canopen import CanopenProfile, Watchdog
 from profiles.simulator_marker import MARKER_INDEX
 

@@ -10,8 +10,8 @@ from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
 from drivers.modbus import pdu as requests
 from drivers.modbus.codec import WordOrder, from_words, register_name, to_words
-from drivers.modbus.errors import BUSY, BadReply, NoReply, RegisterRefused
 from drivers.modbus.link import Link
+from drivers.modbus.pdu import BUSY, BadReply, NoReply, RegisterRefused
 from profiles.modbus import Register
 
 SETTING_TIMEOUT_S = 1.0

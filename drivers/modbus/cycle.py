@@ -3,16 +3,265 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from drivers.drive import Command, Mode
-from drivers.errors import CommandRejected
-from drivers.modbus.codec import WordOrder, from_words, register_name, to_counts, to_words
-from drivers.modbus.plan import Words
-from drivers.modbus.scales import Scales
+from drivers.errors import CommandRejected, PreflightRefused
+from drivers.modbus import pdu
+from drivers.modbus.access import Access, Answer
+from drivers.modbus.codec import Scales, WordOrder, from_words, register_name, to_counts, to_words
+from drivers.modbus.pdu import BUSY, NoisyReply, RegisterRefused
 from profiles.modbus import ModbusProfile, Register
 
+# ---------------------------------------------------------------------------------------------------------------------
+# From a profile's registers to the fewest transactions a cycle, pure.
+#
+# Writes never cover a register that nobody asked for; reads may take along up to `largest_gap` others. Setpoints go
+# out before the control word or together with it. With function 23 a write and a read share a transaction (the drive
+# writes first); without it each block has one of its own. Speed and torque are read last, in one transaction where
+# they can be, else in two that follow each other.
+#
+# What isn't needed every cycle (mode register and display, torque demand) rides along where that costs no
+# transaction.
+
+
+Words = Mapping[tuple[str, int], int]
+"""Registers by (table, address)."""
+
+
+class Span(NamedTuple):
+    """Neighbouring registers of one table."""
+
+    table: str
+    address: int
+    length: int
+
+    def covers(self, register: Register) -> bool:
+        """Does the register stand in it, as a whole?"""
+        end = register.address + register.count
+        return register.table == self.table and self.address <= register.address and end <= self.address + self.length
+
+
+class Transaction(NamedTuple):
+    """One request and its reply: a write, a read, or both."""
+
+    function: int
+    write: Span | None
+    read: Span | None
+
+    def request(self, image: Mapping[int, int]) -> bytes:
+        """The PDU; ``image`` has the word of every holding register that is written."""
+        words = [] if self.write is None else [image[self.write.address + k] for k in range(self.write.length)]
+        if self.write is None:
+            assert self.read is not None
+            return pdu.read(self.function, self.read.address, self.read.length)
+        if self.function == pdu.WRITE_ONE:
+            return pdu.write_one(self.write.address, words[0])
+        if self.function == pdu.WRITE_MANY:
+            return pdu.write_many(self.write.address, words)
+        assert self.read is not None
+        return pdu.read_write(self.read.address, self.read.length, self.write.address, words)
+
+    def __str__(self) -> str:
+        parts = [f"{verb} {span.address}+{span.length}"
+                 for verb, span in (("writes", self.write), ("reads", self.read)) if span is not None]
+        return f"{self.function} {' '.join(parts)}"
+
+
+@dataclass(frozen=True)
+class CyclePlan:
+    """What goes over the line: ``cycle`` each time, the others when the mode changes or must be looked at."""
+
+    cycle: tuple[Transaction, ...]
+    mode_writes: tuple[Transaction, ...]
+    mode_reads: tuple[Transaction, ...]
+    has_demand: bool
+
+
+def plan_cycle(profile: ModbusProfile) -> CyclePlan:
+    """The cheapest plan. Raises PreflightRefused where the profile's functions can't do it."""
+    cycle, modes = profile.cycle, profile.modes
+    setpoints = [cycle.speed_setpoint.register_]
+    if modes.torque and cycle.torque_setpoint is not None:
+        setpoints.append(cycle.torque_setpoint.register_)
+    written = [*setpoints, cycle.control.register_]
+    feedback = [cycle.status.register_, cycle.speed.register_, cycle.torque.register_]
+    mode_writes = [modes.register_] if modes.register_ is not None else []
+    mode_reads = [modes.display.register_] if modes.display is not None else []
+    demand = [cycle.torque_demand.register_] if cycle.torque_demand is not None else []
+
+    most_written = min(cycle.largest_write, pdu.MOST_WRITTEN)
+    if 16 not in cycle.functions:
+        most_written = min(most_written, pdu.MOST_WRITTEN_WITH_READ) if 23 in cycle.functions else 1
+
+    def write_spans(registers: Sequence[Register]) -> list[Span]:
+        return spans(registers, 0, most_written)
+
+    def read_spans(registers: Sequence[Register]) -> list[Span]:
+        return spans(registers, cycle.largest_gap, cycle.largest_read)
+
+    if mode_writes and len(write_spans([*written, *mode_writes])) == len(write_spans(written)):
+        written, mode_writes = [*written, *mode_writes], []
+    for extra in (mode_reads, demand):
+        if extra and len(read_spans([*feedback, *extra])) == len(read_spans(feedback)):
+            feedback += extra
+            if extra is mode_reads:
+                mode_reads = []
+    control = cycle.control.register_
+    writes = sorted(write_spans(written), key=lambda span: (span.covers(control), span.address))
+    # Speed and torque last and side by side, so that they are as much of one moment as can be.
+    moving = (cycle.speed.register_, cycle.torque.register_)
+    reads = sorted(read_spans(feedback), key=lambda span: any(span.covers(one) for one in moving))
+    functions = frozenset(cycle.functions)
+    return CyclePlan(
+        _pair(writes, reads, functions),
+        _pair(write_spans(mode_writes), [], functions) if mode_writes else (),
+        _pair([], read_spans(mode_reads), functions) if mode_reads else (),
+        bool(demand) and demand[0] in feedback,
+    )
+
+
+def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -> tuple[Transaction, ...]:
+    """What these transactions read, without any writing; () where the drive knows no function for that."""
+    found = []
+    for span in (one.read for one in transactions if one.read is not None and one.read != one.write):
+        function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
+        if function not in functions:
+            return ()
+        found.append(Transaction(function, None, span))
+    return tuple(found)
+
+
+def spans(registers: Iterable[Register], gap: int, most: int) -> list[Span]:
+    """Registers gathered into as few spans as possible, none cut in two. Raises PreflightRefused if one is too long."""
+    found: list[Span] = []
+    for register in sorted(registers, key=lambda one: (one.table, one.address, one.count)):
+        if register.count > most:
+            raise PreflightRefused(
+                f"a 32-bit number in register {register.address} can't be sent or read in one piece",
+                where="profile, cycle.functions",
+                next_step="Its two halves would act one after the other; the drive needs function 16 or 23 for it",
+            )
+        end = register.address + register.count
+        if found:
+            last = found[-1]
+            near = register.table == last.table and register.address <= last.address + last.length + gap
+            if near and end - last.address <= most:
+                found[-1] = Span(last.table, last.address, max(last.length, end - last.address))
+                continue
+        found.append(Span(register.table, register.address, register.count))
+    return found
+
+
+def _pair(writes: Sequence[Span], reads: Sequence[Span], functions: frozenset[int]) -> tuple[Transaction, ...]:
+    """One transaction for a write and a read where function 23 is known; the order of the writes is kept."""
+    pairable = [span for span in reads if span.table == "holding"] if pdu.READ_WRITE in functions else []
+    fit = [span.length <= pdu.MOST_WRITTEN_WITH_READ for span in writes]
+    pairs = min(len(writes), len(pairable)) if all(fit) else 0
+    alone, paired = writes[: len(writes) - pairs], writes[len(writes) - pairs :]
+    # The last pairable reads: those that bring speed and torque then come in the same transactions as the control word.
+    shared = pairable[len(pairable) - pairs :]
+    rest = [span for span in reads if span not in shared]
+    return (
+        *(_write(span, functions) for span in alone),
+        *(_read(span, functions) for span in rest),
+        *(Transaction(pdu.READ_WRITE, one, other) for one, other in zip(paired, shared, strict=True)),
+    )
+
+
+def _write(span: Span, functions: frozenset[int]) -> Transaction:
+    if span.length == 1 and pdu.WRITE_ONE in functions:
+        return Transaction(pdu.WRITE_ONE, span, None)
+    if pdu.WRITE_MANY in functions:
+        return Transaction(pdu.WRITE_MANY, span, None)
+    if pdu.READ_WRITE in functions:
+        # What was written is read along: the function can't go without a read.
+        return Transaction(pdu.READ_WRITE, span, span)
+    raise _unable("written", span)
+
+
+def _read(span: Span, functions: frozenset[int]) -> Transaction:
+    function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
+    if function not in functions:
+        raise _unable("read", span)
+    return Transaction(function, None, span)
+
+
+def _unable(verb: str, span: Span) -> PreflightRefused:
+    return PreflightRefused(
+        f"register {span.address} can't be {verb}: the profile names no function for it",
+        where="profile, cycle.functions",
+        next_step="Say there which function codes the drive knows: 3 reads, 6, 16 or 23 write",
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One round of the cycle's transactions over the line, and when speed and torque were under way.
+
+
+BUSY_TRIES, BUSY_PAUSE_S = 3, 0.002
+"""Of a transaction in the cycle that the drive put off with exception 6; then the cycle counts as missed."""
+
+
+class Round(NamedTuple):
+    """What the registers read were, and the control times that bound the transactions with speed and torque."""
+
+    words: Mapping[tuple[str, int], int]
+    sent_s: float
+    received_s: float
+    longest_s: float               # of the single transactions
+
+
+def go_round(
+    access: Access,
+    transactions: Sequence[Transaction],
+    image: Mapping[int, int],
+    timeout_s: float,
+    moving: Sequence[Register],
+    again_until_s: float = -math.inf,
+) -> Round:
+    """Run them one after the other; the first that fails ends the round.
+
+    A reply that noise has damaged is asked for once more, up to ``again_until_s`` (control time): the same words.
+
+    Raises CommunicationLost (NoReply, BadReply, LinkLost) and RegisterRefused.
+    """
+    words: dict[tuple[str, int], int] = {}
+    sent_s: float | None = None
+    received_s = longest_s = 0.0
+    for transaction in transactions:
+        answer = _patiently(access, transaction.request(image), timeout_s, str(transaction), again_until_s)
+        longest_s = max(longest_s, answer.received_s - answer.sent_s)
+        span = transaction.read
+        if span is None:
+            continue
+        words.update({(span.table, span.address + k): word for k, word in enumerate(answer.words)})
+        if any(span.covers(register) for register in moving):
+            sent_s = answer.sent_s if sent_s is None else sent_s
+            received_s = answer.received_s
+    return Round(words, sent_s or 0.0, received_s, longest_s)
+
+
+def _patiently(access: Access, pdu: bytes, timeout_s: float, what: str, again_until_s: float) -> Answer:
+    tries, noisy = 1, False
+    while True:
+        try:
+            return access.once(pdu, timeout_s, f"function {what}")
+        except NoisyReply:
+            if noisy or access.clock.now_s() >= again_until_s:
+                raise
+            noisy = True
+            continue
+        except RegisterRefused as error:
+            if error.code != BUSY or tries >= BUSY_TRIES:
+                raise
+        tries += 1
+        access.clock.wait_until(access.clock.now_s() + BUSY_PAUSE_S)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Setpoints(NamedTuple):
     """A command in the drive's own counts. ``reverse``: the speed's sign, where its register has none."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
+from drivers.clock import Ticks
 from drivers.drive import (
     Command,
     Counters,
@@ -30,27 +31,30 @@ from drivers.drive import (
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.modbus import preflight as checks
 from drivers.modbus.access import Access
-from drivers.modbus.codec import register_name
-from drivers.modbus.cycle import Codec, Feedback, Setpoints, shown_mode
-from drivers.modbus.echoes import check_setpoints, clear_setpoints
-from drivers.modbus.errors import BUSY, CycleRefused, LinkLost, RegisterRefused
-from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped
-from drivers.modbus.limits import own_speed_limits, set_limits
+from drivers.modbus.codec import Scales, register_name
+from drivers.modbus.cycle import (
+    Codec,
+    Feedback,
+    Round,
+    Setpoints,
+    Transaction,
+    go_round,
+    only_reads,
+    plan_cycle,
+    shown_mode,
+)
+from drivers.modbus.identity import read_marker, refuse_if_driven, refuse_unless_stepped, tell_stage
 from drivers.modbus.link import Link, late_replies
 from drivers.modbus.other_master import OtherMaster
-from drivers.modbus.parameters import find_filters
-from drivers.modbus.plan import Transaction, only_reads, plan_cycle
+from drivers.modbus.parameters import find_filters, own_speed_limits, set_limits
+from drivers.modbus.pdu import BUSY, CycleRefused, LinkLost, RegisterRefused
 from drivers.modbus.position import Angle, find_angle
-from drivers.modbus.rounds import Round, go_round
-from drivers.modbus.scales import Scales
-from drivers.modbus.stage_marker import tell_stage
-from drivers.modbus.standstill import Standstill
-from drivers.modbus.state_machine import Wish, controlword_towards, decode, power_state, seen
+from drivers.modbus.preflight import check_setpoints, clear_setpoints
+from drivers.modbus.state_machine import Standstill, Wish, controlword_towards, decode, power_state, seen
 from drivers.modbus.temperature import Heat
 from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
 from drivers.own_limits import SPEED, TORQUE, OwnLimits
 from drivers.preflight import Table
-from drivers.ticks import Ticks
 from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25

@@ -3,17 +3,43 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from typing import NamedTuple
 
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.codec import register_name
-from drivers.modbus.errors import NoReply, RegisterRefused
+from drivers.modbus.pdu import NoReply, RegisterRefused
 from drivers.modbus.state_machine import decode, power_state
 from profiles.modbus import ModbusProfile
-from profiles.simulator_marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_TEXT
+from profiles.simulator_marker import (
+    MARKER_REGISTER,
+    MARKER_REGISTERS,
+    MARKER_STAGE_REGISTER,
+    MARKER_TEXT,
+    STAGE_NUMBERS,
+)
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Telling a simulated peer which stage of the protocol begins: its scripted faults wait for it.
+
+
+_LONGEST_S = 0.05
+"""For the reply, in the middle of a run: a rehearsal must not cost the run its beat."""
+
+
+def tell_stage(access: Access, stage: str) -> None:
+    """One request, asked once; whether it gets through is the peer's concern. Anything but a stage is not told."""
+    number = STAGE_NUMBERS.get(stage)
+    if number is None:
+        return
+    request = access.write_request(MARKER_STAGE_REGISTER, (number,))
+    with suppress(CommunicationLost, RegisterRefused):
+        access.once(request, _LONGEST_S, f"register {MARKER_STAGE_REGISTER}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Marker(NamedTuple):
     """``stepped`` only of a simulated peer."""

@@ -16,11 +16,10 @@ from typing import NamedTuple
 from drivers.errors import CommunicationLost
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
-from drivers.modbus.codec import from_words, register_name
-from drivers.modbus.errors import LinkLost, RegisterRefused
+from drivers.modbus.codec import from_words, per_count, register_name, si_per_count
+from drivers.modbus.cycle import CyclePlan, Span, spans
 from drivers.modbus.parameters import show
-from drivers.modbus.plan import CyclePlan, Span, spans
-from drivers.modbus.scales import per_count, si_per_count
+from drivers.modbus.pdu import LinkLost, RegisterRefused
 from profiles.modbus import ModbusProfile, Parameter, Register, Signal
 
 REMEMBERED_S = 0.5

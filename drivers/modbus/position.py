@@ -10,7 +10,7 @@ from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
 from drivers.modbus.codec import WordOrder, from_words, register_name
-from drivers.modbus.errors import RegisterRefused
+from drivers.modbus.pdu import RegisterRefused
 from drivers.preflight import Table
 from profiles.modbus import ModbusProfile, Position
 

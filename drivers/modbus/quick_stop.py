@@ -12,9 +12,9 @@ from contextlib import suppress
 from drivers.drive import FrameTap, Mode, PowerState
 from drivers.errors import PreflightRefused, TdhilError
 from drivers.modbus.access import Access
+from drivers.modbus.codec import si_per_count
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.link import Link
-from drivers.modbus.scales import si_per_count
 from drivers.modbus.state_machine import decode, power_state, seen
 from drivers.quick_stop import Seen
 from profiles.modbus import ModbusProfile, StatusState

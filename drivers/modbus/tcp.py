@@ -25,9 +25,8 @@ from pymodbus.pdu import DecodePDU
 
 from drivers.clock import Clock
 from drivers.errors import PreflightRefused
-from drivers.modbus.errors import BadReply, LinkLost, NoReply
 from drivers.modbus.link import Reply
-from drivers.modbus.pdu import answers
+from drivers.modbus.pdu import BadReply, LinkLost, NoReply, answers
 
 CONNECT_S = 3.0
 DEAD_AFTER_MS = 1000

@@ -7,7 +7,7 @@ from drivers.errors import CommunicationLost, LimitHit, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
 from drivers.modbus.codec import from_words, register_name
-from drivers.modbus.errors import LinkLost, RegisterRefused
+from drivers.modbus.pdu import LinkLost, RegisterRefused
 from drivers.modbus.state_machine import seen
 from drivers.preflight import Table
 from profiles.modbus import ModbusProfile, Temperature

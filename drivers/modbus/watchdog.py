@@ -10,11 +10,9 @@ from drivers.drive import Limits
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
-from drivers.modbus.limits import write_setting
-from drivers.modbus.parameters import Parameters, show, where_of
-from drivers.modbus.rounds import Round
-from drivers.no_watchdog import ANY_CLIENT, DIES, SHARED_FLAG, settle
-from drivers.preflight import Table
+from drivers.modbus.cycle import Round
+from drivers.modbus.parameters import Parameters, show, where_of, write_setting
+from drivers.preflight import ANY_CLIENT, DIES, SHARED_FLAG, Table, settle
 from profiles.modbus import ModbusProfile, Parameter
 
 LEAST_CYCLES = 5

@@ -43,15 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
     if "list" in namespace.fault:
-        from sim_bus.fault_catalogue import listing
+        from sim_bus.canopen.faults import listing
 
         print(listing())  # noqa: T201
         return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
         from profiles.library import load_canopen_profile
+        from sim_bus.canopen.faults import parse_all
         from sim_bus.canopen.simulator import Simulator
-        from sim_bus.fault_catalogue import parse_all
         from sim_bus.params import RigParams, load_rig
 
         faults = parse_all(namespace.fault)
@@ -81,8 +81,7 @@ def _open_bus(namespace: argparse.Namespace) -> Iterator[tuple["can.BusABC", str
 
 
 def _hub_bus(host: str, port: int) -> tuple["can.BusABC", str]:
-    from sim_bus.canopen.socketcand import Hub
-    from sim_bus.hub_port import HubPort
+    from sim_bus.canopen.socketcand import Hub, HubPort
 
     try:
         hub = Hub(host, port)

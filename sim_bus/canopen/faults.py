@@ -6,16 +6,579 @@ way to the drive lets time go on all the same, and the host is told where each c
 is then in its cycle.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from profiles.simulator_marker import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
+from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_catalogue import make
-from sim_bus.fault_hooks import Frame, Misbehaviour, Scene
-from sim_bus.fault_script import Cast, Scripted
+from sim_bus.fault_script import (
+    Cast,
+    Kind,
+    Scripted,
+    factor,
+    listing_of,
+    make_from,
+    parse_from,
+    plain,
+    seconds,
+    share,
+)
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
+
+
+Frame = tuple[int, bytes | bytearray]
+Frames = Iterable[Frame]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where a fault happens. ``put`` sends a frame past all faults, as another station on the bus would."""
+
+    node: Cia402Node
+    put: Callable[[int, bytes], None]
+    rng: np.random.Generator
+
+    def foreign(self, can_id: int, data: bytes) -> None:
+        """A frame of a third party: everybody on the bus hears it, the drive among them."""
+        self.put(can_id, data)
+        self.node.on_frame(can_id, data)
+
+
+class Misbehaviour:
+    """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
+
+    scene: Scene
+
+    def begin(self) -> None:
+        """It starts."""
+
+    def end(self) -> None:
+        """It is over."""
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        """What becomes of a frame that the drive sends."""
+        return ((can_id, data),)
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        """What becomes of a frame that comes to the drive."""
+        return ((can_id, data),)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Faults of the drive itself and of what it turns.
+
+
+_PROFILE_VELOCITY = 3
+
+
+class Emcy(Misbehaviour):
+    """An emergency message, and nothing else."""
+
+    def __init__(self, code: int) -> None:
+        self._code = code
+
+    def begin(self) -> None:
+        self.scene.node.emergency.report(self._code, emcy.GENERIC)
+
+
+class DriveFault(Emcy):
+    """The drive finds a fault: emergency message, its own fault reaction (605Eh), fault state."""
+
+    def begin(self) -> None:
+        super().begin()
+        self.scene.node.application.fault()
+
+
+class Restart(Misbehaviour):
+    """The drive restarts: torque off, defaults, boot-up message."""
+
+    def begin(self) -> None:
+        node = self.scene.node
+        node.on_frame(0x000, bytes((0x81, node.id)))
+
+
+class ForeignNmt(Misbehaviour):
+    """A third party sends an NMT command: 2 stop, 128 pre-operational (CiA 301)."""
+
+    def __init__(self, command: int) -> None:
+        self._command = command
+
+    def begin(self) -> None:
+        self.scene.foreign(0x000, bytes((self._command, self.scene.node.id)))
+
+
+class Deaf(Misbehaviour):
+    """The state machine doesn't move on commands any more."""
+
+    def begin(self) -> None:
+        self.scene.node.application.deaf = True
+
+    def end(self) -> None:
+        self.scene.node.application.deaf = False
+
+
+class SafeTorqueOff(Deaf):
+    """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
+
+    def begin(self) -> None:
+        self.scene.node.application.power_off()
+        super().begin()
+
+
+class ModeKept(Misbehaviour):
+    """6060h is taken and not followed: 6061h goes on showing the old mode."""
+
+    def begin(self) -> None:
+        self.scene.node.application.keeps_mode = True
+
+    def end(self) -> None:
+        self.scene.node.application.keeps_mode = False
+
+
+class ModeLost(ModeKept):
+    """The drive goes over to its profile velocity mode (3) by itself, and stays there whatever 6060h says."""
+
+    def begin(self) -> None:
+        self.scene.node.application.set_mode(_PROFILE_VELOCITY)
+        super().begin()
+
+
+class LimitedTorque(Misbehaviour):
+    """An internal limit leaves this share of the torque limit."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def begin(self) -> None:
+        limits = self.scene.node.inverter.control.limits
+        self._before = limits.torque_forward_nm, limits.torque_reverse_nm
+        limits.torque_forward_nm *= self._share
+        limits.torque_reverse_nm *= self._share
+
+    def end(self) -> None:
+        limits = self.scene.node.inverter.control.limits
+        limits.torque_forward_nm, limits.torque_reverse_nm = self._before
+
+
+class LoadLost(Misbehaviour):
+    """What was coupled comes off: this share of the motor end's inertia and friction is left."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def begin(self) -> None:
+        self.scene.node.inverter.lose_load(self._share)
+
+
+class Reported(Misbehaviour):
+    """What the drive reports is scaled so; what it regulates by isn't."""
+
+    def __init__(self, *, speed: float = 1.0, torque: float = 1.0) -> None:
+        self._speed, self._torque = speed, torque
+
+    def begin(self) -> None:
+        self._scale(self._speed, self._torque)
+
+    def end(self) -> None:
+        self._scale(1.0, 1.0)
+
+    def _scale(self, speed: float, torque: float) -> None:
+        reporting = self.scene.node.inverter.reporting
+        reporting.speed_scale, reporting.torque_scale = speed, torque
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Faults of the bus: frames that are lost, doubled, late, old, or somebody else's.
+
+
+SYNC_ID = 0x080
+_FIRST_TPDO, _SECOND_TPDO, _HEARTBEAT, _ANSWER, _REQUEST = 0x180, 0x280, 0x700, 0x580, 0x600
+_SWITCH_ON_DISABLED = b"\x40\x02"
+_AT_REST = b"\x37\x16"        # operation enabled, target reached, speed zero
+
+
+class Dead(Misbehaviour):
+    """Nothing gets through, either way: a cable that is cut, an adapter that is pulled."""
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return ()
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return ()
+
+
+class Lossy(Misbehaviour):
+    """A share of all frames is lost, either way."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return () if self.scene.rng.random() < self._share else ((can_id, data),)
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return () if self.scene.rng.random() < self._share else ((can_id, data),)
+
+
+class Without(Misbehaviour):
+    """The drive no longer sends frames of these kinds (the identifier less the node)."""
+
+    def __init__(self, *kinds: int) -> None:
+        self._kinds = kinds
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        return () if can_id - self.scene.node.id in self._kinds else ((can_id, data),)
+
+
+class Doubled(Misbehaviour):
+    """A share of the TPDOs comes twice."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        twice = can_id == _FIRST_TPDO + self.scene.node.id and self.scene.rng.random() < self._share
+        return ((can_id, data),) * (1 + twice)
+
+
+class Reordered(Misbehaviour):
+    """A share of the first TPDO is held back until after that of the next SYNC."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+        self._held: list[Frame] = []
+
+    def end(self) -> None:
+        self._held.clear()
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id != _FIRST_TPDO + self.scene.node.id:
+            return ((can_id, data),)
+        if self._held:
+            held, self._held = self._held, []
+            return ((can_id, data), *held)
+        if self.scene.rng.random() < self._share:
+            self._held.append((can_id, data))
+            return ()
+        return ((can_id, data),)
+
+
+class Frozen(Misbehaviour):
+    """The TPDOs go on coming, and say what they last said: a gateway that repeats its process image."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, bytes] = {}
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id - self.scene.node.id not in (_FIRST_TPDO, _SECOND_TPDO):
+            return ((can_id, data),)
+        return ((can_id, self._kept.setdefault(can_id, data)),)
+
+
+class Replayed(Misbehaviour):
+    """Somebody plays a recording of this drive, enabled and at rest: old TPDOs go before each of the drive's own."""
+
+    def __init__(self, before: int) -> None:
+        self._before = before
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        if can_id != _FIRST_TPDO + self.scene.node.id:
+            return ((can_id, data),)
+        old = _AT_REST + bytes(max(0, len(data) - 2))
+        return (*((can_id, old),) * self._before, (can_id, data))
+
+
+class SecondNode(Misbehaviour):
+    """Another drive has the same node ID: it answers too, and shows itself switched off."""
+
+    def begin(self) -> None:
+        if self.scene.node.sync_seen:
+            self.scene.put(_HEARTBEAT + self.scene.node.id, b"\0")     # it has just been switched on
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        kind = can_id - self.scene.node.id
+        if kind == _FIRST_TPDO:
+            return (can_id, data), (can_id, _SWITCH_ON_DISABLED + bytes(max(0, len(data) - 2)))
+        if kind in (_ANSWER, _HEARTBEAT):
+            return (can_id, data), (can_id, data)
+        return ((can_id, data),)
+
+
+class SecondMaster(Misbehaviour):
+    """Another host runs the drive: enabled before we come; later its own SYNC and setpoints beside ours."""
+
+    def begin(self) -> None:
+        node = self.scene.node
+        if not node.sync_seen:
+            for word in (0x06, 0x07, 0x0F):
+                node.application.write_controlword(word)
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id == SYNC_ID and node.sync_seen:
+            self.scene.put(SYNC_ID, b"")
+            self.scene.foreign(0x200 + node.id, bytes.fromhex("0f00") + bytes(6))
+        return ((can_id, data),)
+
+
+class ForeignHeartbeat(Misbehaviour):
+    """Another node bears the number 127, the host's: its heartbeat comes every so often."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_us = round(1e6 * every_s)
+        self._next_us = 0
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        now_us = self.scene.node.time_us
+        if now_us >= self._next_us:
+            self._next_us = now_us + self._every_us
+            self.scene.foreign(_HEARTBEAT + 127, b"\x05")
+        return ((can_id, data),)
+
+
+class ToolWrites(Misbehaviour):
+    """A tool writes one object by SDO, once; everybody on the bus hears it."""
+
+    def __init__(self, index: int, sub: int, value: int, size: int) -> None:
+        self._request = bytes((0x23 | (4 - size) << 2,)) + index.to_bytes(2, "little") + bytes((sub,)) + (
+            value.to_bytes(4, "little"))
+
+    def begin(self) -> None:
+        self.scene.foreign(_REQUEST + self.scene.node.id, self._request)
+
+
+class SettingChanged(Misbehaviour):
+    """One object gets another value from the drive's own panel: nothing of it is on the bus."""
+
+    def __init__(self, index: int, sub: int, value: int) -> None:
+        self._key, self._value = index << 8 | sub, value
+
+    def begin(self) -> None:
+        self.scene.node.store.write(self._key, self._value)
+
+
+class ForeignSetpoints(Misbehaviour):
+    """Another master sends enable operation and a speed of 500 counts in RPDO4, at each SYNC.
+
+    ``again``: and it switches that RPDO on again, by SDO, whenever it finds it off.
+    """
+
+    def __init__(self, again: bool) -> None:
+        self._again = again
+
+    def begin(self) -> None:
+        self.scene.node.store.write(0x1403 << 8 | 2, 1)        # synchronous: acts beside the host's
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id == SYNC_ID and node.sync_seen:
+            if self._again and int(node.store.number(0x1403 << 8 | 1)) >> 31:
+                switch_on = bytes.fromhex("23031401") + (0x500 + node.id).to_bytes(4, "little")
+                self.scene.foreign(_REQUEST + node.id, switch_on)
+            self.scene.foreign(0x500 + node.id, bytes.fromhex("0f00f4010000"))
+        return ((can_id, data),)
+
+
+class SdoMaster(Misbehaviour):
+    """Another master writes enable operation and a speed of 500 counts by SDO, after each SYNC."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        node = self.scene.node
+        if can_id != SYNC_ID or not node.sync_seen:
+            return ((can_id, data),)
+        wishes = [(_REQUEST + node.id, bytes.fromhex(one)) for one in ("23ff6000f4010000", "2b4060000f000000")]
+        for wish in wishes:
+            self.scene.put(*wish)
+        return ((can_id, data), *wishes)
+
+
+class Answers(Misbehaviour):
+    """Base of those that meddle with SDO. ``index`` and ``sub`` name the object."""
+
+    def __init__(self, index: int, sub: int) -> None:
+        self._object = index.to_bytes(2, "little") + bytes((sub,))
+
+    def _asked(self, can_id: int, data: bytes | bytearray, *commands: int) -> bool:
+        """Is it the beginning of a transfer of the object (command specifier 1 download, 2 upload; CiA 301)?"""
+        requested = can_id == _REQUEST + self.scene.node.id and len(data) == 8
+        return requested and data[0] >> 5 in commands and bytes(data[1:4]) == self._object
+
+    def _answer(self, first: int, rest: bytes = bytes(4)) -> None:
+        self.scene.put(_ANSWER + self.scene.node.id, bytes((first,)) + self._object + rest)
+
+
+class Aborted(Answers):
+    """The drive aborts every transfer of the object: 08000020h, data can't be transferred or stored."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        if not self._asked(can_id, data, 1, 2):
+            return ((can_id, data),)
+        self._answer(0x80, (0x08000020).to_bytes(4, "little"))
+        return ()
+
+
+class Unanswered(Answers):
+    """The drive doesn't answer when it is asked for the object."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        return () if self._asked(can_id, data, 1, 2) else ((can_id, data),)
+
+
+class NotKept(Answers):
+    """A write is answered as if it had been taken over; what stood there before goes on standing there."""
+
+    def incoming(self, can_id: int, data: bytes | bytearray) -> Frames:
+        if not self._asked(can_id, data, 1):
+            return ((can_id, data),)
+        self._answer(0x60)
+        return ()
+
+
+class Otherwise(Answers):
+    """The object reads as something else: its lowest byte comes with one bit changed."""
+
+    def outgoing(self, can_id: int, data: bytes) -> Frames:
+        upload = can_id == _ANSWER + self.scene.node.id and data[0] >> 5 == 2 and data[0] & 2
+        if upload and data[1:4] == self._object:
+            data = data[:4] + bytes((data[4] ^ 0x04,)) + data[5:]
+        return ((can_id, data),)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The faults that can be scripted on CANopen: name, row of the fault table, what they do, what their value means.
+
+
+_OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?(?::([0-9]{1,3}))?")
+
+
+def _code(text: str) -> int:
+    if not re.fullmatch(r"(?:0x)?[0-9A-Fa-f]{4}h?", text):
+        raise ValueError("an error code of four hexadecimal digits, such as 7305h")
+    return int(text.removeprefix("0x").removesuffix("h"), 16)
+
+
+def _frames(text: str) -> int:
+    if not (text.isdecimal() and 1 <= int(text) <= 100):
+        raise ValueError("a number of frames, 1 to 100")
+    return int(text)
+
+
+def _object(text: str) -> tuple[int, int]:
+    found = _OBJECT.fullmatch(text)
+    if found is None or int(found[2] or 0) > 255:
+        raise ValueError("an object, such as 6072h or 1016h:1")
+    return int(found[1], 16), int(found[2] or 0)
+
+
+def _again(text: str) -> bool:
+    if text not in ("once", "again"):
+        raise ValueError("once or again")
+    return text == "again"
+
+
+def _written(text: str) -> tuple[int, int, int, int]:
+    """6072h=100 or 1016h:1=0: object, value, and its size in bytes, as CiA 301 and 402 have it."""
+    where, _, value = text.partition("=")
+    index, sub = _object(where)
+    if not re.fullmatch(r"[0-9]{1,10}|[0-9A-Fa-f]{1,8}h", value):
+        raise ValueError("an object and what is written to it, such as 6072h=100")
+    number = int(value[:-1], 16) if value.endswith("h") else int(value)
+    size = 4 if index in _LONG or 0x1400 <= index < 0x1C00 else 1 if index in _SHORT else 2
+    if number >> 8 * size:
+        raise ValueError(f"a value of at most {size} bytes")
+    return index, sub, number, size
+
+
+_LONG, _SHORT = {0x1006, 0x1016, 0x6080, 0x6085, 0x60FF}, {0x100D, 0x6060}
+
+KINDS: dict[str, Kind[Misbehaviour]] = {
+    "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(Dead)),
+    "frame-loss": Kind(17, "this share of all frames is lost, either way",
+                       lambda v: Lossy(share(v)), "5%", "SHARE"),
+    "duplicate-frames": Kind(18, "this share of the feedback comes twice",
+                             lambda v: Doubled(share(v)), "10%", "SHARE"),
+    "reordered-frames": Kind(18, "this share of the feedback comes after that of the next cycle",
+                             lambda v: Reordered(share(v)), "10%", "SHARE"),
+    "frozen-feedback": Kind(19, "the feedback repeats its last values", plain(Frozen)),
+    "feedback-lost": Kind(19, "no TPDO comes any more; the heartbeat goes on",
+                          plain(lambda: Without(0x180, 0x280))),
+    "heartbeat-lost": Kind(20, "the drive's heartbeat ends", plain(lambda: Without(0x700))),
+    "node-reset": Kind(21, "the drive restarts (boot-up message); its torque is off, the shaft coasts",
+                       plain(Restart)),
+    "foreign-nmt-stop": Kind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
+    "foreign-nmt-preop": Kind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
+    "emcy": Kind(23, "an emergency message, with the drive still enabled",
+                 lambda v: Emcy(_code(v)), "7305h", "CODE"),
+    "drive-fault": Kind(23, "emergency message and fault state, after the drive's own fault reaction",
+                        lambda v: DriveFault(_code(v)), "3210h", "CODE"),
+    "sdo-abort": Kind(24, "the drive aborts every transfer of an object",
+                      lambda v: Aborted(*_object(v)), "6072h", "OBJECT"),
+    "sdo-timeout": Kind(25, "the drive doesn't answer when asked for an object",
+                        lambda v: Unanswered(*_object(v)), "6072h", "OBJECT"),
+    "second-master": Kind(26, "another host: from the start the drive is enabled already; later, foreign setpoints",
+                          plain(SecondMaster)),
+    "duplicate-node": Kind(26, "a second drive answers under the same node ID", plain(SecondNode)),
+    "replayed-feedback": Kind(26, "so many frames of a recording, taken at rest, go before each of the drive's own",
+                              lambda v: Replayed(_frames(v)), "1", "FRAMES"),
+    "foreign-heartbeat": Kind(56, "another node bears the host's number: its heartbeat comes so often",
+                              lambda v: ForeignHeartbeat(seconds(v)), "1s", "TIME"),
+    "tool-writes": Kind(57, "a tool writes an object by SDO, once",
+                        lambda v: ToolWrites(*_written(v)), "1016h:1=0", "OBJECT=VALUE"),
+    "setting-changed": Kind(58, "an object is changed at the drive's own panel",
+                            lambda v: SettingChanged(*_written(v)[:3]), "6007h=0", "OBJECT=VALUE"),
+    "foreign-setpoints": Kind(59, "another master sends setpoints in RPDO4, or switches that on again and again",
+                              lambda v: ForeignSetpoints(_again(v)), "once", "once|again"),
+    "sdo-master": Kind(60, "another master writes controlword and speed by SDO, in every cycle",
+                       plain(SdoMaster)),
+    "wrong-identity": Kind(29, "1018h:1, the vendor, is another one",
+                           plain(lambda: Otherwise(0x1018, 1))),
+    "fault-at-start": Kind(30, "the drive is in fault when the host comes",
+                           lambda v: DriveFault(_code(v)), "3210h", "CODE"),
+    "stuck-state": Kind(31, "the controlword is ignored", plain(Deaf)),
+    "mode-not-followed": Kind(32, "6061h doesn't follow 6060h", plain(ModeKept)),
+    "mode-lost": Kind(82, "the drive goes over to mode 3 by itself, and stays there", plain(ModeLost)),
+    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(SafeTorqueOff)),
+    "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
+                           lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
+    "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
+                      lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
+    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: Reported(speed=-1.0))),
+    "write-not-kept": Kind(45, "a write to an object is answered and not kept",
+                           lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
+    "reads-back-otherwise": Kind(45, "an object reads back as something else",
+                                 lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
+    "watchdog-not-armed": Kind(50, "the write to 1016h:1 is answered and not kept",
+                               plain(lambda: NotKept(0x1016, 1))),
+    "torque-scale": Kind(0, "the reported torque is multiplied by this",
+                         lambda v: Reported(torque=factor(v)), "1.1", "FACTOR"),
+}
+
+
+def make(fault: Scripted) -> Misbehaviour:
+    """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
+    return make_from(KINDS, fault)
+
+
+def parse_all(texts: Sequence[str]) -> tuple[Scripted, ...]:
+    """All the faults of a command line, each checked. Raises FaultRefused."""
+    return parse_from(KINDS, texts)
+
+
+def listing() -> str:
+    """Every fault with its row and value, for people."""
+    return listing_of(KINDS)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _SEED = 0xFA17
 

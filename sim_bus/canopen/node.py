@@ -15,18 +15,23 @@ from canopen.objectdictionary import datatypes
 
 from profiles.canopen import CanopenProfile
 from profiles.simulator_marker import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
-from sim_bus import emergency as emcy
+from sim_bus.canopen import services as emcy
 from sim_bus.canopen.application_objects import ApplicationObjects
 from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.canopen.pdo import ReceivePdo, TransmitPdo
 from sim_bus.canopen.profile_emulation import WornProfile
 from sim_bus.canopen.sender import PassiveNetwork, Sender
-from sim_bus.canopen.services import Nmt, NmtCommand, NmtState
+from sim_bus.canopen.services import (
+    Emergency,
+    HeartbeatConsumer,
+    HeartbeatProducer,
+    LifeGuard,
+    Nmt,
+    NmtCommand,
+    NmtState,
+)
 from sim_bus.cia402 import Application
-from sim_bus.emergency import Emergency
-from sim_bus.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from sim_bus.inverter import Inverter
-from sim_bus.node_guarding import LifeGuard
 from sim_bus.params import RigParams
 from sim_bus.trace import ROW_PERIOD_US, Trace
 

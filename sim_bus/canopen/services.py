@@ -1,7 +1,197 @@
 """NMT, slave side (CiA 301): states as a heartbeat shows them, and the master's commands."""
 
-from enum import IntEnum
 
+from collections.abc import Callable
+from enum import IntEnum
+from struct import Struct
+
+from canopen.sdo import SdoAbortedError
+
+from sim_bus.canopen.objects import ABORT_NO_DATA, ABORT_VALUE, ObjectStore, key_of
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Error register 1001h, error history 1003h, error code 603Fh and the EMCY that tells of them (CiA 301).
+#
+# ::
+#
+#     EMCY    byte 0 1 error code, little-endian · 2 error register · 3..7 manufacturer's, 0 here
+
+
+GENERIC = 0x01
+COMMUNICATION = 0x10
+HEARTBEAT_LOST = 0x8130
+PDO_TOO_SHORT = 0x8210
+_EMCY = Struct("<HB5x")
+_HISTORY = 8
+
+
+class Emergency:
+    """What is wrong at present, and what was."""
+
+    def __init__(self, store: ObjectStore, send: Callable[[bytes], None]) -> None:
+        self.register = 0
+        self.code = 0
+        self._history: list[int] = []
+        self._send = send
+        store.live[key_of(0x1001)] = lambda: self.register
+        store.live[key_of(0x603F)] = lambda: self.code
+        store.live[key_of(0x1003)] = lambda: len(self._history)
+        store.hooks[key_of(0x1003)] = self._clear_history
+        for number in range(_HISTORY):
+            self._bind(store, number)
+
+    def _bind(self, store: ObjectStore, number: int) -> None:
+        def read() -> int:
+            if number >= len(self._history):
+                raise SdoAbortedError(ABORT_NO_DATA)
+            return self._history[number]
+
+        store.live[key_of(0x1003, number + 1)] = read
+
+    def report(self, code: int, register: int, *, lasting: bool = True) -> None:
+        """Sends an EMCY and notes it; what is not ``lasting`` leaves no trace in 1001h and 603Fh."""
+        if lasting:
+            self.register |= register | GENERIC
+            self.code = code
+        self._history = [code, *self._history][:_HISTORY]
+        self._send(_EMCY.pack(code, self.register | register | GENERIC))
+
+    def reset(self) -> None:
+        """Nothing is wrong any more; says so where something was."""
+        if self.register or self.code:
+            self.register = self.code = 0
+            self._send(_EMCY.pack(0, 0))
+
+    def forget(self) -> None:
+        """Power-on: no error, no history, no message."""
+        self.register = self.code = 0
+        self._history = []
+
+    def _clear_history(self, value: int) -> None:
+        if value:
+            raise SdoAbortedError(ABORT_VALUE)
+        self._history = []
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Heartbeat both ways in plant time: 1017h sends ours, 1016h:1 watches the host's (CiA 301).
+
+
+class HeartbeatConsumer:
+    """Supervision of one node, begun by its first heartbeat; `expired` says once that it has fallen silent."""
+
+    def __init__(self) -> None:
+        self.setting = 0
+        self.cob_id = -1
+        self.alive = False
+        self._timeout_us = 0
+        self._last_us = 0
+
+    def configure(self, value: int) -> None:
+        """1016h:1 = node << 16 | milliseconds; 0 in either switches off. Supervision waits for a heartbeat again."""
+        self.setting = value
+        node, milliseconds = value >> 16 & 0xFF, value & 0xFFFF
+        active = 1 <= node <= 127 and milliseconds > 0
+        self.cob_id = 0x700 + node if active else -1
+        self._timeout_us = 1000 * milliseconds
+        self.alive = False
+
+    def beat(self, now_us: int) -> bool:
+        """A heartbeat came; True where it is the first one, or the first after a silence."""
+        first, self.alive = not self.alive, True
+        self._last_us = now_us
+        return first
+
+    def expired(self, now_us: int) -> bool:
+        """True once, when the time has run out."""
+        if self.alive and now_us - self._last_us >= self._timeout_us:
+            self.alive = False
+            return True
+        return False
+
+
+class HeartbeatProducer:
+    """When our own heartbeat is due."""
+
+    def __init__(self) -> None:
+        self._period_us = 0
+        self._next_us = 0
+        self._now_us = 0
+
+    @property
+    def active(self) -> bool:
+        """It is switched on."""
+        return self._period_us > 0
+
+    def configure(self, milliseconds: int) -> None:
+        """1017h; 0 switches off, otherwise the first one is due at once."""
+        self._period_us = 1000 * milliseconds
+        self._next_us = self._now_us
+
+    def due(self, now_us: int) -> bool:
+        """True when one has to be sent now; several missed ones are one."""
+        self._now_us = now_us
+        if not self._period_us or now_us < self._next_us:
+            return False
+        self._next_us = max(self._next_us + self._period_us, now_us + 1)
+        return True
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Node guarding and life guarding, slave side, in plant time (CiA 301).
+#
+# Every remote frame on 700h + node is answered with one byte: bit 7 toggles (0 in the first answer after a reset),
+# bits 0 to 6 are the NMT state. With 100Ch and 100Dh both set, the first question begins the life guarding: their
+# product, in ms, is the time after which a host that doesn't ask counts as dead.
+
+
+class LifeGuard:
+    """What is set, when the host asked last, and which toggle comes next."""
+
+    def __init__(self) -> None:
+        self.guard_ms = 0
+        self.factor = 0
+        self.alive = False
+        self._last_us = 0
+        self._toggle = 0
+
+    def set_guard(self, milliseconds: int) -> None:
+        """100Ch; supervision waits for a question again."""
+        self.guard_ms = milliseconds
+        self.alive = False
+
+    def set_factor(self, factor: int) -> None:
+        """100Dh; supervision waits for a question again."""
+        self.factor = factor
+        self.alive = False
+
+    def answer(self, state: int) -> bytes:
+        """The byte that answers a question."""
+        byte, self._toggle = self._toggle | state, self._toggle ^ 0x80
+        return bytes([byte])
+
+    def asked(self, now_us: int) -> bool:
+        """A question came; True where supervision begins with it."""
+        if not self.guard_ms * self.factor:
+            return False
+        first, self.alive = not self.alive, True
+        self._last_us = now_us
+        return first
+
+    def expired(self, now_us: int) -> bool:
+        """True once, when the life time has run out."""
+        if self.alive and now_us - self._last_us >= 1000 * self.guard_ms * self.factor:
+            self.alive = False
+            return True
+        return False
+
+    def reset(self) -> None:
+        """Boot-up: the toggle begins at 0 again, nothing is supervised."""
+        self._toggle = 0
+        self.alive = False
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class NmtState(IntEnum):
     """The byte of a heartbeat; 0 is the boot-up message."""

@@ -11,9 +11,75 @@ import contextlib
 import selectors
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from sim_bus.socketcand import HI, LONGEST_WORD, OK, WireFrame, frame_word, parse_send, split
+import can
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The words of socketcand's raw mode, as python-can's stock client speaks and understands them. Pure.
+#
+# ::
+#
+#     server → client   < hi >                               on connection
+#     client → server   < open can0 >                        → < ok >
+#     client → server   < rawmode >                          → < ok >
+#     client → server   < send 123 2 a 1f >                  identifier (3 or 8 digits), length, bytes; hex
+#     server → client   < frame 123 1700000000.123456 0A1F > bytes without blanks; none at all: two blanks before >
+#
+# A length with no bytes is what the client makes of a remote frame.
+
+
+HI = b"< hi >"
+OK = b"< ok >"
+LONGEST_WORD = 512
+"""A client that sends so much without a ``>`` isn't one."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireFrame:
+    """A frame on its way through the hub."""
+
+    can_id: int
+    extended: bool
+    data: bytes
+    remote_length: int | None = None
+
+
+def split(buffer: bytearray) -> list[str]:
+    """Takes the complete words ``< … >`` out of the front of ``buffer`` and returns what stands inside them."""
+    end = buffer.rfind(b">")
+    if end < 0:
+        return []
+    text = buffer[: end + 1].decode("ascii", "replace")
+    del buffer[: end + 1]
+    return [word.split("<", 1)[-1].strip() for word in text.split(">")[:-1]]
+
+
+def parse_send(word: str) -> WireFrame | None:
+    """The frame in ``send …``; None where it is none."""
+    parts = word.split()
+    try:
+        can_id, length = int(parts[1], 16), int(parts[2], 16)
+        data = bytes(int(part, 16) for part in parts[3:])
+    except (IndexError, ValueError):
+        return None
+    extended = len(parts[1]) > 3
+    if not 0 <= length <= 8 or not 0 <= can_id <= (0x1FFFFFFF if extended else 0x7FF):
+        return None
+    if not data and length:
+        return WireFrame(can_id, extended, b"", length)
+    return WireFrame(can_id, extended, data) if len(data) == length else None
+
+
+def frame_word(frame: WireFrame, time_s: float) -> bytes:
+    """What a client is told of a frame."""
+    digits = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
+    return f"< frame {digits} {time_s:.6f} {frame.data.hex().upper()} >".encode("ascii")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 HOLD_S = 0.020
 """The client takes the ``< ok >`` of rawmode by itself: a frame glued to it would be an error to it."""
@@ -182,3 +248,43 @@ class Hub:
         client.socket.close()
         if client.raw and not any(other.raw for other in self._clients):
             self.all_gone = True
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A python-can bus that is a port of our own hub: receiving moves the hub, so that no second thread is needed.
+
+
+class HubPort(can.BusABC):
+    """The local end. When the last client leaves, `recv` raises `can.CanOperationError` once: the bus has ended."""
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._queue: deque[can.Message] = deque()
+        hub.tap(self._deliver)
+        self.channel_info = f"hub {hub.host}:{hub.port}"
+        super().__init__(channel=hub.channel)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """To all clients; what a client doesn't take at once waits in the hub."""
+        if not (msg.is_remote_frame or msg.is_error_frame):
+            self._hub.send(WireFrame(msg.arbitration_id, msg.is_extended_id, bytes(msg.data)))
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        queue = self._queue
+        if not queue:
+            self._hub.poll(1.0 if timeout is None else timeout)
+            if not queue and self._hub.all_gone:
+                self._hub.all_gone = False
+                raise can.CanOperationError("the last client has left")
+        return (queue.popleft(), True) if queue else (None, True)
+
+    def _deliver(self, frame: WireFrame) -> None:
+        self._queue.append(can.Message(
+            timestamp=time.time(), arbitration_id=frame.can_id, is_extended_id=frame.extended, data=frame.data,
+            is_remote_frame=frame.remote_length is not None, dlc=frame.remote_length,
+        ))
+
+    def shutdown(self) -> None:
+        """Ends the hub as well."""
+        super().shutdown()
+        self._hub.close()

@@ -41,15 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Simulates until SIGINT or SIGTERM; prints one line ``ready: …`` on stdout. Returns the exit code."""
     if "list" in namespace.fault:
-        from sim_bus.modbus.fault_catalogue import listing
+        from sim_bus.modbus.faults import listing
 
         print(listing())  # noqa: T201
         return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
         from profiles.library import load_modbus_profile
-        from sim_bus.modbus.fault_catalogue import parse_all, wrongs_of
-        from sim_bus.modbus.faults import Faults
+        from sim_bus.modbus.faults import Faults, parse_all, wrongs_of
         from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
         from sim_bus.modbus.machine import Machine
         from sim_bus.modbus.server import Server

@@ -5,21 +5,85 @@ control time, until the reply is complete, and that wait is what moves the plant
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from profiles.modbus import ModbusProfile
+from profiles.modbus import Line, ModbusProfile
 from sim_bus.fault_script import Scripted
-from sim_bus.modbus.fault_catalogue import wrongs_of
-from sim_bus.modbus.faults import Faults, tells_stage
+from sim_bus.modbus.codec import Reply
+from sim_bus.modbus.faults import Faults, tells_stage, wrongs_of
 from sim_bus.modbus.machine import Machine
-from sim_bus.modbus.reply import Reply
-from sim_bus.modbus.timing import LineTiming
 from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How long a request and its reply take on the line. Pure; seconds.
+#
+# RTU: a character is 11 bits (start, 8, parity, stop; or two stops), a frame is unit + PDU + two of CRC, and its end
+# is known after 3.5 characters of silence, 1.75 ms above 19,200 baud (Modbus over serial line, section 2.5.1.1). TCP:
+# no characters, but a latency each way, with a jitter on top.
+#
+# ::
+#
+#     |silence| request | silence | turn-around | reply | silence | next request
+
+
+CHARACTER_BITS = 11
+_FRAME = 3
+"""Unit and CRC, in characters."""
+_FIXED_SILENCE_S = 0.00175
+_FIXED_ABOVE_BAUD = 19200
+TCP_LATENCY_S = 0.0005
+TCP_JITTER_S = 0.0003
+
+
+@dataclass(frozen=True, slots=True)
+class LineTiming:
+    """One line with a drive at its end."""
+
+    character_s: float = 0.0
+    silence_s: float = 0.0
+    """Between two frames."""
+    turn_around_s: float = 0.0
+    """From the end of a request, as the drive sees it, to the first character of its reply."""
+    latency_s: float = 0.0
+    """Each way."""
+    jitter_s: float = 0.0
+    """The most that is added to the latency, each way."""
+
+    @classmethod
+    def rtu(cls, baud: int, turn_around_s: float) -> Self:
+        """A serial line."""
+        character_s = CHARACTER_BITS / baud
+        silence_s = _FIXED_SILENCE_S if baud > _FIXED_ABOVE_BAUD else 3.5 * character_s
+        return cls(character_s=character_s, silence_s=silence_s, turn_around_s=turn_around_s)
+
+    @classmethod
+    def tcp(cls, turn_around_s: float, latency_s: float = TCP_LATENCY_S, jitter_s: float = TCP_JITTER_S) -> Self:
+        """A network."""
+        return cls(turn_around_s=turn_around_s, latency_s=latency_s, jitter_s=jitter_s)
+
+    @classmethod
+    def of(cls, line: Line) -> Self:
+        """The line that a profile describes: TCP where it has that."""
+        if "tcp" in line.transports:
+            return cls.tcp(line.turn_around_s)
+        return cls.rtu(line.baud, line.turn_around_s)
+
+    def way_s(self, pdu_bytes: int, chance: float) -> float:
+        """From the first to the last character of a frame, and over the network; ``chance`` in [0, 1) is its jitter."""
+        return (pdu_bytes + _FRAME) * self.character_s + self.latency_s + chance * self.jitter_s
+
+    def acts_after_s(self, pdu_bytes: int, chance: float) -> float:
+        """From the first character of a request until the drive acts on it and begins to reply."""
+        return self.way_s(pdu_bytes, chance) + self.silence_s + self.turn_around_s
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _BROADCAST = 0
 AT_REST_RAD_S = 0.01
@@ -31,7 +95,7 @@ _LOOK_S = 0.1
 class EmbeddedModbusDrive:
     """A drive that wears ``profile``, at the end of a line of ``timing`` (the profile's own unless given).
 
-    ``script`` as `sim_bus.modbus.fault_catalogue.parse_all` gives it. TdhilError where it doesn't fit the profile.
+    ``script`` as `sim_bus.modbus.faults.parse_all` gives it. TdhilError where it doesn't fit the profile.
     """
 
     def __init__(self, params: RigParams, profile: ModbusProfile, *, unit: int = 1, seed: int = 0,

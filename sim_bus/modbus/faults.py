@@ -4,17 +4,418 @@ All of it in plant time. That the host says which stage has begun (`profiles.sim
 belongs to the rehearsal, not to the line: no fault comes between.
 """
 
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from profiles.modbus import ModbusProfile
 from profiles.simulator_marker import MARKER_STAGE_REGISTER
-from sim_bus.fault_script import Cast, Scripted
-from sim_bus.modbus.fault_catalogue import make
-from sim_bus.modbus.fault_hooks import Ask, Misbehaviour, Scene
+from sim_bus.cia402 import Mode
+from sim_bus.fault_script import (
+    Cast,
+    FaultRefused,
+    Kind,
+    Moment,
+    Scripted,
+    factor,
+    listing_of,
+    make_from,
+    parse_from,
+    plain,
+    share,
+)
+from sim_bus.modbus.codec import NONE, Reply
 from sim_bus.modbus.machine import Machine
-from sim_bus.modbus.reply import Reply
+from sim_bus.modbus.wrong_maps import Wrong, parse
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a scripted fault of a Modbus drive may do: come between request and reply, and lay hands on the drive itself.
+
+
+Ask = Callable[[bytes], Reply]
+"""A request PDU → what comes back for it."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where a fault happens."""
+
+    machine: Machine
+    profile: ModbusProfile
+    rng: np.random.Generator
+
+
+class Misbehaviour:
+    """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
+
+    scene: Scene
+
+    def begin(self) -> None:
+        """It starts."""
+
+    def end(self) -> None:
+        """It is over."""
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        """A request comes; ``ask`` is what would happen to it without this fault."""
+        return ask(pdu)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Faults of a Modbus line: requests and replies that are lost, late, damaged, refused, old; connections that die.
+#
+# Codes and frames: Modbus application protocol V1.1b3, section 7; messaging guide, 3.1.3; serial line guide, 2.5.1.
+
+
+_OTHER_TRANSACTION, _OTHER_CRC = 0x5555, 0x0100
+_TABLES = {3: "holding", 4: "input", 23: "holding"}
+
+
+class _Some(Misbehaviour):
+    """Happens to a share of the requests."""
+
+    def __init__(self, share: float) -> None:
+        self._share = share
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        return self._spoilt(pdu, ask) if self.scene.rng.random() < self._share else ask(pdu)
+
+    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+        raise NotImplementedError
+
+
+class NoReply(_Some):
+    """Neither request nor reply gets through; the drive doesn't act."""
+
+    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+        return NONE
+
+
+class WrongTransaction(_Some):
+    """The drive acts, and its reply bears the transaction of another request."""
+
+    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+        return ask(pdu)._replace(transaction_bits=_OTHER_TRANSACTION)
+
+
+class BadCrc(_Some):
+    """The drive acts, and its reply has a wrong CRC."""
+
+    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+        return ask(pdu)._replace(crc_bits=_OTHER_CRC)
+
+
+class Short(_Some):
+    """The drive acts, and says half of its reply."""
+
+    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+        reply = ask(pdu)
+        return reply if reply.pdu is None else reply._replace(pdu=reply.pdu[: (len(reply.pdu) + 1) // 2])
+
+
+class Late(Misbehaviour):
+    """The drive acts at once, and its reply comes so much later, s."""
+
+    def __init__(self, late_s: float) -> None:
+        self._late_s = late_s
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        reply = ask(pdu)
+        return reply._replace(late_s=reply.late_s + self._late_s)
+
+
+class Refusing(Misbehaviour):
+    """The drive hears every request, does nothing, and answers with an exception."""
+
+    def __init__(self, code: int) -> None:
+        self._code = code
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        return Reply(self.scene.machine.refuse(pdu, self._code))
+
+
+class Connection(Misbehaviour):
+    """The connection on which the next request comes is lost, once; a new one works."""
+
+    def __init__(self, how: Literal["reset", "half-open"]) -> None:
+        self._how: Literal["reset", "half-open"] = how
+        self._done = False
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        if self._done:
+            return ask(pdu)
+        self._done = True
+        return NONE._replace(connection=self._how)
+
+
+class Frozen(Misbehaviour):
+    """What is read of the feedback is what was read of it first: a gateway that repeats its process image.
+
+    What is written goes through.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[bytes, bytes] = {}
+
+    def end(self) -> None:
+        self._kept.clear()
+
+    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+        reply = ask(pdu)
+        if reply.pdu is None or reply.pdu[0] != pdu[0] or not self._is_feedback(pdu):
+            return reply
+        return reply._replace(pdu=self._kept.setdefault(pdu[:5], reply.pdu))
+
+    def _is_feedback(self, pdu: bytes) -> bool:
+        """Reads speed or torque."""
+        table = _TABLES.get(pdu[0])
+        first, count = int.from_bytes(pdu[1:3], "big"), int.from_bytes(pdu[3:5], "big")
+        cycle = self.scene.profile.cycle
+        return any(
+            signal.register_.table == table and first <= signal.register_.address < first + count
+            for signal in (cycle.speed, cycle.torque)
+        )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Faults of the Modbus drive itself and of what it turns.
+
+
+class Act(Misbehaviour):
+    """Something is done to the drive, and undone where it can be."""
+
+    def __init__(self, begin: Callable[[Machine], None], end: Callable[[Machine], None] | None = None) -> None:
+        self._begin, self._end = begin, end
+
+    def begin(self) -> None:
+        self._begin(self.scene.machine)
+
+    def end(self) -> None:
+        if self._end is not None:
+            self._end(self.scene.machine)
+
+
+class NotArmed(Misbehaviour):
+    """The watchdog's time is written without an error, and keeps what it was."""
+
+    def begin(self) -> None:
+        watchdog = self.scene.profile.watchdog.parameter
+        if watchdog is not None:
+            self.scene.machine.parameters.not_kept.add(watchdog)
+
+    def end(self) -> None:
+        self.scene.machine.parameters.not_kept.clear()
+
+
+def drive_fault() -> Act:
+    """The drive finds a fault: its own fault reaction, then fault."""
+    return Act(Machine.trip)
+
+
+def stuck() -> Act:
+    """The state machine doesn't move on commands any more."""
+    return Act(lambda machine: _deaf(machine, True), lambda machine: _deaf(machine, False))
+
+
+def safe_torque_off() -> Act:
+    """STO: torque off at once, and no enabling while it lasts. The shaft coasts."""
+    def begin(machine: Machine) -> None:
+        mode = machine.application.mode
+        machine.application.power_off()
+        machine.application.set_mode(mode.value)        # how the drive regulates is its wiring's
+        _deaf(machine, True)
+
+    return Act(begin, lambda machine: _deaf(machine, False))
+
+
+def mode_kept() -> Act:
+    """Speed or torque is chosen and not followed; the display shows what was before."""
+    def keep(machine: Machine, keeps: bool) -> None:
+        machine.application.keeps_mode = keeps
+
+    return Act(lambda machine: keep(machine, True), lambda machine: keep(machine, False))
+
+
+def mode_lost() -> Act:
+    """The drive regulates speed from then on, whatever is chosen, and shows it."""
+    def lose(machine: Machine) -> None:
+        machine.application.set_mode(Mode.CYCLIC_VELOCITY.value)
+        machine.application.keeps_mode = True
+
+    def over(machine: Machine) -> None:
+        machine.application.keeps_mode = False
+
+    return Act(lose, over)
+
+
+def limited_torque(share: float) -> Act:
+    """An internal limit leaves this share of the torque limits, whatever their registers say."""
+    return Act(lambda machine: machine.leave_torque(share), lambda machine: machine.leave_torque(1.0))
+
+
+def hot(temperature_c: float) -> Act:
+    """Motor and drive have become so hot."""
+    return Act(lambda machine: machine.heat(temperature_c), lambda machine: machine.heat(40.0))
+
+
+def load_lost(share: float) -> Act:
+    """What was coupled comes off: this share of the motor end's inertia and friction is left."""
+    return Act(lambda machine: machine.inverter.lose_load(share))
+
+
+def reported(*, speed: float = 1.0, torque: float = 1.0) -> Act:
+    """What the drive reports is scaled so; what it regulates by isn't."""
+    def scale(machine: Machine, by_speed: float, by_torque: float) -> None:
+        machine.inverter.reporting.speed_scale, machine.inverter.reporting.torque_scale = by_speed, by_torque
+
+    return Act(lambda machine: scale(machine, speed, torque), lambda machine: scale(machine, 1.0, 1.0))
+
+
+def _deaf(machine: Machine, deaf: bool) -> None:
+    machine.application.deaf = deaf
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The faults that can be scripted on Modbus: name, row of the fault table, what they do, what their value means.
+
+
+WRONGS = {
+    "word-order": "word_order", "scale-10": "scale_10", "address-off-by-one": "address_off_by_one", "sign": "sign",
+    "unsigned": "unsigned", "write-not-kept": "write_not_applied", "reads-back-otherwise": "reads_back_something_else",
+}
+"""Faults that are the drive's wiring (`sim_bus.modbus.wrong_maps`): so from the start, for good."""
+
+ONLY_ON = {"wrong-transaction-id": ("tcp",), "reset": ("tcp",), "half-open": ("tcp",), "bad-crc": ("rtu", "embedded")}
+"""Lines on which a fault can be, where that isn't all of tcp, rtu and embedded."""
+
+_LINES = {
+    "tcp": "tdhil simulate modbus --tcp HOST:PORT", "rtu": "tdhil simulate modbus --rtu",
+    "embedded": "tdhil identify --simulate",
+}
+
+
+def _code(text: str) -> int:
+    if text not in {"1", "2", "3", "4", "6"}:
+        raise ValueError("an exception: 1 function, 2 address, 3 value, 4 failure, 6 busy")
+    return int(text)
+
+
+def _delay_s(text: str) -> float:
+    found = re.fullmatch(r"(\d{1,4}(?:\.\d{1,6})?)(m?s)", text)
+    if found is None:
+        raise ValueError("a time, such as 200ms")
+    return float(found[1]) / (1000.0 if found[2] == "ms" else 1.0)
+
+
+def _celsius(text: str) -> float:
+    if not 0.0 <= float(text) <= 300.0:
+        raise ValueError("°C, from 0 to 300")
+    return float(text)
+
+
+def _name(text: str) -> Misbehaviour:
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", text):
+        raise ValueError("a parameter as the profile calls it")
+    return Misbehaviour()
+
+
+def _wiring(summary: str, row: int = 44) -> Kind[Misbehaviour]:
+    return Kind(row, summary, plain(Misbehaviour))
+
+
+KINDS: dict[str, Kind[Misbehaviour]] = {
+    "frozen-feedback": Kind(19, "speed and torque read as they last did; what is written goes through",
+                            plain(Frozen)),
+    "drive-fault": Kind(23, "fault state, after the drive's own fault reaction", plain(drive_fault)),
+    "fault-at-start": Kind(30, "the drive is in fault when the host comes", plain(drive_fault)),
+    "stuck-state": Kind(31, "the control word is ignored", plain(stuck)),
+    "mode-not-followed": Kind(32, "the drive stays with speed or torque as it is", plain(mode_kept)),
+    "mode-lost": Kind(88, "the drive goes over to regulating speed by itself, and stays there",
+                      plain(mode_lost)),
+    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
+                plain(safe_torque_off)),
+    "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
+                           lambda v: limited_torque(share(v)), "10%", "SHARE"),
+    "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
+                      lambda v: load_lost(max(0.001, share(v))), "10%", "SHARE"),
+    "hot": Kind(35, "motor and drive become so hot, °C", lambda v: hot(_celsius(v)), "150", "CELSIUS"),
+    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: reported(speed=-1.0))),
+    "exception": Kind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
+                      lambda v: Refusing(_code(v)), "4", "CODE"),
+    "no-reply": Kind(39, "this share of the requests doesn't get through, and nothing comes back",
+                     lambda v: NoReply(share(v)), "100%", "SHARE"),
+    "late-reply": Kind(40, "every reply comes so late", lambda v: Late(_delay_s(v)), "1s", "TIME"),
+    "wrong-transaction-id": Kind(41, "this share of the replies bears another transaction (TCP only)",
+                                 lambda v: WrongTransaction(share(v)), "100%", "SHARE"),
+    "bad-crc": Kind(42, "this share of the replies has a wrong CRC (not on TCP; embedded: such a reply is lost)",
+                    lambda v: BadCrc(share(v)), "100%", "SHARE"),
+    "short-reply": Kind(42, "this share of the replies is cut to half", lambda v: Short(share(v)), "100%",
+                        "SHARE"),
+    "reset": Kind(43, "the connection is reset, once (TCP only)", plain(lambda: Connection("reset"))),
+    "half-open": Kind(43, "the connection is silent from then on, and stays open (TCP only)",
+                      plain(lambda: Connection("half-open"))),
+    "word-order": _wiring("32-bit numbers stand with their halves exchanged"),
+    "scale-10": _wiring("every scaled register counts in tenths"),
+    "address-off-by-one": _wiring("every register stands one address higher"),
+    "sign": _wiring("what is reported of signed registers has the opposite sign"),
+    "unsigned": _wiring("signed registers have no sign"),
+    "write-not-kept": _wiring("parameters are written without an error, and keep what they had", 45),
+    "reads-back-otherwise": Kind(45, "a parameter, as the profile calls it, reads as something else", _name,
+                                 "torque_limit", "PARAMETER"),
+    "watchdog-not-armed": Kind(50, "the watchdog's time is written without an error, and keeps what it was",
+                               plain(NotArmed)),
+    "torque-scale": Kind(0, "the reported torque is multiplied by this",
+                         lambda v: reported(torque=factor(v)), "1.1", "FACTOR"),
+}
+
+
+def make(fault: Scripted) -> Misbehaviour:
+    """What a scripted fault does; nothing where it is the wiring. Raises FaultRefused."""
+    return make_from(KINDS, fault)
+
+
+def parse_all(texts: Sequence[str], line_kind: str) -> tuple[Scripted, ...]:
+    """All the faults of a command line, each checked, on ``tcp``, ``rtu`` or ``embedded``. Raises FaultRefused."""
+    faults = parse_from(KINDS, texts)
+    for fault in faults:
+        where = f"--fault {fault.text}"
+        lines = ONLY_ON.get(fault.name, tuple(_LINES))
+        if line_kind not in lines:
+            raise FaultRefused(f"there is no {fault.name} on this line", where=where,
+                               next_step=f"Rehearse it with {' or '.join(_LINES[one] for one in lines)}")
+        if fault.name in WRONGS and (fault.at != Moment() or "/" in fault.text):
+            raise FaultRefused(f"{fault.name} is how the drive is wired: from the start, for good", where=where,
+                               next_step="Leave the @ and the / out")
+    return faults
+
+
+def wrongs_of(script: Iterable[Scripted], parameters: Sequence[str]) -> tuple[Wrong, ...]:
+    """The wiring that a script asks for. Raises FaultRefused for a parameter that the profile hasn't."""
+    wrongs = []
+    for fault in script:
+        if fault.name not in WRONGS:
+            continue
+        kind = KINDS[fault.name]
+        of = fault.value or kind.value
+        if of and of not in parameters:
+            raise FaultRefused(f"the profile has no parameter '{of[:40]}'", where=f"--fault {fault.text}",
+                               next_step=f"It has: {', '.join(parameters)}")
+        wrongs.append(parse(f"{WRONGS[fault.name]}:{of}" if of else WRONGS[fault.name]))
+    return tuple(wrongs)
+
+
+def listing() -> str:
+    """Every fault with its row and value, for people."""
+    return listing_of(KINDS)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _SEED = 0xFA17
 _WRITES = (6, 16)

@@ -12,12 +12,263 @@
 A read takes all registers of one moment. A write checks everything before anything acts.
 """
 
-from collections.abc import Callable, Mapping
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from math import floor, pi
 from struct import Struct
 from typing import NamedTuple
 
-from sim_bus.modbus.errors import IllegalAddress, IllegalFunction, IllegalValue, Refused
-from sim_bus.modbus.slots import Slot
+from profiles.modbus import Echo, ModbusProfile, Register, Signal, Temperature
+from profiles.simulator_marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
+from sim_bus.cia402 import Application
+from sim_bus.modbus.codec import Layout
+from sim_bus.modbus.control_words import Words
+from sim_bus.modbus.parameters import Parameters
+from sim_bus.modbus.wrong_maps import DeviceFailure, IllegalAddress, IllegalFunction, IllegalValue, Refused, Wrong
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which register holds what: the profile's map laid over the simulated drive, with the wrongs that it has.
+#
+# Numbers in a slot are those of the register (counts); how they are scaled is the drive's own arithmetic, in floats,
+# and what doesn't fit saturates, as in a drive.
+
+
+HOT_C = 120.0
+"""What the simulated drive's motor bears."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """One number in its registers. ``refuses`` raises what `sim_bus.modbus.wrong_maps` has; nothing is written then."""
+
+    layout: Layout
+    read: Callable[[], int]
+    write: Callable[[int], None] | None = None
+    refuses: Callable[[int], None] | None = None
+    commands: bool = False
+    """Control word or setpoint."""
+
+
+class Map:
+    """All slots; of two on one register the first counts."""
+
+    def __init__(self, profile: ModbusProfile, parameters: Parameters, words: Words, wrongs: tuple[Wrong, ...],
+                 *, stepped: bool, on_stage: Callable[[int], None] = lambda _number: None) -> None:
+        self._profile = profile
+        self._parameters = parameters
+        self._words = words
+        self._application: Application = words.application
+        self._wrongs = {wrong.kind for wrong in wrongs}
+        self.temperature_c = 40.0      # of everything that has one
+        self._speed_counts = 0
+        self._torque_counts = 0
+        named = self._cycle() + self._mode() + self._echoes() + self._position() + self._families() + self._settings()
+        named += self._temperatures()
+        self.slots: dict[tuple[str, int], Slot] = {}
+        for slot in named:
+            self._lay(replace(slot, layout=self._moved(slot.layout)))
+        self._fill_gaps(profile.cycle.largest_gap)
+        for slot in _marker(stepped):
+            self._lay(slot)
+        self._stage = 0
+        self._on_stage = on_stage
+        self._lay(Slot(Layout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
+
+    def act(self) -> None:
+        """Setpoints take effect; where the drive isn't listening, they keep."""
+        application, words, cycle = self._application, self._words, self._profile.cycle
+        if not words.listens:
+            return
+        speed = self._to_si(cycle.speed_setpoint, self._speed_counts)
+        application.target_speed_rad_s = -speed if words.reversed else speed
+        if cycle.torque_setpoint is not None:
+            application.target_torque_nm = self._to_si(cycle.torque_setpoint, self._torque_counts)
+
+    # -- what stands in the registers ----------------------------------------------------------------------
+
+    def _cycle(self) -> list[Slot]:
+        cycle, words, application = self._profile.cycle, self._words, self._application
+        control, reporting = application.inverter.control, application.inverter.reporting
+        slots = [
+            Slot(self._layout(cycle.control.register_), lambda: words.word, words.write, commands=True),
+            Slot(self._layout(cycle.status.register_), self._status),
+            Slot(self._layout(cycle.speed_setpoint.register_), lambda: self._speed_counts, self._set_speed,
+                 commands=True),
+            self._reported(cycle.speed, lambda: reporting.speed_rad_s),
+            self._reported(cycle.torque, lambda: reporting.torque_nm),
+        ]
+        if cycle.torque_setpoint is not None:
+            slots.append(Slot(self._layout(cycle.torque_setpoint.register_), lambda: self._torque_counts,
+                              self._set_torque, commands=True))
+        if cycle.torque_demand is not None:
+            slots.append(self._reported(cycle.torque_demand, lambda: control.demand_nm))
+        return slots
+
+    def _mode(self) -> list[Slot]:
+        modes, words = self._profile.modes, self._words
+        slots = []
+        if modes.register_ is not None:
+            values = (modes.speed_value, modes.torque_value)
+
+            def refuses(value: int) -> None:
+                if value not in values:
+                    raise IllegalValue
+                if not words.may_switch(value == values[1]):
+                    raise DeviceFailure
+
+            slots.append(Slot(self._layout(modes.register_), lambda: values[words.register_says_torque] or 0,
+                              lambda value: words.select_by_register(value == values[1]), refuses))
+        if modes.display is not None:
+            slots.append(Slot(self._layout(modes.display.register_), self._display))
+        return slots
+
+    def _echoes(self) -> list[Slot]:
+        """What the drive has made of a setpoint, in SI, told once more: not the register that the host wrote."""
+        application = self._application
+        targets: dict[str, Callable[[], float]] = {
+            "speed": lambda: application.target_speed_rad_s, "torque": lambda: application.target_torque_nm,
+        }
+        return [self._reported(echo, targets[echo.setpoint]) for echo in self._profile.echoes]
+
+    def _position(self) -> list[Slot]:
+        """The true shaft's angle in counts; the counter starts over when it is full."""
+        position = self._profile.position
+        if position is None:
+            return []
+        layout, inverter = self._layout(position.register_), self._application.inverter
+
+        def read() -> int:
+            turned = inverter.state.angle_rad / (2.0 * pi) * position.counts_per_turn
+            if position.wrap_counts is not None:
+                turned %= position.wrap_counts
+            span = layout.highest - layout.lowest + 1
+            return (floor(turned) - layout.lowest) % span + layout.lowest
+
+        return [Slot(layout, read)]
+
+    def _temperatures(self) -> list[Slot]:
+        slots = []
+        for one in self._profile.temperatures:
+            if one.register_ != self._profile.cycle.status.register_:
+                layout = self._layout(one.register_)
+                slots.append(Slot(layout, partial(self._temperature, layout, one)))
+        return slots
+
+    def _temperature(self, layout: Layout, one: Temperature) -> int:
+        """Its number, or a word with its bits as they must stand."""
+        if one.too_hot is not None:
+            return one.too_hot.value if self._is_hot else ~one.too_hot.value & one.too_hot.mask
+        share = self.temperature_c / (1.0 if one.unit == "celsius" else HOT_C)
+        return layout.saturated(share / one.per_lsb)
+
+    @property
+    def _is_hot(self) -> bool:
+        return self.temperature_c > HOT_C
+
+    def _families(self) -> list[Slot]:
+        return [Slot(Layout(address), extra.read, extra.write) for address, extra in self._words.extras().items()]
+
+    def _settings(self) -> list[Slot]:
+        """Parameters: what preflight sets, or a person at the drive, may be written."""
+        parameters, slots = self._parameters, list[Slot]()
+        for one in self._profile.parameters:
+            if one.register_ is None:
+                continue
+            layout = self._layout(one.register_)
+            writable = one.set_to is not None or one.require is not None
+            slots.append(Slot(layout, partial(self._told, layout, one.name),
+                              partial(parameters.write, one.name) if writable else None))
+        return slots
+
+    # -- helpers -------------------------------------------------------------------------------------------
+
+    def _reported(self, signal: Signal | Echo, quantity: Callable[[], float]) -> Slot:
+        echo = isinstance(signal, Echo)
+        layout = self._layout(signal.register_, echo=echo)
+        parameters = self._parameters
+
+        def read() -> int:
+            scale = parameters.scale(signal.per_lsb, signal.unit, signal.times, echo=echo)
+            return self._signed(layout, layout.saturated(parameters.in_unit(quantity(), signal.unit) / scale))
+
+        return Slot(layout, read)
+
+    def _told(self, layout: Layout, name: str) -> int:
+        return self._signed(layout, layout.saturated(self._parameters.number(name)))
+
+    def _to_si(self, signal: Signal, counts: int) -> float:
+        scale = self._parameters.scale(signal.per_lsb, signal.unit, signal.times)
+        return self._parameters.si(counts * scale, signal.unit)
+
+    def _set_speed(self, counts: int) -> None:
+        self._speed_counts = counts
+
+    def _set_torque(self, counts: int) -> None:
+        self._torque_counts = counts
+
+    def _set_stage(self, number: int) -> None:
+        self._stage = number
+        self._on_stage(number)
+
+    def _status(self) -> int:
+        """The family's word; over it what the user has wired to it, but on ABB, whose bit 11 is the family's own."""
+        word, display = self._words.status(), self._profile.modes.display
+        status = self._profile.cycle.status.register_
+        for one in self._profile.temperatures:
+            if one.register_ == status and one.too_hot is not None and self._is_hot:
+                word = word & ~one.too_hot.mask | one.too_hot.value
+        if display is not None and display.register_.address == status.address \
+                and display.register_.table == status.table and self._profile.control.family != "abb":
+            return word & ~display.mask | self._display()
+        return word
+
+    def _display(self) -> int:
+        display = self._profile.modes.display
+        if display is None:
+            return 0
+        return (display.torque if self._words.torque else display.speed) & display.mask
+
+    def _signed(self, layout: Layout, number: int) -> int:
+        """As the drive reports it."""
+        if "sign" in self._wrongs and layout.signed:
+            return layout.saturated(-number)
+        return number
+
+    def _layout(self, register: Register, *, echo: bool = False) -> Layout:
+        signless = "unsigned" in self._wrongs and not echo
+        kind = register.type.replace("i", "u") if signless else register.type
+        high_first = self._profile.line.word_order == "high_first"
+        return Layout(register.address, kind, register.table, high_first is not ("word_order" in self._wrongs))
+
+    def _moved(self, layout: Layout) -> Layout:
+        return replace(layout, address=layout.address + 1) if "address_off_by_one" in self._wrongs else layout
+
+    def _lay(self, slot: Slot) -> None:
+        keys = [(slot.layout.table, address) for address in slot.layout.addresses]
+        if not any(key in self.slots for key in keys):
+            self.slots.update(dict.fromkeys(keys, slot))
+
+    def _fill_gaps(self, largest: int) -> None:
+        """Registers between two of the map that may be read along, and say nothing."""
+        for table in ("holding", "input"):
+            taken = sorted(address for where, address in self.slots if where == table)
+            for low, high in pairwise(taken):
+                if high - low - 1 <= largest:
+                    for address in range(low + 1, high):
+                        self._lay(Slot(Layout(address, table=table), lambda: 0))
+
+
+def _marker(stepped: bool) -> Iterable[Slot]:
+    text = MARKER_TEXT.encode("ascii").ljust(2 * MARKER_REGISTERS, b"\0")
+    words = [int.from_bytes(text[at : at + 2], "big") for at in range(0, len(text), 2)]
+    for number, word in enumerate([*words, int(stepped)]):
+        yield Slot(Layout(MARKER_REGISTER + number), lambda word=word: word)  # type: ignore[misc]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _REQUESTS_SO_FAR = 0x000E
 _PAIR = Struct(">HH")

@@ -4,11 +4,10 @@ import select
 import threading
 import time
 
+from sim_bus.modbus.codec import NONE, Reply
 from sim_bus.modbus.faults import Faults
-from sim_bus.modbus.framing import Request
-from sim_bus.modbus.lines import Listener
+from sim_bus.modbus.lines import Listener, Request
 from sim_bus.modbus.machine import Machine
-from sim_bus.modbus.reply import NONE, Reply
 
 _POLL_S = 0.005
 _BROADCAST = 0

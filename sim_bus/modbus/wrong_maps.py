@@ -14,11 +14,48 @@ A register that echoes a setpoint is another one, with a count and a type of its
 it is, and what the drive has made of the setpoint shows there.
 """
 
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from profiles.errors import TdhilError
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How the drive refuses a request: a Modbus exception reply (Modbus application protocol, section 7).
+
+
+class Refused(Exception):
+    """The request is answered by an exception of this code."""
+
+    code = 4
+
+
+class IllegalFunction(Refused):
+    """01: the drive doesn't know the function."""
+
+    code = 1
+
+
+class IllegalAddress(Refused):
+    """02: no such register, or not to be written."""
+
+    code = 2
+
+
+class IllegalValue(Refused):
+    """03: a count or a value that can't be."""
+
+    code = 3
+
+
+class DeviceFailure(Refused):
+    """04: understood, and can't be done now."""
+
+    code = 4
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 Kind = Literal["word_order", "scale_10", "address_off_by_one", "sign", "unsigned", "write_not_applied",
                "reads_back_something_else"]

@@ -31,11 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from profiles.model import refuse_if
+from profiles.model import NonNegative, Positive, refuse_if
 from sim_bus.plant.friction import advance_of
 from sim_bus.plant.friction.shaft import Shaft
 from sim_bus.plant.two_mass import Bottom
-from sim_bus.validated import NonNegative, Positive
 
 LONGEST_TICK_S = 0.002
 MOST_CELLS = 20_000

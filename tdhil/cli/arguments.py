@@ -6,8 +6,44 @@ None as a default means: rig.yaml, else the profile, else the built-in default (
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
+from profiles import quantities
+from profiles.quantities import SHARE, Unit
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which shafts may be asked for, and which motions of stage 5.
+#
+# They are `tdhil.estimation.result.MODELS` and the kinds of `tdhil.run.settings`, without what importing those
+# costs.
+
+
+MODELS = ("auto", "rigid", "two-mass", "string", "paper")
+EXCITATIONS = ("multisine", "sine", "step", "pulses", "coast-down")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
+
+
+def amount(unit: Unit) -> Callable[[str], float]:
+    """For argparse: a number in ``unit``, or with any unit of the same kind, in ``unit``."""
+
+    def read(text: str) -> float:
+        try:
+            return quantities.read(text, unit)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text[:60]!r}: {error}") from None
+
+    return read
+
+
+share = amount(SHARE)
+"""``1%`` or ``0.01``."""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Which drive; the group, for what a command has to add to it."""
@@ -26,7 +62,6 @@ def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     from can.cli import add_bus_arguments
 
     from profiles.quantities import BIT_RATE
-    from tdhil.commands.quantities import amount
 
     modbus = parser.add_argument_group("Modbus (what is left out is as the profile says)")
     modbus.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")

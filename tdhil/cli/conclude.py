@@ -10,10 +10,44 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.cli.streams import OutputLost
-from tdhil.commands.after_looks import after_looks, working_confidence_of
 from tdhil.errors import ExitCode, UsageError
+from tdhil.estimation.result import Identification, Verdict
 from tdhil.recording.recording import Recording
 
+# ---------------------------------------------------------------------------------------------------------------------
+# What a stopping rule means for the result: intervals a little wider, so that they cover as asked after looking.
+
+
+def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
+    """The confidence to identify with; ``confidence`` itself where stage 5 had a fixed length.
+
+    The run's own is in its log. Another one, asked for in a replay, is worked out by the same rule. A log that was cut
+    before the first look owes nothing to it.
+    """
+    stopping = run.get("stopping")
+    if not isinstance(stopping, Mapping) or not stopping.get("decisions"):
+        return confidence
+    last = stopping["decisions"][-1]
+    if stopping.get("confidence") == confidence:
+        return float(last["working_confidence"])
+    from tdhil.run.design.stopping_rule import interval_confidence
+
+    return interval_confidence(confidence, float(stopping["pilot_dof"]), int(last["seen"]))
+
+
+def after_looks(found: Identification, run: Mapping[str, Any], confidence: float) -> Identification:
+    """The result under the confidence that it holds with, and what would have brought the tolerance within reach."""
+    stopping = run.get("stopping")
+    if not isinstance(stopping, Mapping):
+        return found
+    if found.inertia is not None:
+        found = replace(found, inertia=replace(found.inertia, confidence=confidence))
+    if found.verdict is Verdict.VALID_WIDE and stopping.get("advice"):
+        found = replace(found, advice=str(stopping["advice"]))
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 def conclude(
     recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] | None = None
@@ -23,11 +57,9 @@ def conclude(
     ``warnings``: what was assumed in reading a foreign trace; None for a run of ours.
     """
     from tdhil.estimation import identify
-    from tdhil.estimation.result import Verdict
-    from tdhil.identify.options import Options
-    from tdhil.protocol import no_watchdog, others
+    from tdhil.estimation.result import Options, Verdict
     from tdhil.report.document import result_document
-    from tdhil.run import speed_check
+    from tdhil.run import preconditions, speed_check, stage_log
 
     asked = run.get("identify", {})
     known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}
@@ -38,8 +70,8 @@ def conclude(
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     said = (
-        *(warnings or ()), *_stop_warnings(run), *no_watchdog.warnings(run), *speed_check.warnings(run),
-        *others.warnings(run),
+        *(warnings or ()), *_stop_warnings(run), *preconditions.warnings(run), *speed_check.warnings(run),
+        *stage_log.warnings(run),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))

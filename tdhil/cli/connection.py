@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -124,3 +125,20 @@ def _refuse_canopen_flags(cli: Mapping[str, Any]) -> None:
         if cli.get(name) is not None:
             step = "A Modbus drive is named by --host or --serial, and --unit; for CANopen say --drive canopen"
             raise UsageError("belongs to CANopen", where=flag, next_step=step)
+
+
+@dataclass(frozen=True)
+class PeerPlan:
+    """What will be opened. ``seed`` and ``plant`` are the embedded simulator's, None without it."""
+
+    embedded: bool
+    stepped: bool
+    seed: int | None
+    plant: Any
+    faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
+    never_came: list[str] = field(default_factory=list)    # those of them whose moment the run did not reach
+
+    @property
+    def epoch_ns(self) -> int:
+        """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
+        return time.time_ns()

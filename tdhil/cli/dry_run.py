@@ -74,9 +74,9 @@ def plan_dry(
     options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
-    from tdhil.protocol.string_rules import refuse_by_plan
     from tdhil.run.excitation import PlanRefused
     from tdhil.run.planning import plan_acquisition
+    from tdhil.run.preconditions import refuse_by_plan
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: all of it; 3: the log is not whole, and what there is was written; 10: nothing can be read."""
-    from tdhil.record.errors import LogError, NothingRecoverable
+    from tdhil.errors import LogError, NothingRecoverable
     from tdhil.recording.log_reader import read_run
     from tdhil.report.document import SIMULATED
     from tdhil.report.live import stderr_console

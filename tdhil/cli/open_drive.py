@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from drivers.clock import Clock, MonotonicClock, SteppedClock
 from drivers.drive import Drive, FrameTap
-from tdhil.cli.connection import Connection
+from tdhil.cli.connection import Connection, PeerPlan
 from tdhil.config.options import RunOptions
 from tdhil.config.rig import DriveData
 from tdhil.errors import UsageError
-
-
-@dataclass(frozen=True)
-class PeerPlan:
-    """What will be opened. ``seed`` and ``plant`` are the embedded simulator's, None without it."""
-
-    embedded: bool
-    stepped: bool
-    seed: int | None
-    plant: Any
-    faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
-    never_came: list[str] = field(default_factory=list)    # those of them whose moment the run did not reach
-
-    @property
-    def epoch_ns(self) -> int:
-        """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
-        return time.time_ns()
 
 
 def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:

@@ -2,16 +2,178 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import difflib
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import BaseModel
 
-from profiles.entry import Confidence, Entry
+from drivers.errors import PreflightRefused
+from profiles.entry import Confidence, Entry, Require
 from profiles.library import Profile
-from profiles.modbus import ModbusProfile
-from profiles.requirement import Require
+from profiles.modbus import ModbusProfile, Register
 from tdhil.cli.connection import can_torque
+from tdhil.errors import UsageError
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Every register that a Modbus profile names, with its meaning: for `profiles show` and for `doctor`. Pure.
+
+
+_UNITS = {"rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "hz": "Hz", "kw": "kW", "none": ""}
+_SIGNALS = {
+    "control": "control word",
+    "status": "status word",
+    "speed_setpoint": "speed setpoint",
+    "torque_setpoint": "torque setpoint",
+    "speed": "reported speed",
+    "torque": "reported torque",
+    "torque_demand": "torque demand",
+}
+
+
+@dataclass(frozen=True)
+class RegisterUse:
+    """One register. ``per_lsb``: units for one count, None for words of bits; ``times``: parameter that multiplies."""
+
+    name: str                   # as in `ModbusProfile.entries`
+    meaning: str
+    register: Register
+    per_lsb: float | None
+    unit: str                   # as people write it
+    times: str | None
+    entry: Entry
+
+    @property
+    def address(self) -> str:
+        """As on the wire, and as the manual writes it."""
+        at = self.register
+        table = "" if at.table == "holding" else " input"
+        return f"{at.address} ({at.address:04X}h){table}" + (f" = {at.reference}" if at.reference else "")
+
+    @property
+    def scale(self) -> str:
+        """What one count means."""
+        if self.per_lsb is None:
+            return "bits"
+        times = f" × {self.times}" if self.times else ""
+        return f"{self.per_lsb:g}{times} {self.unit}".strip()
+
+
+def register_uses(profile: ModbusProfile) -> tuple[RegisterUse, ...]:
+    """In the order of the profile: the cycle, the mode, parameters, echoes. Each use once, also where two share one."""
+    found = [
+        RegisterUse(
+            f"cycle.{name}", meaning, part.register_, getattr(part, "per_lsb", None),
+            _UNITS.get(getattr(part, "unit", "none"), getattr(part, "unit", "")), getattr(part, "times", None), part,
+        )
+        for name, meaning in _SIGNALS.items()
+        if (part := getattr(profile.cycle, name)) is not None
+    ]
+    modes = profile.modes
+    if modes.register_ is not None:
+        found.append(RegisterUse("modes", "speed or torque", modes.register_, None, "", None, modes))
+    if modes.display is not None:
+        found.append(RegisterUse("modes", "speed or torque, as shown", modes.display.register_, None, "", None, modes))
+    found += [
+        RegisterUse(f"parameters.{one.name}", one.title, one.register_, one.per_lsb, unit_text(one.unit),
+                    one.factor, one)
+        for one in profile.parameters
+        if one.register_ is not None
+    ]
+    found += [
+        RegisterUse(f"echoes.{one.setpoint}", f"{one.setpoint} setpoint, as understood", one.register_, one.per_lsb,
+                    unit_text(one.unit), one.times, one)
+        for one in profile.echoes
+    ]
+    return tuple(found)
+
+
+def unit_text(unit: str) -> str:
+    """A unit of the schema as people write it."""
+    return _UNITS.get(unit, unit)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a profile only supposes of a drive is refused before a real shaft moves, unless the operator takes it by name.
+#
+# A wrong scale or word order in a profile is a wrong moment of inertia, or a shaft that turns the wrong way. `likely`
+# entries may be taken all at once, or a whole section of them; `unverified` ones each by its own name.
+
+
+ALL_LIKELY = "likely"
+UNVERIFIED_FLAG = "--accept-unverified"
+
+
+def doubtful(profile: Profile) -> tuple[tuple[str, Entry], ...]:
+    """(name, entry) of everything below verified."""
+    return tuple((name, entry) for name, entry in profile.entries() if entry.confidence != "verified")
+
+
+def is_accepted(name: str, entry: Entry, accepted: Collection[str]) -> bool:
+    """Has the operator taken this entry?"""
+    if name in accepted:
+        return True
+    sections = {ALL_LIKELY, name.partition(".")[0]}
+    return entry.confidence == "likely" and not sections.isdisjoint(accepted)
+
+
+def check_names(profile: Profile, accepted: Iterable[str], source: str = UNVERIFIED_FLAG) -> None:
+    """UsageError for a name that this profile has not: a typo must not pass for consent."""
+    known = {name for name, _ in profile.entries()}
+    known |= {name.split(".")[0] for name in known} | {ALL_LIKELY}
+    for name in accepted:
+        if name not in known:
+            close = difflib.get_close_matches(name, sorted(known), n=3, cutoff=0.5)
+            meant = f"did you mean {' or '.join(repr(one) for one in close)}?" if close else "it has no such entry"
+            raise UsageError(
+                f"profile {profile.name} has no entry '{name[:60]}'; {meant}", where=source,
+                next_step=f"See tdhil profiles show {profile.name}",
+            )
+
+
+def require_accepted(profile: Profile, accepted: Collection[str]) -> None:
+    """For a drive that is not simulated: PreflightRefused with every entry that was not taken, and how to take it."""
+    refused = [(name, entry) for name, entry in doubtful(profile) if not is_accepted(name, entry, accepted)]
+    if refused:
+        raise PreflightRefused(_text(profile, refused), where=profile.name, next_step=_step(profile, refused))
+
+
+def accepted_lines(profile: Profile, accepted: Collection[str]) -> tuple[str, ...]:
+    """What is taken although nobody verified it, a line each."""
+    return tuple(
+        f"{name} ({entry.confidence}): {entry.source}"
+        for name, entry in doubtful(profile)
+        if is_accepted(name, entry, accepted)
+    )
+
+
+def note(profile: Profile) -> str:
+    """For a simulated drive, where it is no obstacle; '' where there is nothing to say."""
+    count = len(doubtful(profile))
+    what = "1 entry is" if count == 1 else f"{count} entries are"
+    if not count:
+        return ""
+    return f"profile {profile.name}: {what} not verified; on a real drive {UNVERIFIED_FLAG} must take them"
+
+
+def _text(profile: Profile, refused: list[tuple[str, Entry]]) -> str:
+    lines = [f"  {name} ({entry.confidence}): {entry.source}" for name, entry in refused]
+    counted = "1 entry of this profile is" if len(lines) == 1 else f"{len(lines)} entries of this profile are"
+    return "\n".join([f"{counted} not verified, and the drive is a real one", *lines])
+
+
+def _step(profile: Profile, refused: list[tuple[str, Entry]]) -> str:
+    words = [ALL_LIKELY] if any(entry.confidence == "likely" for _, entry in refused) else []
+    words += [name for name, entry in refused if entry.confidence == "unverified"]
+    options = " ".join(f"{UNVERIFIED_FLAG} {word}" for word in words)
+    return (
+        f"\nCheck them in the drive's manual (tdhil profiles show {profile.name} says what). Then either say "
+        f"'confidence: verified' in a copy of the profile, or take them as they are: {options}"
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 LEVELS: tuple[Confidence, ...] = ("verified", "likely", "unverified")
 

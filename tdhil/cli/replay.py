@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
+from tdhil.cli.arguments import MODELS, amount, share
 from tdhil.cli.conclude import conclude, print_result, save_report
-from tdhil.commands.models import MODELS
-from tdhil.commands.quantities import amount, share
-from tdhil.errors import ExitCode, UsageError
-from tdhil.record.errors import LogError, NothingRecoverable
+from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
 
 if TYPE_CHECKING:
-    from tdhil.record.ended import Ended
     from tdhil.recording.log_reader import Run
+    from tdhil.recording.run_log import Ended
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
@@ -77,9 +75,9 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def _run_log(namespace: argparse.Namespace, path: Path) -> int:
-    from tdhil.record.ended import find_ended
     from tdhil.recording.log_reader import read_run
     from tdhil.recording.recording import aborted_stage
+    from tdhil.recording.run_log import find_ended
     from tdhil.report.live import stderr_console
 
     for name in _TRACE_ONLY:
@@ -116,7 +114,7 @@ def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
 
     Raises NothingRecorded with that run's own exit code, but for one that tells of a process and not of a run.
     """
-    from tdhil.record.errors import NothingRecorded
+    from tdhil.errors import NothingRecorded
 
     if len(found.recording.time_s) and any(stage.name != "setup" for stage in found.stages):
         return
@@ -131,7 +129,7 @@ def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
 
 def _run_trace(namespace: argparse.Namespace, path: Path) -> int:
     from tdhil.cli.task import ASSUMED_TORQUE_SCALE_REL_SD
-    from tdhil.record.csv_choice import USUAL, parse_columns
+    from tdhil.recording.csv.layout import USUAL, parse_columns
     from tdhil.recording.csv.reader import Bench, read_recording
 
     scale = namespace.torque_scale_sd

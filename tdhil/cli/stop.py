@@ -103,7 +103,7 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
             link.close()
         return
     from drivers.canopen.quick_stop import Cia402Target
-    from tdhil.bus_open import open_bus
+    from tdhil.cli.buses.can_bus import open_bus
 
     bus = open_bus(connection.bus)
     node = options.node if options.node is not None else profile.node

@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil import __version__
-from tdhil.errors import ExitCode, UsageError
-from tdhil.record.errors import LogError
+from tdhil.errors import ExitCode, LogError, UsageError
 
 LIBRARIES = (
     "numpy", "scipy", "python-can", "canopen", "pymodbus", "pyserial", "mcap", "protobuf", "pydantic", "rich", "PyYAML",
@@ -82,7 +81,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def about(log: Path) -> Iterable[tuple[str, str]]:
     """(name in the archive, text): everything but the log itself and rig.yaml, not yet scrubbed."""
-    from tdhil.commands.doctor_host import host_findings
+    from tdhil.cli.doctor import host_findings
 
     yield "versions.json", _json(versions())
     yield "doctor.txt", "".join(f"{one.text}\n" for one in host_findings(log))

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
-from profiles.yaml_messages import messages_of
+from profiles.yaml_loader import messages_of
 from tdhil.config.rig import ExcitationKind, Rig
 from tdhil.errors import UsageError
 

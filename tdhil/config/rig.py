@@ -20,8 +20,7 @@ from pydantic import Field, PrivateAttr, ValidationError
 
 from drivers.errors import DataFileError, PreflightRefused, Problem
 from profiles.model import DataModel, Finding
-from profiles.yaml_loader import Conversion, load_with_lines
-from profiles.yaml_messages import messages_of
+from profiles.yaml_loader import Conversion, load_with_lines, messages_of
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:

@@ -9,13 +9,13 @@ from tdhil.estimation.result import (
     Identification,
     InertiaEstimate,
     LineFit,
+    Options,
     PaperEstimate,
     ResidualTest,
     SecondOpinion,
     Verdict,
 )
 from tdhil.estimation.rough_inertia import RoughFriction, RoughInertia, rough_friction, rough_inertia
-from tdhil.identify.options import Options
 
 __all__ = [
     "BudgetLine",

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
+from tdhil.estimation.frequency_domain.inference import rejects
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines
 from tdhil.estimation.result import (
     BudgetLine,
@@ -12,14 +13,13 @@ from tdhil.estimation.result import (
     Estimate,
     FrictionPoint,
     LinePoint,
+    Options,
     PaperEstimate,
     Refusal,
     ResidualTest,
     SecondOpinion,
 )
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.identify.lines.residual import rejects
-from tdhil.identify.options import Options
 from tdhil.recording.recording import Recording, Stage
 
 

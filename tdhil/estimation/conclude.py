@@ -3,9 +3,8 @@
 from dataclasses import replace
 
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.result import Identification, InertiaEstimate, Verdict
-from tdhil.identify.options import Options
-from tdhil.identify.torque_scale import widened_most_by_scale, with_total
+from tdhil.estimation.frequency_domain.inference import widened_most_by_scale, with_total
+from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
 from tdhil.recording.recording import Stage
 
 _SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"

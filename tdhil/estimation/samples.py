@@ -5,8 +5,206 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.identify.faults.left_out import good_samples
-from tdhil.recording.recording import FloatArray, Recording, Segment
+from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Feedback that stuck while it was called fresh: the same value again and again where the motion says it must change.
+#
+# A smooth wave rounded to q rests on one value about its crests: x ≈ A − A ω² t²/2 stays within q for 2 √(2q/A)/ω. A
+# run of equal values several times as long as that, at the slowest line, and longer than a hole that a period may
+# have, is no wave. Two kinds of rest are other faults and are told elsewhere: at the extreme (clipped), and of the
+# speed at zero (the shaft stands still).
+
+
+_NATURAL = 3.0            # times as long as a rounded crest
+_SHARE_OF_CYCLE = 0.1     # of the fastest line's
+_LEAST_SAMPLES = 8
+_LOOKED_AT = 200_000      # samples, for the smallest step
+_PERIODIC = ("multisine", "sine")
+
+
+def frozen(recording: Recording) -> BoolArray | None:
+    """(N,) True where a sample repeats its stuck predecessor, within the excitation; None if there is none."""
+    excitation = recording.excitation
+    if excitation is None or excitation.kind not in _PERIODIC:
+        return None
+    found: BoolArray | None = None
+    for segment in excitation.segments:
+        if not segment.lines_hz or not min(segment.lines_hz) > 0.0:
+            continue
+        first, last = (int(i) for i in np.searchsorted(recording.time_s, (segment.start_s, segment.end_s)))
+        for begin, end in _rests(recording, segment, first, last):
+            if found is None:
+                found = np.zeros(len(recording.time_s), dtype=np.bool_)
+            found[begin + 1 : end] = True
+    return found
+
+
+def _rests(recording: Recording, segment: Segment, first: int, last: int) -> list[tuple[int, int]]:
+    """Stretches [begin, end) of sample numbers in which a signal stands still for too long."""
+    time = recording.time_s[first:last]
+    if last - first < 2 * _LEAST_SAMPLES:
+        return []
+    fresh = recording.fresh[first:last]
+    chosen = None if bool(np.all(fresh)) else np.flatnonzero(fresh)
+    if chosen is not None and len(chosen) < 2 * _LEAST_SAMPLES:
+        return []
+    if chosen is not None:
+        time = time[chosen]
+    found = []
+    for signal, quantum, is_speed in (
+        (recording.speed_rad_s, recording.speed_resolution_rad_s, True),
+        (recording.torque_nm, recording.torque_resolution_nm, False),
+    ):
+        part = signal[first:last] if chosen is None else signal[first:last][chosen]
+        step = _step(part, quantum)
+        for begin, end in _long_runs(time, part, _longest(part, step, segment)):
+            value = float(part[begin])
+            still = is_speed and abs(value) <= 2.0 * step
+            if still or value in (float(np.nanmax(part)), float(np.nanmin(part))):
+                continue
+            found.append((first + (begin if chosen is None else int(chosen[begin])),
+                          first + (end if chosen is None else int(chosen[end - 1]) + 1)))
+    return found
+
+
+def _step(signal: FloatArray, quantum: float) -> float:
+    """The declared resolution, or the smallest step that occurs, whichever is coarser."""
+    steps = np.abs(np.diff(signal[:_LOOKED_AT]))
+    steps = steps[steps > 0.0]
+    seen = float(np.min(steps)) if len(steps) else 0.0
+    return max(seen, quantum) if np.isfinite(quantum) else seen
+
+
+def _longest(signal: FloatArray, step: float, segment: Segment) -> float:
+    """How long this signal may rest on one value, s; infinite for one that has no amplitude to speak of."""
+    amplitude = 0.5 * float(np.nanmax(signal) - np.nanmin(signal))
+    if not (np.isfinite(amplitude) and amplitude > 2.0 * step):
+        return float("inf")
+    natural = 2.0 * float(np.sqrt(2.0 * step / amplitude)) / (2.0 * np.pi * min(segment.lines_hz))
+    return max(_NATURAL * natural, _SHARE_OF_CYCLE / max(segment.lines_hz))
+
+
+def _long_runs(time: FloatArray, signal: FloatArray, longest_s: float) -> list[tuple[int, int]]:
+    """Runs [begin, end) of equal values that last longer than ``longest_s`` and have some samples."""
+    ends = np.flatnonzero(signal[1:] != signal[:-1])      # the last sample of every run but the last
+    first, last = (int(ends[0]), int(ends[-1])) if len(ends) else (len(signal) - 1, -1)
+    between = [(int(ends[k]) + 1, int(ends[k + 1]) + 1) for k in np.flatnonzero(np.diff(ends) >= _LEAST_SAMPLES)]
+    return [(begin, end) for begin, end in ((0, first + 1), *between, (last + 1, len(signal)))
+            if end - begin >= _LEAST_SAMPLES and time[end - 1] - time[begin] > longest_s]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Single samples that can't be: a value far from both its neighbours, on the same side. A bit that fell over, a frame
+# of another object, a pulse on the wire.
+#
+# The usual step from sample to sample is the mean |Δx|, noise and motion together. Of Gaussian noise a step of 25
+# times that doesn't occur, and motion doesn't go there and back within three samples.
+
+
+_FAR = 25.0       # usual steps
+_QUANTA = 6.0     # and at least so many of the signal's resolution: at rest the usual step may be next to nothing
+_MOST = 0.02      # of the samples: more are no spikes but another signal
+_BLOCK = 262144   # samples worked on at once
+
+
+def spikes(recording: Recording) -> BoolArray | None:
+    """(N,) True at a spike of speed or torque; None if there is none."""
+    found: BoolArray | None = None
+    for signal, quantum in (
+        (recording.speed_rad_s, recording.speed_resolution_rad_s),
+        (recording.torque_nm, recording.torque_resolution_nm),
+    ):
+        at = _of(signal, quantum)
+        if at is not None:
+            found = at if found is None else found | at
+    return found
+
+
+def _of(signal: FloatArray, quantum: float) -> BoolArray | None:
+    if len(signal) < 3:
+        return None
+    starts = range(0, len(signal) - 2, _BLOCK)
+    total, count = 0.0, 0
+    for first in starts:
+        part = np.asarray(signal[first : first + _BLOCK + 2], dtype=np.float64)
+        # of infinite neighbours the step is no number; they are left out, here as in the whole
+        finite = np.isfinite(part)
+        step = np.abs(np.diff(part[finite]))
+        total, count = total + float(np.sum(step)), count + len(step)
+    limit = max(_FAR * total / count, _QUANTA * quantum) if count else np.inf
+    found: BoolArray | None = None
+    for first in starts:
+        part = np.asarray(signal[first : first + _BLOCK + 2], dtype=np.float64)
+        if not np.all(np.isfinite(part)):
+            part = np.where(np.isfinite(part), part, 0.0)
+        step = np.diff(part)
+        if not len(step) or max(float(np.max(step)), -float(np.min(step))) <= limit or limit <= 0.0:
+            continue
+        up, down = step > limit, step < -limit
+        here = (up[:-1] & down[1:]) | (down[:-1] & up[1:])
+        if np.any(here):
+            if found is None:
+                found = np.zeros(len(signal), dtype=np.bool_)
+            found[first + 1 : first + 1 + len(here)] |= here
+    if found is None or np.count_nonzero(found) > _MOST * len(signal):
+        return None
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which samples are no measurements although nobody flagged them, and what a user is told of them.
+
+
+def good_samples(recording: Recording) -> BoolArray:
+    """(N,) True where a sample is fresh and finite, no spike, and doesn't repeat its stuck predecessor."""
+    good: BoolArray = np.isfinite(recording.time_s)
+    good &= recording.fresh
+    good &= np.isfinite(recording.speed_rad_s)
+    good &= np.isfinite(recording.torque_nm)
+    for bad in (spikes(recording), frozen(recording)):
+        if bad is not None:
+            good &= ~bad
+    return good
+
+
+def log_warnings(recording: Recording) -> tuple[str, ...]:
+    """What the log itself says of its samples: that they are not all, and that some brought nothing new."""
+    found = []
+    if not recording.complete:
+        found.append("the log ended before the run did: partial data")
+    stale = float((~recording.fresh).mean())
+    if stale > 0.01:
+        found.append(f"{stale:.1%} of the samples were stale and left out")
+    return tuple(found)
+
+
+def left_out_warnings(recording: Recording) -> tuple[str, ...]:
+    """A sentence for each kind of fault that samples were left out for; stale ones, which were flagged, apart."""
+    said = []
+    finite = np.isfinite(recording.speed_rad_s)
+    finite &= np.isfinite(recording.torque_nm)
+    odd = int(np.count_nonzero(recording.fresh & ~finite))
+    if odd:
+        said.append(f"{_samples(odd)} not a number, and left out")
+    jumps = spikes(recording)
+    if jumps is not None:
+        said.append(f"{_samples(int(np.count_nonzero(jumps)))} a spike far from its neighbours, and left out")
+    stuck = frozen(recording)
+    if stuck is not None:
+        where, share = float(recording.time_s[np.argmax(stuck)]), float(np.mean(stuck))
+        said.append(
+            f"the feedback stuck although it was called fresh, first at {where:.6g} s: {share:.1%} of the samples were "
+            "left out"
+        )
+    return tuple(said)
+
+
+def _samples(count: int) -> str:
+    return "1 sample was" if count == 1 else f"{count} samples were each"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _LEAST_SHARE = 0.6        # of a period's samples that must be there
 _LONGEST_GAP = 0.1        # of the shortest cycle of the excitation

@@ -18,13 +18,161 @@
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
 """
 
-from typing import Any, Final
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import NoneType, UnionType
+from typing import Any, Final, get_args, get_origin
+
+from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto, FileDescriptorProto
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from google.protobuf.timestamp_pb2 import DESCRIPTOR as TIMESTAMP
 
 from drivers.drive import Mode, PowerState
-from tdhil.record.event import Event
-from tdhil.record.foxglove import LOG_CLASS
-from tdhil.record.schema import fields_of, message_classes
+from tdhil.recording.builder import hints_of
 from tdhil.recording.recording import Excitation, Level, Ramp, Segment, Stage
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Something that happened in a run and is worth a line: an error, a warning, a drop, a key press.
+
+
+RECOVERED: Final = "recovered"
+"""Kind of the event in a salvaged copy: the copy is whole, the run that it shows is not."""
+
+
+FAILURE: Final = "failure"
+INTERRUPTED: Final = "interrupted"
+"""Kinds of the event that ended a run: what went wrong, or who asked for it."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """``time_s`` is control time; ``kind`` is one lower-case word; ``traceback`` is empty where there was none."""
+
+    time_s: float
+    kind: str
+    text: str
+    traceback: str = ""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Events once more as `foxglove.Log`, which viewers of MCAP show as a log (docs.foxglove.dev, schema Log).
+#
+# Our own Event stays what is read back; this one is for people with a viewer, and nothing here reads it.
+
+
+_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
+_INFO, _WARNING, _ERROR = 2, 3, 4
+_WARNINGS: Final = frozenset({
+    INTERRUPTED, RECOVERED, "bus", "clock", "dropped", "fault", "left", "limits", "stop", "warning", "watchdog",
+})
+_NAME: Final = "tdhil"
+
+
+def _log_class() -> Any:
+    file = FileDescriptorProto(name="foxglove/Log.proto", package="foxglove", syntax="proto3",
+                               dependency=[TIMESTAMP.name])
+    message = file.message_type.add(name="Log")
+    level = message.enum_type.add(name="Level")
+    for number, name in enumerate(_LEVELS):
+        level.value.add(name=name, number=number)
+    for number, (name, kind, of) in enumerate((
+        ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+        ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
+        ("message", FieldDescriptorProto.TYPE_STRING, ""),
+        ("name", FieldDescriptorProto.TYPE_STRING, ""),
+        ("file", FieldDescriptorProto.TYPE_STRING, ""),
+        ("line", FieldDescriptorProto.TYPE_FIXED32, ""),
+    ), start=1):
+        field = message.field.add(name=name, number=number, type=kind, label=FieldDescriptorProto.LABEL_OPTIONAL)
+        if of:
+            field.type_name = of
+    pool = DescriptorPool()
+    pool.AddSerializedFile(TIMESTAMP.serialized_pb)
+    pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName("foxglove.Log"))
+
+
+LOG_CLASS: Final = _log_class()
+
+
+def log_payload(kind: str, text: str, log_time_ns: int) -> bytes:
+    """A `foxglove.Log` message of an event; its level is by the event's kind."""
+    level = _ERROR if kind == FAILURE else _WARNING if kind in _WARNINGS else _INFO
+    message = LOG_CLASS(level=level, message=f"{kind}: {text}", name=_NAME)
+    message.timestamp.seconds, message.timestamp.nanos = divmod(log_time_ns, 10**9)
+    payload: bytes = message.SerializeToString()
+    return payload
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Protobuf message classes from a compact table: no compiler, no generated code, any protobuf runtime from 5 on.
+#
+# A message is a dictionary from field name to type; the field's number is its place, counted from 1. So fields
+# are added at the end and never moved. A type is a scalar of protobuf, an enum or a message of the same table,
+# with ``?`` for an optional one (absent is not zero) and ``*`` for a repeated one.
+
+
+Table = Mapping[str, Mapping[str, str]]
+
+_SCALARS = {
+    "double": FieldDescriptorProto.TYPE_DOUBLE,
+    "int64": FieldDescriptorProto.TYPE_INT64,
+    "fixed32": FieldDescriptorProto.TYPE_FIXED32,
+    "bool": FieldDescriptorProto.TYPE_BOOL,
+    "string": FieldDescriptorProto.TYPE_STRING,
+    "bytes": FieldDescriptorProto.TYPE_BYTES,
+}
+_OF_PYTHON = {float: "double", int: "int64", bool: "bool", str: "string"}
+
+
+def fields_of(kind: Any) -> dict[str, str]:
+    """The table row of a dataclass, from its annotations."""
+    hints = hints_of(kind)
+    return {field.name: _type_of(hints[field.name]) for field in fields(kind)}
+
+
+def message_classes(package: str, enums: Mapping[str, tuple[str, ...]], messages: Table) -> dict[str, Any]:
+    """A class for each message of the table; the values of an enum count from 0."""
+    file = FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
+    for name, values in enums.items():
+        enum = file.enum_type.add(name=name)
+        for number, value in enumerate(values):
+            enum.value.add(name=f"{name.upper()}_{value}", number=number)
+    for name, row in messages.items():
+        _describe(file.message_type.add(name=name), row, package, enums)
+    pool = DescriptorPool()
+    pool.Add(file)
+    return {name: GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in messages}
+
+
+def _describe(message: DescriptorProto, row: Mapping[str, str], package: str, enums: Mapping[str, Any]) -> None:
+    for number, (name, wanted) in enumerate(row.items(), start=1):
+        bare = wanted.rstrip("?*")
+        field = message.field.add(name=name, json_name=name, number=number)
+        repeated = wanted.endswith("*")
+        field.label = FieldDescriptorProto.LABEL_REPEATED if repeated else FieldDescriptorProto.LABEL_OPTIONAL
+        if bare in _SCALARS:
+            field.type = _SCALARS[bare]
+        else:
+            field.type = FieldDescriptorProto.TYPE_ENUM if bare in enums else FieldDescriptorProto.TYPE_MESSAGE
+            field.type_name = f".{package}.{bare}"
+        if wanted.endswith("?") and field.type != FieldDescriptorProto.TYPE_MESSAGE:
+            field.proto3_optional = True           # proto3 wants a oneof of one for it
+            field.oneof_index = len(message.oneof_decl)
+            message.oneof_decl.add(name=f"_{name}")
+
+
+def _type_of(hint: Any) -> str:
+    if get_origin(hint) is UnionType:
+        return _type_of(next(one for one in get_args(hint) if one is not NoneType)) + "?"
+    if get_origin(hint) is tuple:
+        return _type_of(get_args(hint)[0]) + "*"
+    return _OF_PYTHON.get(hint, getattr(hint, "__name__", "string"))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 PACKAGE: Final = "tdhil"
 

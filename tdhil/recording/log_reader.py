@@ -5,20 +5,183 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from struct import Struct
+from typing import Any, Final, NamedTuple
 
 from google.protobuf.message import DecodeError
 
 from drivers.drive import Command, PowerState, RawFrame, Sample
-from tdhil.record.event import RECOVERED, Event
-from tdhil.record.inflate import Damage
-from tdhil.record.messages import Ours, messages
-from tdhil.record.plain import structure
+from tdhil.errors import LogError
 from tdhil.recording import log_format
-from tdhil.recording.builder import FACTS, RecordingBuilder
-from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, STATE_OF
+from tdhil.recording.builder import FACTS, RecordingBuilder, structure
+from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, PACKAGE, RECOVERED, STATE_OF, Event, schema_name
 from tdhil.recording.log_messages import TEXT_LIMIT
+from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.mcap_recovery import Contents, Damage, Library, Whole, walk
 from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The records inside a chunk that passed its CRC: pure, over bytes that may still be hostile.
+
+
+_RECORD = Struct("<BQ")
+_MESSAGE = Struct("<HIQQ")
+SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
+_LONGEST = 128                         # characters of a name: ours are shorter
+
+
+class Schema(NamedTuple):
+    """``identifier:2  n:4 name  …``: the fields themselves are known here."""
+
+    identifier: int
+    name: str
+
+
+class Channel(NamedTuple):
+    """``identifier:2  schema:2  n:4 topic  …``."""
+
+    identifier: int
+    schema: int
+    topic: str
+
+
+class Message(NamedTuple):
+    """``channel:2  sequence:4  log time:8  publish time:8  payload``."""
+
+    channel: int
+    log_time_ns: int
+    payload: bytes
+
+
+def records(chunk: bytes) -> Iterator[Schema | Channel | Message]:
+    """The records in order; others are stepped over. Raises ValueError where a record leaves the chunk."""
+    offset, size = 0, len(chunk)
+    while offset < size:
+        if offset + _RECORD.size > size:
+            raise ValueError("a record is cut")
+        opcode, length = _RECORD.unpack_from(chunk, offset)
+        start = offset + _RECORD.size
+        offset = start + length
+        if offset > size:
+            raise ValueError("a record is longer than its chunk")
+        if opcode == MESSAGE:
+            if length < _MESSAGE.size:
+                raise ValueError("a message is too short")
+            channel, _, log_time_ns, _ = _MESSAGE.unpack_from(chunk, start)
+            yield Message(channel, log_time_ns, chunk[start + _MESSAGE.size:offset])
+        elif opcode == SCHEMA:
+            yield Schema(_number(chunk, start), _string(chunk, start + 2, offset))
+        elif opcode == CHANNEL:
+            yield Channel(_number(chunk, start), _number(chunk, start + 2), _string(chunk, start + 4, offset))
+
+
+def _number(chunk: bytes, start: int) -> int:
+    return int.from_bytes(chunk[start:start + 2], "little")
+
+
+def _string(chunk: bytes, start: int, end: int) -> str:
+    length = min(_LONGEST, int.from_bytes(chunk[start:start + 4], "little"))
+    return chunk[start + 4:min(end, start + 4 + length)].decode("utf-8", "replace")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The messages of our channels in a file that may be anything.
+
+
+_NUMBER: Final = {(topic, schema_name(message)): number for number, (topic, message) in CHANNELS.items()}
+_OTHER: Final = "Give a run.mcap of this tool"
+
+
+class Ours(NamedTuple):
+    """One message on one of our channels, not decoded yet; ``number`` is the channel's in `channels`."""
+
+    number: int
+    payload: bytes
+    log_time_ns: int
+
+
+def messages(path: Path, *, salvage: bool = False) -> Iterator[Ours | Damage | Whole]:
+    """Messages of ours, what was stepped over, and at the end `Whole` if the file was closed.
+
+    Raises `LogError` where the file can't be opened, is empty, is not MCAP, or (at the end) holds nothing of ours.
+    ``salvage``: a file that doesn't begin like MCAP is searched all the same, since its head may be what was hit.
+    """
+    declared = _Declared()
+    try:
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            file.seek(0)
+            if size == 0:
+                raise LogError("the file is empty", where=str(path), next_step="The run has to be done again")
+            if file.read(len(MAGIC)) != MAGIC[:size]:
+                if not salvage:
+                    raise LogError("this is not an MCAP file", where=str(path), next_step=_OTHER)
+                yield Damage(0, "the file does not begin like MCAP")
+                declared.assume()
+            for found in walk(file, size):
+                if isinstance(found, Contents):
+                    yield from declared.messages(found)
+                elif isinstance(found, Library):
+                    declared.library(found.name)
+                else:
+                    if salvage and isinstance(found, Damage):
+                        declared.assume_undeclared()       # it may have been what declares the channels
+                    yield found
+    except OSError as error:
+        raise LogError(f"the log can't be read: {error.strerror or error}", where=str(path),
+                       next_step="Check the path") from error
+    if not declared.ours:
+        what = "nothing of a run of this tool is in it" if salvage else "an MCAP file, but not a run of this tool"
+        raise LogError(what, where=str(path), next_step=_OTHER)
+
+
+class _Declared:
+    """Which channel of the file is which of ours, by topic and schema."""
+
+    def __init__(self) -> None:
+        self.ours = False
+        self._schemas: dict[int, str] = {}
+        self._numbers: dict[int, int] = {}
+
+    def library(self, name: str) -> None:
+        """Our own files: the channels are known even if the chunk that declares them is lost."""
+        if name.split(" ", maxsplit=1)[0] == PACKAGE:
+            self.ours = True
+            self._numbers = {number: number for number in CHANNELS} | self._numbers
+
+    def assume(self) -> None:
+        """Nothing is known of who wrote it: what can't be one of our files' chunks must show by itself."""
+        self._numbers = {number: number for number in CHANNELS}
+
+    def assume_undeclared(self) -> None:
+        """Where nothing was declared so far: our own numbers."""
+        if not self._schemas:
+            self._numbers = {number: number for number in CHANNELS} | self._numbers
+
+    def messages(self, contents: Contents) -> Iterator[Ours | Damage]:
+        numbers = self._numbers
+        try:
+            for record in records(contents.data):
+                if isinstance(record, Message):
+                    if record.channel in numbers:
+                        self.ours = True
+                        yield Ours(numbers[record.channel], record.payload, record.log_time_ns)
+                elif isinstance(record, Schema):
+                    self._schemas[record.identifier] = record.name
+                else:
+                    self._channel(record)
+        except ValueError as error:
+            yield Damage(contents.offset, f"a chunk is malformed: {error}")
+
+    def _channel(self, record: Channel) -> None:
+        number = _NUMBER.get((record.topic, self._schemas.get(record.schema, "")))
+        self._numbers.pop(record.identifier, None)
+        if number is not None:
+            self.ours = True
+            self._numbers[record.identifier] = number
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 SAMPLES: Final = 8_000_000             # 25 bytes each; two hours at 1 kHz
 _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01

@@ -8,23 +8,305 @@ thread (`sync`) has the disk take what was written, against a loss of power.
 """
 
 import errno
+import os
 import shutil
+import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from threading import Event as Flag
 from threading import Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
 from drivers.drive import Command, RawFrame, Sample
-from tdhil.record.backlog import Backlog
-from tdhil.record.errors import LogBroken, LogError, LogRefused, LogUnopened
-from tdhil.record.event import Event
-from tdhil.record.pump import Pump
-from tdhil.record.sync import Syncer
+from tdhil.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.recording import log_messages
-from tdhil.recording.log_format import CAN, MODBUS
+from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, MODBUS, SAMPLE, Event, log_payload
+from tdhil.recording.log_messages import Cold, event_message, pack_command, pack_frames, pack_sample
 from tdhil.recording.mcap_container import Container, LogGone, RawFile
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The bounded queue between the control loop and the log's thread.
+
+
+NUDGE: Final = 256
+WAKE_S: Final = 0.2
+LAG_S: Final = 0.4                     # of control time: what a kill may cost in stepped time, plus a cycle
+SPARE: Final = 1024
+
+
+class Backlog:
+    """First in, first out. `put` belongs to the run, everything else to the log's thread.
+
+    A deque, since its append and popleft are atomic: no lock on the way in. ``block`` says what a full queue does:
+    make the caller wait (stepped time, where nothing is lost by waiting) or drop the record and count it (real
+    time, where the shaft turns on).
+    """
+
+    def __init__(self, limit: int, *, block: bool) -> None:
+        self.items: deque[Any] = deque()
+        self.wake = Flag()                 # there is enough to do, or the end has come
+        self.room = Flag()                 # something was taken out
+        self.dropped = 0
+        self.ended = False
+        self.hurry = False                 # somebody waits until all that is here is in the file
+        self.written = Flag()              # that is done
+        self.saved_s = 0.0                 # control time up to which the file holds everything
+        self._limit = limit
+        self._block = block
+        self._alert = min(NUDGE, limit)
+
+    def put(self, item: Any) -> bool:
+        """Takes ``item``; False if the queue is full (it is dropped and counted) or the log has ended."""
+        if len(self.items) >= self._alert and not self._crowded(self._limit):
+            return False
+        self.items.append(item)
+        return True
+
+    def put_rare(self, item: Any) -> bool:
+        """Takes an item that is too precious to be dropped with the cyclic ones: some spare places are kept."""
+        if len(self.items) >= self._alert and not self._crowded(self._limit + SPARE):
+            return False
+        self.items.append(item)
+        return True
+
+    def keep_up(self, time_s: float) -> None:
+        """Stepped time, after the cycle of control time ``time_s``: waits while the file is `LAG_S` behind it."""
+        behind_s = time_s - self.saved_s
+        if behind_s < WAKE_S:
+            return
+        if behind_s < LAG_S:
+            if not self.wake.is_set():
+                self.wake.set()
+            return
+        self.written.clear()
+        self.hurry = True
+        self.wake.set()
+        while not self.ended and not self.written.wait(0.05):
+            pass                           # the time-out covers an end that came in between
+
+    def end(self) -> None:
+        """Nothing is taken any more; whoever waits for room goes on."""
+        self.ended = True
+        self._alert = 0
+        self.room.set()
+        self.written.set()
+
+    def _crowded(self, limit: int) -> bool:
+        if not self.wake.is_set():
+            self.wake.set()
+        while not self.ended and len(self.items) >= limit:
+            if not self._block:
+                self.dropped += 1
+                return False
+            self.room.clear()
+            self.wake.set()
+            if len(self.items) >= limit:
+                self.room.wait(0.05)       # the time-out covers a flag cleared just after it was set
+        return not self.ended
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Asks the operating system to put the log on the disk, beside the thread that writes it.
+#
+# What was written survives a killed process by itself; only a loss of power takes what the disk hasn't got yet. A disk
+# may take a second for that, and neither the control loop nor the thread that closes the chunks waits for it.
+
+
+EVERY_S: Final = 0.25                  # of wall time, at most so often
+_CANNOT: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.EROFS, errno.ENOSYS})
+_data_to_disk = getattr(os, "fdatasync", os.fsync)
+
+
+class Syncer:
+    """One file's. ``failure`` is what the disk said when it couldn't."""
+
+    def __init__(self, file: RawFile) -> None:
+        self.failure: OSError | None = None
+        self._file = file
+        self._wake = Flag()
+        self._end = Flag()
+        self._thread = Thread(target=self._run, name="tdhil-sync", daemon=True)
+        self._thread.start()
+
+    def poke(self) -> None:
+        """There is something new in the file. Raises OSError where the disk failed since the last time."""
+        if self.failure is not None:
+            raise self.failure
+        if not self._wake.is_set():
+            self._wake.set()
+
+    def finish(self) -> None:
+        """Everything written is on the disk. Raises OSError if it can't be known to be."""
+        self._end.set()
+        self._wake.set()
+        self._thread.join()
+        if self.failure is not None:
+            raise self.failure
+
+    def _run(self) -> None:
+        last = False
+        while not last and self.failure is None:
+            self._wake.wait()
+            last = self._end.is_set()
+            self._wake.clear()
+            try:
+                _data_to_disk(self._file.fileno())
+            except OSError as error:
+                # Pipes and devices have no disk behind them.
+                self.failure = None if error.errno in _CANNOT else error
+            self._end.wait(EVERY_S)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The log's thread: takes what waits, lays it out, closes chunks in time.
+
+
+POLL_S: Final = 0.05
+CHUNK_WALL_S: Final = 0.25
+CHUNK_LOG_NS: Final = 200_000_000
+CHUNK_BYTES: Final = 2**20
+FRAMES: Final = 64
+
+
+class Pump:
+    """Runs until the backlog has ended and is empty, or until something fails; then finishes the file.
+
+    ``failure`` is the first exception, whatever came after it.
+    """
+
+    def __init__(
+        self, backlog: Backlog, container: Container, syncer: Syncer, epoch_ns: int, frames: int = CAN
+    ) -> None:
+        self.failure: BaseException | None = None
+        self._backlog = backlog
+        self._container = container
+        self._syncer = syncer
+        self._epoch_ns = epoch_ns
+        self._channel = frames                 # of raw frames
+        self._time_s = 0.0                     # of the latest record, control time
+        self._frames: list[RawFrame] = []      # of the cycle that is under way
+        self._chunk_ns: int | None = None      # log time of the open chunk's first sample
+        self._opened_s: float | None = None    # when the open chunk was first seen, wall time
+        self._told = 0                         # drops that have been logged
+
+    def run(self) -> None:
+        """The thread's body; lets no exception out. However it ends, nobody waits for it any more."""
+        try:
+            self._guarded(self._work)
+        finally:
+            self._backlog.end()
+        self._backlog.items.clear()
+        self._guarded(self._close_chunk)
+        self._guarded(self._container.finish)
+        self._guarded(self._syncer.finish)
+        self._guarded(self._container.close)
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        try:
+            step()
+        except BaseException as error:         # kept for the run, which raises it in its own thread
+            self.failure = self.failure or error
+
+    def _work(self) -> None:
+        backlog = self._backlog
+        last = False
+        while not last:
+            backlog.wake.wait(POLL_S)
+            backlog.wake.clear()
+            last = backlog.ended
+            hurry = backlog.hurry
+            self._drain()
+            if hurry:
+                backlog.hurry = False
+                self._close_chunk()
+                backlog.written.set()
+            now_s = time.monotonic()
+            if self._opened_s is None:
+                self._opened_s = now_s if self._container.size or self._frames else None
+            elif now_s - self._opened_s >= CHUNK_WALL_S:
+                self._close_chunk()
+
+    def _drain(self) -> None:
+        items, room = self._backlog.items, self._backlog.room
+        while items:
+            item = items.popleft()
+            if not room.is_set():
+                room.set()
+            kind = type(item)
+            if kind is RawFrame:
+                self._frames.append(item)
+                if len(self._frames) >= FRAMES:
+                    self._put_frames()
+            elif kind is Sample:
+                self._put_sample(item)
+            elif kind is Cold:
+                self._put_cold(item)
+            else:
+                time_s, command = item
+                self._container.add(COMMAND, self._log_ns(time_s), pack_command(time_s, command))
+
+    def _put_sample(self, sample: Sample) -> None:
+        if self._frames:
+            self._put_frames()
+        log_ns = self._log_ns(sample[0])
+        self._container.add(SAMPLE, log_ns, pack_sample(sample))
+        if self._chunk_ns is None:
+            self._chunk_ns = log_ns
+        elif not 0 <= log_ns - self._chunk_ns < CHUNK_LOG_NS:
+            self._close_chunk()
+
+    def _put_frames(self) -> None:
+        frames, self._frames = self._frames, []
+        self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
+        if self._container.size > CHUNK_BYTES:
+            self._close_chunk()
+
+    def _put_cold(self, cold: Cold) -> None:
+        channel, time_s, payload, flush = cold
+        log_ns = self._log_ns(self._time_s if time_s is None else time_s)
+        self._container.add(channel, log_ns, payload)
+        if channel == EVENT:
+            self._put_log(log_ns, payload)
+        if flush or self._container.size > CHUNK_BYTES:
+            self._close_chunk()
+
+    def _put_log(self, log_ns: int, payload: bytes) -> None:
+        """An event again, as viewers know it."""
+        event = CLASSES["Event"].FromString(payload)
+        self._container.add(LOG, log_ns, log_payload(event.kind, event.text, log_ns))
+
+    def _close_chunk(self) -> None:
+        if self._frames:
+            frames, self._frames = self._frames, []
+            self._container.add(self._channel, self._log_ns(frames[0][0]), pack_frames(frames))
+        dropped = self._backlog.dropped
+        if dropped > self._told:
+            text = f"{dropped - self._told} records found no place in the log's queue; {dropped} so far"
+            self._told = dropped
+            event = event_message(Event(self._time_s, "dropped", text))
+            self._container.add(event.channel, self._log_ns(self._time_s), event.payload)
+            self._put_log(self._log_ns(self._time_s), event.payload)
+        self._chunk_ns = self._opened_s = None
+        self._container.close_chunk()
+        self._backlog.saved_s = self._time_s
+        self._syncer.poke()
+
+    def _log_ns(self, time_s: float) -> int:
+        """Log time of a control time; NaN counts as the time of the record before, an impossible one as the epoch."""
+        try:
+            log_ns = self._epoch_ns + round(time_s * 1e9)
+        except (ValueError, OverflowError):
+            return self._log_ns(self._time_s)
+        if not 0 <= log_ns < 2**63:
+            return max(0, min(self._epoch_ns, 2**63 - 1))
+        self._time_s = time_s
+        return log_ns
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 STEPPED_QUEUE: Final = 1024            # records; small, since in stepped time it can hold much control time
 REAL_TIME_QUEUE: Final = 16384         # some seconds at 250 Hz: what a slow disk may take before records are lost

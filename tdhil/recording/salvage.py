@@ -14,13 +14,10 @@ from typing import Final
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from tdhil.record.errors import LogBroken, LogError, LogUnopened, NothingRecoverable
-from tdhil.record.event import RECOVERED, Event
-from tdhil.record.foxglove import log_payload
-from tdhil.record.messages import Ours, messages
-from tdhil.recording.log_format import CHANNELS, CLASSES, EVENT, LOG
+from tdhil.errors import LogBroken, LogError, LogUnopened, NothingRecoverable
+from tdhil.recording.log_format import CHANNELS, CLASSES, EVENT, LOG, RECOVERED, Event, log_payload
 from tdhil.recording.log_messages import event_message
-from tdhil.recording.log_reader import Run, read_run
+from tdhil.recording.log_reader import Ours, Run, messages, read_run
 from tdhil.recording.mcap_container import Container
 
 CHUNK_BYTES: Final = 2**18

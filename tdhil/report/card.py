@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -10,15 +11,144 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from tdhil.report.card_parts import (
-    budget_table,
-    compliant_rows,
-    estimate_text,
-    friction_rows,
-    inertia_text,
-    opinion_rows,
-)
 from tdhil.report.document import SIMULATED
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Numbers as people read them: as many digits as the interval bears, and no more.
+
+
+def with_interval(value: float, low: float, high: float, unit: str) -> str:
+    """``103.9 (103.1 to 104.8) kg·m²``: two significant digits of the half-width decide the decimals."""
+    half = 0.5 * (high - low)
+    if not all(math.isfinite(number) for number in (value, low, high)) or half <= 0.0:
+        return f"{value:.5g} {unit}"
+    shown = (_digits(number, half) for number in (value, low, high))
+    return "{} ({} to {}) ".format(*shown) + unit
+
+
+def rounded(value: float | None, low: float | None, high: float | None) -> tuple[str, str, str]:
+    """The three as texts, with decimals as in `with_interval`; None, an open side, is ``open``."""
+    ends = [number for number in (low, high) if number is not None]
+    half = 0.5 * (ends[1] - ends[0]) if len(ends) == 2 else 0.0
+
+    def shown(number: float | None) -> str:
+        if number is None:
+            return "open"
+        return _digits(number, half) if half > 0.0 and math.isfinite(half) else f"{number:.4g}"
+
+    return shown(value), shown(low), shown(high)
+
+
+def plus_minus(value: float, half_width: float) -> str:
+    """``83.9 ± 3.0``, decimals as in `with_interval`."""
+    if not (math.isfinite(value) and math.isfinite(half_width)) or half_width <= 0.0:
+        return f"{value:.4g}"
+    return f"{_digits(value, half_width)} ± {_digits(half_width, half_width)}"
+
+
+def _digits(number: float, half_width: float) -> str:
+    """To the second significant digit of the half-width, tens and hundreds included."""
+    decimals = 1 - math.floor(math.log10(half_width))
+    return f"{round(number, decimals) + 0.0:.{max(0, decimals)}f}"          # no minus zero
+
+
+def percent(half_width: float, value: float) -> str:
+    """``±0.80 %`` of the value: two significant digits."""
+    if not value or not math.isfinite(half_width):
+        return "±?"
+    share = 100.0 * half_width / abs(value)
+    return f"±{share:.0f} %" if share >= 9.95 else f"±{share:#.2g} %"
+
+
+def minutes(seconds: float) -> str:
+    """``4:07``, or ``12 s`` under a minute."""
+    whole = max(0, round(seconds))
+    return f"{whole // 60}:{whole % 60:02d}" if whole >= 60 else f"{whole} s"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The small tables of the result card: budget, second opinions, friction over speed, a compliant shaft.
+
+
+_AGREES = {True: ("agrees", "green"), False: ("DOES NOT AGREE", "bold red"), None: ("nothing to compare with", "dim")}
+
+_NOTHING = 1e-5           # of J: a source of less than that is none
+
+Row = tuple[str, Text | str]
+
+
+def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """What turns behind the spring; a quantity that the data leave open is said to be so."""
+    shaft = document["compliant"]
+    if shaft is None:
+        return
+    yield "shaft", "compliant: J above is the motor's side, J_r"
+    for title, key, unit in (
+        ("J_L behind the spring", "load_inertia_kg_m2", "kg·m²"),
+        ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
+        ("spring k", "stiffness_nm_rad", "N·m/rad"),
+        ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
+        ("resonance", "resonance_hz", "Hz"),
+        ("antiresonance", "antiresonance_hz", "Hz"),
+    ):
+        part = shaft[key]
+        yield title, "left open by the data" if part is None else estimate_text(part, unit)
+
+
+def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """Every second opinion, and whether it agrees with the result."""
+    for opinion in document["second_opinions"]:
+        word, style = _AGREES[opinion["agrees"]]
+        value = estimate_text(opinion["inertia_kg_m2"], "kg·m²")
+        yield "second opinion", Text.assemble(f"{value}  ", (word, style), f", {opinion['route']}")
+
+
+def friction_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """Friction torque at every steady speed of the run, two to a line."""
+    points = [f"{p['speed_rad_s']:.2f} rad/s: {_plus_minus(p['torque_nm'])}" for p in document["friction_curve"]]
+    if points:
+        width = max(len(point) for point in points)
+        pairs = [points[k : k + 2] for k in range(0, len(points), 2)]
+        yield "friction, N·m", "\n".join("   ".join(f"{point:<{width}}" for point in pair).rstrip() for pair in pairs)
+
+
+def budget_table(budget: Sequence[Mapping[str, Any]], value: float) -> Table:
+    """Where the interval comes from, line by line, largest first."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column(justify="right", no_wrap=True)
+    table.add_column(style="dim", overflow="fold")
+    table.add_row(Text("what makes it unsure", style="italic"), Text("± kg·m²", style="dim"), Text("± %", style="dim"))
+    for line in sorted(budget, key=lambda line: -(line["half_width_kg_m2"] or 0.0)):
+        half = line["half_width_kg_m2"]
+        if half is None:
+            table.add_row(line["source"], "open", "", line["note"])
+        elif half < _NOTHING * value:
+            table.add_row(line["source"], "0", "0", line["note"])
+        else:
+            table.add_row(line["source"], f"{half:.2g}", percent(half, value).strip("±% "), line["note"])
+    return table
+
+
+def estimate_text(part: Mapping[str, Any], unit: str) -> str:
+    """An estimate of the document with its interval; an open side is said."""
+    if part["low"] is None or part["high"] is None:
+        return f"{part['value']:.4g} {unit}, open on {'both sides' if part['low'] == part['high'] else 'one side'}"
+    return with_interval(part["value"], part["low"], part["high"], unit)
+
+
+def inertia_text(part: Mapping[str, Any], kind: str = "") -> str:
+    """J with the interval that includes the torque scale (``_total``), or that of the repeatability."""
+    value, low, high = part["value"], part["low" + kind], part["high" + kind]
+    return f"{with_interval(value, low, high, 'kg·m²')}  {percent(0.5 * (high - low), value)}"
+
+
+def _plus_minus(part: Mapping[str, Any]) -> str:
+    return plus_minus(part["value"], 0.5 * (part["high"] - part["low"]))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _VERDICT_STYLE = {
     "valid": "bold green",

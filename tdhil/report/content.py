@@ -13,9 +13,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tdhil.recording.recording import Recording
-from tdhil.report.card_parts import estimate_text, inertia_text
+from tdhil.report.card import estimate_text, inertia_text, minutes, plus_minus, rounded
 from tdhil.report.document import SIMULATED
-from tdhil.report.numbers import minutes, plus_minus, rounded
 
 if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
@@ -164,8 +163,7 @@ def _sentence(text: str) -> str:
 
 
 def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Section]:
-    from tdhil.report.picture_run import draw_run
-    from tdhil.report.plots import draw_budget, draw_friction, draw_lines, draw_opinions
+    from tdhil.report.plots import draw_budget, draw_friction, draw_lines, draw_opinions, draw_run
 
     yield Section("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):

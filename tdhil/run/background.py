@@ -9,16 +9,12 @@ it is killed.
 
 from __future__ import annotations
 
-import os
 import pickle
-import signal
 import subprocess
 import sys
 import time
-import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from queue import SimpleQueue
 from threading import Event, Lock, Thread
 from typing import IO, Any, Generic, TypeVar
 
@@ -38,7 +34,7 @@ _REAPED_S = 1.0           # wall time that a killed process gets to be gone; it 
 _PROGRAM = (
     "import pickle, sys\n"
     "sys.path[:] = pickle.load(sys.stdin.buffer)\n"
-    "from tdhil.run.background import serve\n"
+    "from tdhil.run.background_process import serve\n"
     "serve()\n"
 )
 
@@ -221,65 +217,3 @@ def _out_of_the_way() -> dict[str, Any]:
         flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
         return {"creationflags": flags | subprocess.BELOW_NORMAL_PRIORITY_CLASS}
     return {"process_group": 0}
-
-
-# -- in the process itself -----------------------------------------------------------------------------------
-
-
-def serve() -> None:
-    """Answer one question after the other until the pipe ends; what `Reckoner` runs."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _take_second_place()
-    # Whatever prints must not come between the answers.
-    answers = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
-
-    from tdhil.protocol.choose_rate import quieten
-    from tdhil.run import adaptive_duration, stage_planner  # noqa: F401
-
-    quieten()
-    asked: SimpleQueue[bytes] = SimpleQueue()
-    Thread(target=_listen, args=(asked,), daemon=True).start()
-    pickle.dump(READY, answers)
-    answers.flush()
-    while True:
-        pickle.dump(_answer(asked.get()), answers)
-        answers.flush()
-
-
-def _listen(asked: SimpleQueue[bytes]) -> None:
-    """A thread that always waits: it sees the end of the pipe in the midst of work, too."""
-    try:
-        while True:
-            asked.put(pickle.load(sys.stdin.buffer))
-    finally:
-        os._exit(0)
-
-
-def _answer(question: bytes) -> tuple[str, bytes]:
-    try:
-        work = pickle.loads(question)
-    except Exception as error:
-        return "unfit", pickle.dumps(f"{type(error).__name__}: {error}")
-    kind = "found"
-    try:
-        found = work()
-    except BaseException as error:
-        error.add_note("in the process beside the control loop:\n" + "".join(traceback.format_exception(error)))
-        kind, found = "raised", error
-    try:
-        answer = pickle.dumps(found)
-        pickle.loads(answer)
-    except Exception as error:
-        return "unfit", pickle.dumps(f"{type(found).__name__} can't be handed on: {error}")
-    return kind, answer
-
-
-def _take_second_place() -> None:
-    """No real-time scheduling, even where it was inherited, and nicer than the control loop."""
-    with suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with suppress(AttributeError, OSError):
-        os.nice(NICE)

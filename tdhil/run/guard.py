@@ -22,9 +22,9 @@ import math
 from collections import deque
 from collections.abc import Callable
 
+from drivers.clock import LOWER_THE_RATE
 from drivers.drive import Command, Counters, Mode, PowerState, Sample
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed
-from drivers.ticks import LOWER_THE_RATE
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
@@ -102,7 +102,7 @@ class Guard:
         self.reckoning = False
         """Arithmetic goes on beside the loop and makes it late: that alone is no reason to stop."""
         self.host_late: Callable[[], str] = lambda: ""
-        """How late this computer has been, in words, where it doesn't keep up (`drivers.ticks.how_late`)."""
+        """How late this computer has been, in words, where it doesn't keep up (`drivers.clock.how_late`)."""
 
     def check_command(self, command: Command) -> None:
         """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""

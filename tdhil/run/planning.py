@@ -10,9 +10,8 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from tdhil.protocol.design.predicted import predicted
 from tdhil.run.design.choose import Choice, Knowledge, choose, refuse_unfit
-from tdhil.run.design.prediction import Evidence, half_width, longer
+from tdhil.run.design.prediction import Evidence, half_width, longer, predicted
 from tdhil.run.design.stopping_rule import MARGIN, interval_confidence, least_scale
 from tdhil.run.excitation import (
     LEAST_COUNTED,

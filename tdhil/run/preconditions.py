@@ -1,12 +1,289 @@
 """In which mode of the drive a run goes, within which of its limits, and what is refused because of either. Pure."""
 
-from dataclasses import replace
+from __future__ import annotations
 
-from drivers.drive import Mode, Preflight
-from drivers.errors import PreflightRefused
-from drivers.own_limits import FLAG, SPEED, TORQUE
-from tdhil.run.settings import ExcitationRequest, MachineLimits
+import gc
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
+from drivers.clock import LOWER_THE_RATE, quantile
+from drivers.drive import Mode, Paced, Preflight, ReportingFilters, Sample
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
+from drivers.preflight import ACCEPTED_BY, ANY_CLIENT, NO_WATCHDOG_FLAG, NOTHING_STOPS_IT, SHARED_FLAG
+from tdhil.recording.recording import LagPrior
+from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How many cycles a second: the profile's, or the next lower that this computer, its adapter and the drive hold.
+#
+# Tried before anything moves, with the drive disabled, by the cycles themselves: a computer that is busy, a slow
+# adapter and a slow line show alike, in cycles that begin late and in answers that come late or not at all.
+
+
+SHARE = 0.999
+"""Of the cycles must be in time by half a period."""
+CYCLES, LONGEST_S = 1000, 4.0
+"""Tried at each rate: so many, or for so long where that is less."""
+WARM_UP = 10
+"""Cycles at each rate before those that count: the first ones load what was never needed before."""
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One rate: how many cycles it was tried for, how late ``SHARE`` of them were at most, and whether that will do."""
+
+    rate_hz: float
+    cycles: int
+    late_s: float
+    holds: bool
+
+    @property
+    def text(self) -> str:
+        """As a person reads it."""
+        return f"p99.9 of {1e3 * self.late_s:.2g} ms in {self.cycles} cycles"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The rate that is left set, and what was tried before it, the highest first."""
+
+    tried: tuple[Tried, ...]
+
+    @property
+    def taken(self) -> Tried:
+        return self.tried[-1]
+
+    @property
+    def text(self) -> str:
+        """One line for the terminal and the log."""
+        taken, first = self.taken, self.tried[0]
+        if not taken.holds:
+            return (
+                f"{taken.rate_hz:g} cycles a second, though this computer doesn't hold them ({taken.text}, "
+                f"and half a period is {500.0 / taken.rate_hz:.3g} ms). {LOWER_THE_RATE}, or end what keeps it busy"
+            )
+        if taken is first:
+            return f"{taken.rate_hz:g} cycles a second: this computer holds them ({taken.text}; --rate overrides)"
+        return (
+            f"{taken.rate_hz:g} cycles a second ({taken.text}) instead of the profile's {first.rate_hz:g}, which this "
+            f"computer doesn't hold ({first.text}); --rate overrides, --real-time-priority may help"
+        )
+
+    def plain(self) -> list[dict[str, Any]]:
+        """As the run's configuration keeps it."""
+        return [asdict(one) for one in self.tried]
+
+
+def quieten() -> None:
+    """Whatever would hold a control loop up later is done now: before anything is armed, and before it is measured.
+
+    Reading scipy from the disk takes seconds, in pieces that let no other thread run; and looking through all that is
+    loaded, again and again, for garbage that isn't there takes a tenth of one.
+    """
+    import scipy.optimize
+    import scipy.signal
+    import scipy.special
+    import scipy.stats  # noqa: F401
+
+    import tdhil.estimation  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
+
+
+def choose_rate(drive: Paced, rates_hz: Sequence[float], cycle: Callable[[], Sample]) -> Choice:
+    """Go down ``rates_hz`` until one holds; that one, or the last, is set. Raises whatever a cycle raises."""
+    tried: list[Tried] = []
+    for rate_hz in rates_hz:
+        drive.set_rate(rate_hz, measuring=True)
+        tried.append(_try(drive, rate_hz, cycle))
+        if tried[-1].holds:
+            break
+    drive.set_rate(tried[-1].rate_hz)
+    return Choice(tuple(tried))
+
+
+def _try(drive: Paced, rate_hz: float, cycle: Callable[[], Sample]) -> Tried:
+    half_s, planned = 0.5 / rate_hz, max(1, min(CYCLES, round(LONGEST_S * rate_hz)))
+    may_be_late = planned - round(SHARE * planned)
+    for _ in range(WARM_UP):
+        cycle()
+    late_s: list[float] = []
+    late = 0
+    while len(late_s) < planned and late <= may_be_late:
+        answered = cycle().fresh
+        late_s.append(max(drive.began_late_s, 0.0 if answered else 1.0 / rate_hz))
+        late += late_s[-1] >= half_s
+    return Tried(rate_hz, len(late_s), quantile(sorted(late_s), SHARE), late <= may_be_late)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is known of the lags in what a drive reports: from rig.yaml, the drive's own filters, and timing. Pure.
+
+
+READ_FILTER_SD_SHARE = 0.1
+READ_FILTER_SD_S = 0.001
+"""How exactly a filter setting that the drive tells is the lag that it causes."""
+
+
+def with_read_filters(prior: LagPrior, filters: ReportingFilters) -> LagPrior:
+    """What rig.yaml states goes before what the drive tells of itself."""
+    speed, torque = prior.speed_lag_s, prior.torque_lag_s
+    sources = [prior.source] if prior.source else []
+    if speed is None and filters.speed_lag_s is not None:
+        sd = READ_FILTER_SD_SHARE * filters.speed_lag_s + READ_FILTER_SD_S
+        prior = replace(prior, speed_lag_s=filters.speed_lag_s, speed_lag_sd_s=sd)
+    if torque is None and filters.torque_lag_s is not None:
+        sd = READ_FILTER_SD_SHARE * filters.torque_lag_s + READ_FILTER_SD_S
+        prior = replace(prior, torque_lag_s=filters.torque_lag_s, torque_lag_sd_s=sd)
+    if filters.source:
+        sources.append(filters.source)
+    return replace(prior, source="; ".join(sources))
+
+
+def with_known_lag(assumptions: ControlAssumptions, prior: LagPrior) -> ControlAssumptions:
+    """Reports that are known to lag further than usual are reckoned with by guard, control and stop."""
+    known_s = 0.0 if prior.speed_lag_s is None else prior.speed_lag_s + 2.0 * prior.speed_lag_sd_s
+    return replace(assumptions, largest_speed_lag_s=max(assumptions.largest_speed_lag_s, known_s))
+
+
+def with_timing(prior: LagPrior, half_width_s: float) -> LagPrior:
+    """A sample's time may be off by so many seconds; torque and speed may be apart by as much."""
+    return replace(prior, skew_sd_s=math.hypot(prior.skew_sd_s, half_width_s))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A run on a drive that is known not to watch its host, or not this one alone, which the operator has accepted by
+# name.
+#
+# Everything else stays as it is: guard, limits and the stop are the host's and the drive's as ever. What changes is
+# what may be said: nobody is to be told that the drive will stop the shaft by itself.
+
+
+SAID = f"no watchdog is armed in the drive, {ACCEPTED_BY}: {NOTHING_STOPS_IT}"
+SAID_SHARED = f"the drive's watchdog is no answer to a dead host, accepted by {SHARED_FLAG}: {ANY_CLIENT}"
+_WARNING_SHARED = (
+    f"the drive's watchdog was fed by any client, accepted by {SHARED_FLAG}: while another one went on asking, it would"
+    " not have stopped by itself had this computer, the program or the cable failed"
+)
+_STEP_SHARED = (
+    "If the shaft still turns, use the hard-wired emergency stop now: requests of any other client keep this drive's"
+    f" watchdog from acting ({SHARED_FLAG}). Then check supply, cable and adapter"
+)
+_WARNING = (
+    f"no watchdog was armed in the drive, {ACCEPTED_BY}: it would not have stopped by itself had this computer, the"
+    " program or the cable failed"
+)
+_STEP = (
+    f"If the shaft still turns, use the hard-wired emergency stop now: no watchdog is armed in this drive "
+    f"({NO_WATCHDOG_FLAG})."
+    " Then check supply, cable and adapter"
+)
+
+
+def configuration(preflight: Preflight) -> dict[str, Any]:
+    """For the log, under `watchdog`; nothing where one is armed that this host alone feeds."""
+    if preflight.watched and preflight.fed_by_any_client:
+        return {"watchdog": {"armed": True, "fed_by_any_client": True, "accepted_by": SHARED_FLAG}}
+    return {} if preflight.watched else {"watchdog": {"armed": False, "accepted_by": NO_WATCHDOG_FLAG}}
+
+
+def warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+    """For the result, from the log's configuration: the same live and replayed."""
+    found = run.get("watchdog")
+    if not isinstance(found, Mapping):
+        return ()
+    if found.get("fed_by_any_client") is True:
+        return (_WARNING_SHARED,)
+    return (_WARNING,) if found.get("armed") is False else ()
+
+
+def correct(error: BaseException, preflight: Preflight | None) -> None:
+    """Whoever can't reach the drive any more says that its watchdog acts; here none does."""
+    if isinstance(error, CommunicationLost) and preflight is not None:
+        if not preflight.watched:
+            error.next_step = _STEP
+        elif preflight.fed_by_any_client and not preflight.identity.simulated:
+            error.next_step = _STEP_SHARED
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a drill string on the shaft forbids, looked at before anything moves (DESIGN.md, Stopping).
+
+
+_LETS_GO = ("coast", "none", "fault_reaction")
+"""Reactions to a silent host after which nothing holds the string; a drive in fault has its torque off (CiA 402)."""
+
+
+def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: bool) -> None:
+    """`refuse_with_string`, as far as it can be said with no drive at hand.
+
+    ``lets_go``: the drive's profile says that it does after a quick stop.
+    """
+    if limits.load != "string":
+        return
+    if request.kind == "coast-down":
+        raise PreflightRefused(
+            "coast-down was asked for, and a drill string hangs on the shaft: it would turn the motor back",
+            where="--excitation",
+            next_step="Use --excitation multisine",
+        )
+    if limits.torque_ramp_nm_s <= 0.0:
+        raise PreflightRefused(
+            "a drill string hangs on the shaft, and nothing says how fast its trapped torque is let go",
+            where="torque_ramp_nm_s",
+            next_step="Give torque_ramp_nm_s in rig.yaml, such as 50",
+        )
+    if lets_go:
+        _refuse_quick_stop(holds=False)
+
+
+def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
+    """PreflightRefused where torque could be lost while a string is wound up; nothing without a string."""
+    if limits.load != "string":
+        return
+    refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
+    if not preflight.watched:
+        raise PreflightRefused(
+            "a drill string hangs on the shaft, and no watchdog is armed in the drive: "
+            f"{NO_WATCHDOG_FLAG} is not for strings",
+            where="load in rig.yaml",
+            next_step="Only the drive's own stop is left for a wound-up string when the host fails: arm its watchdog",
+        )
+    if preflight.fed_by_any_client and not preflight.identity.simulated:
+        raise PreflightRefused(
+            f"a drill string hangs on the shaft, and any client feeds the drive's watchdog: {SHARED_FLAG} is not for"
+            " strings",
+            where="load in rig.yaml",
+            next_step="Use a drive, or a setting of this one, whose watchdog only its commanding host feeds",
+        )
+    if preflight.safe_action in _LETS_GO:
+        raise PreflightRefused(
+            f"a drill string hangs on the shaft, and the drive's watchdog reaction is '{preflight.safe_action}':"
+            " it would let go of the trapped torque",
+            where="watchdog of the profile",
+            next_step="Choose a reaction that brakes and holds: in CiA 402 object 6007h = 3 (quick stop)",
+        )
+    if not preflight.quick_stop_holds:
+        _refuse_quick_stop(preflight.quick_stop_holds)
+
+
+def _refuse_quick_stop(holds: bool | None) -> None:
+    known = holds is not None
+    raise PreflightRefused(
+        "a drill string hangs on the shaft, and "
+        + ("the drive lets go of it after a quick stop" if known
+           else "nobody knows whether the drive holds it after a quick stop"),
+        where="quick_stop of the profile",
+        next_step="Use a drive that stays in quick stop (605Ah = 5 or 6), or run without the string"
+        if known else "Look it up in the drive's manual, and write quick_stop.ends into a profile of your own",
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Preflight) -> Mode:
     """Torque mode where the drive has it and can enter it while it turns, unless speed mode was asked for.
@@ -62,7 +339,7 @@ def keep_within(limits: MachineLimits, request: ExcitationRequest, preflight: Pr
 def _no_room(what: str, limit: str) -> PreflightRefused:
     return PreflightRefused(
         what, where="drive's own limit",
-        next_step=f"Ask for less, raise it at the drive, or let the run widen it: {FLAG} {limit}",
+        next_step=f"Ask for less, raise it at the drive, or let the run widen it: {WIDER_FLAG} {limit}",
     )
 
 

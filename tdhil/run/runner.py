@@ -12,26 +12,31 @@ from dataclasses import asdict, replace
 from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample, Timed
 from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
-from tdhil.protocol import no_watchdog, others
-from tdhil.protocol.choose_rate import choose_rate, quieten
-from tdhil.protocol.control import MeanSpeedControl
-from tdhil.protocol.lag_knowledge import with_known_lag, with_read_filters, with_timing
-from tdhil.protocol.stage_swing import run_swings
-from tdhil.protocol.string_rules import refuse_with_string
 from tdhil.recording.recording import Excitation, LagPrior, Ramp
 from tdhil.recording.run_log import RunLog
+from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
 from tdhil.run.control_loop import Bench
 from tdhil.run.excitation import RigGuess, SwingPlan
 from tdhil.run.guard import Guard
-from tdhil.run.preconditions import choose_mode, keep_within, no_torque
+from tdhil.run.preconditions import (
+    choose_mode,
+    choose_rate,
+    keep_within,
+    no_torque,
+    quieten,
+    refuse_with_string,
+    with_known_lag,
+    with_read_filters,
+    with_timing,
+)
 from tdhil.run.settings import StopRequest
 from tdhil.run.speed_check import Onlooker
 from tdhil.run.stage_log import StageBook
 from tdhil.run.stage_planner import StagePlanner
-from tdhil.run.stages.acquire import run_acquire
+from tdhil.run.stages.acquire import run_acquire, run_swings
 from tdhil.run.stages.brake_test import NOT_YET, slow_down
-from tdhil.run.stages.hold import run_hold
+from tdhil.run.stages.hold import MeanSpeedControl, run_hold
 from tdhil.run.stages.setup import measure_offsets, probe_sign
 from tdhil.run.stages.speed import SpeedResult, run_speed
 from tdhil.run.stages.torque import TorqueResult, run_torque
@@ -95,7 +100,7 @@ class Runner:
                 with suppress(Exception):
                     self._display.stopped(report.confirmed)
             with suppress(Exception):
-                others.tell(self._drive, self._log.configure, self._say)
+                stage_log.tell(self._drive, self._log.configure, self._say)
             with suppress(Exception):
                 self._log.configure(counters=asdict(self._drive.counters))
             try:
@@ -212,13 +217,13 @@ class Runner:
         limits = keep_within(limits, task.request, preflight)
         task = replace(task, limits=limits)
         if not preflight.watched:
-            self._log.configure(**no_watchdog.configuration(preflight))
-            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID)
-            self._say(no_watchdog.SAID)
+            self._log.configure(**preconditions.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", preconditions.SAID)
+            self._say(preconditions.SAID)
         elif preflight.fed_by_any_client and not identity.simulated:
-            self._log.configure(**no_watchdog.configuration(preflight))
-            self._log.event(self._drive.clock.now_s(), "watchdog", no_watchdog.SAID_SHARED)
-            self._say(no_watchdog.SAID_SHARED)
+            self._log.configure(**preconditions.configuration(preflight))
+            self._log.event(self._drive.clock.now_s(), "watchdog", preconditions.SAID_SHARED)
+            self._say(preconditions.SAID_SHARED)
         self._choose_rate()
         # What the line carries is known only now: the driver may have measured it in preflight.
         period_s = self._drive.period_s

@@ -2,16 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
-from drivers.drive import Drive, Preflight, Rehearsed
-from tdhil.protocol import no_watchdog
-from tdhil.protocol.stage_quality import stage_quality
+from drivers.drive import Counters, Drive, Preflight, Rehearsed, Telling
 from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
+from tdhil.run import preconditions
 from tdhil.run.task import Display, Say
 
+# ---------------------------------------------------------------------------------------------------------------------
+# What others did on the drive's bus in a run, for the log, whoever watches, and the result.
+
+
+def summary(drive: Drive) -> tuple[str, ...]:
+    """Of all of the run, a line each; nothing of a drive that doesn't notice."""
+    return drive.summary() if isinstance(drive, Telling) else ()
+
+
+def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
+    """At the end: into the log's configuration, and to whoever watches."""
+    if lines := summary(drive):
+        configure(others=list(lines))
+        for line in lines:
+            say(f"on the drive's bus: {line}")
+
+
+def warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+    """For the result, from the log's configuration: the same live and replayed."""
+    found = run.get("others")
+    return tuple(f"on the drive's bus: {line}" for line in found) if isinstance(found, list) else ()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How well a stage was seen: from what went wrong on the bus and in the loop while it ran. Pure.
+
+
+TOLERATED_LOSS = 0.01
+"""A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
+
+TOLERATED_LATE = 0.05
+"""The same for cycles that began late, and for feedback that came after its cycle or twice."""
+
+FEW_LATE = 10
+"""So many of these are nothing, in however short a stage."""
+
+
+def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:
+    """(``ok`` or ``degraded``, what there is to say)."""
+    cycles = after.cycles - before.cycles
+    parts, outcome = [], "ok"
+    some_late = max(FEW_LATE, TOLERATED_LATE * cycles)
+    for count, tolerated, text in (
+        (after.missed - before.missed, TOLERATED_LOSS * cycles, "without feedback"),
+        (after.late - before.late, some_late, "with feedback that came late or twice"),
+        (after.overruns - before.overruns, some_late, "that began late"),
+    ):
+        if count:
+            parts.append(f"{count} of {cycles} cycles {text}")
+        if count > tolerated:
+            outcome = "degraded"
+    errors, passive = after.error_frames - before.error_frames, after.passive - before.passive
+    if errors:
+        parts.append(f"{errors} error frames" + (", the adapter was error-passive" if passive else ""))
+    if passive or errors > TOLERATED_LOSS * cycles:
+        outcome = "degraded"
+    return outcome, ", ".join(parts)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class StageBook:
     """Of one run. ``stages`` are those that have ended; ``preflight`` is set once there is one."""
@@ -34,7 +94,7 @@ class StageBook:
             self._announce(name)
             yield
         except BaseException as error:
-            no_watchdog.correct(error, self.preflight)
+            preconditions.correct(error, self.preflight)
             try:
                 self._end(Stage(name, start_s, self._now_s(), "aborted", _short(error)))
             except Exception as also:  # the first cause stays the cause

@@ -32,13 +32,139 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.drive import Command, Mode, PowerState, Sample, StopsFeeding
+from drivers.drive import Command, Drive, Looking, Mode, PowerState, Sample, StopsFeeding
 from drivers.errors import CommandRejected, StopNotConfirmed
-from tdhil.protocol.stop_looks import Looks, Slowing
-from tdhil.protocol.stop_patience import Patience
 from tdhil.run.control_loop import Bench
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.string_release import MEAN_S, LetGo, LetGoLimits
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Single looks at a drive (`drivers.drive.Looking`) for a stop without feedback of the cycle, or none to believe.
+#
+# A look feeds what supervises the host. So it must not go on for ever at a shaft that is not slowing down: such a one
+# is left to the drive's own watchdog, which wants silence (`Slowing`).
+
+
+AFTER_S = 0.2
+"""Without cyclic feedback for so long, the drive is looked at."""
+
+EVERY_S, MOST_S = 0.1, 0.4
+"""Between two looks; twice as long after each that brought nothing, up to the second."""
+
+SLOWING_S, SLOWER = 1.0, 0.98
+"""Under looks alone the shaft must have lost so much of its speed each second."""
+
+
+class Looks:
+    """Knows when a look is due. ``only``: the cyclic feedback is not believed any more."""
+
+    def __init__(self, drive: Drive, period_s: float) -> None:
+        self._drive = drive if isinstance(drive, Looking) else None
+        self._period_s = period_s
+        self._missing_s = 0.0
+        self._due_s = AFTER_S
+        self._pause_s = EVERY_S
+        self.only = False
+        self.answered = 0
+
+    @property
+    def standing(self) -> bool:
+        """Do looks stand in for the cycle's feedback at present?"""
+        return self.only or self._missing_s > 0.0
+
+    def heard(self) -> None:
+        """The cycle brought feedback."""
+        self._missing_s, self._due_s, self._pause_s = 0.0, AFTER_S, EVERY_S
+
+    def missed(self) -> Sample | None:
+        """A cycle has brought none: the drive's answer, where a look was due and was answered. May raise."""
+        self._missing_s += self._period_s
+        if self._drive is None or self._missing_s < self._due_s - 1e-9:
+            return None
+        self._due_s = self._missing_s + self._pause_s
+        self._pause_s = min(MOST_S, 2.0 * self._pause_s)
+        return self.ask()
+
+    def ask(self) -> Sample | None:
+        """Look now; None without an answer. May raise."""
+        sample = self._drive.look() if self._drive is not None else None
+        if sample is not None:
+            self.answered += 1
+            self._due_s, self._pause_s = self._missing_s + EVERY_S, EVERY_S
+        return sample
+
+
+class Slowing:
+    """Does the shaft lose speed? ``within_s``: how long it may take over `SLOWER` of it."""
+
+    def __init__(self, at_rest_rad_s: float, within_s: float = SLOWING_S) -> None:
+        self._at_rest_rad_s = at_rest_rad_s
+        self._within_s = within_s
+        self._since_s: float | None = None
+        self._speed_rad_s = math.inf
+
+    def reset(self) -> None:
+        """What comes next is seen as the first."""
+        self._since_s = None
+
+    def see(self, time_s: float, speed_rad_s: float) -> bool:
+        """False once a shaft that turns has not got slower for so long."""
+        speed_rad_s = abs(speed_rad_s)
+        if self._since_s is None or speed_rad_s <= max(self._at_rest_rad_s, SLOWER * self._speed_rad_s):
+            self._since_s, self._speed_rad_s = time_s, speed_rad_s
+        return time_s - self._since_s < self._within_s
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How long a stop is waited for: by the ramp, and beyond it for as long as the shaft keeps getting slower. Pure.
+#
+# A heavy shaft at its torque limit takes J ω / T instead of the ramp's time, and one on a string swings on the way
+# down: the highest speed of each block of 5 s must be lower than ever before by 1 %, or patience ends after two more
+# blocks.
+
+
+BLOCK_S = 5.0
+BLOCKS = 2.0
+SLOWER_SHARE = 0.99
+LONGEST_S = 300.0
+
+
+class Patience:
+    """``see`` every sample and ``wait`` every cycle without one; ``over`` says when to give up."""
+
+    def __init__(self, enough_s: float, at_rest_rad_s: float) -> None:
+        self._enough_s = enough_s
+        self._at_rest_rad_s = at_rest_rad_s
+        self._block_s = 0.0
+        self._peak = 0.0
+        self._best = math.inf
+        self._gained_s = 0.0
+        self.waited_s = 0.0
+
+    @property
+    def over(self) -> bool:
+        """Long enough, and no slower for two blocks; or longer than any stop may take."""
+        no_gain_s = self.waited_s - self._gained_s
+        return self.waited_s > LONGEST_S or (self.waited_s > self._enough_s and no_gain_s > BLOCKS * BLOCK_S)
+
+    def wait(self, period_s: float) -> None:
+        """A cycle has gone by."""
+        self.waited_s += period_s
+        self._block_s += period_s
+        if self._block_s < BLOCK_S:
+            return
+        # A shaft that hardly moves gets no slower by noise alone.
+        if self._at_rest_rad_s < self._peak < SLOWER_SHARE * self._best:
+            self._best, self._gained_s = self._peak, self.waited_s
+        self._block_s = self._peak = 0.0
+
+    def see(self, speed_rad_s: float, period_s: float) -> None:
+        """A cycle has gone by, and showed this speed."""
+        self._peak = max(self._peak, abs(speed_rad_s))
+        self.wait(period_s)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 AT_REST_SHARE = 0.005
 """Standstill is a speed below this share of the speed limit, or three quanta if that is more."""

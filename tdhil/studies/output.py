@@ -7,15 +7,93 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+from rich.text import Text
 
 from tdhil.report import page
-from tdhil.studies.study import Cell, ResultTable, StudyOutcome
+from tdhil.report.page import STYLE
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Numbers of a table as people read them: one column, one number of decimals.
+
+
+_DIGITS = 5          # of a column's largest number
+_MOST_DECIMALS = 5
+_WIDE = 1e3          # a column whose numbers differ more than that gets its digits one by one
+
+
+def shown(value: Cell) -> str:
+    """Alone: six digits at most; '-' for nothing."""
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def column_texts(values: Sequence[Cell]) -> list[str]:
+    """A column, its numbers with as many decimals as its largest bears; whole numbers as they are."""
+    sizes = [abs(value) for value in values if isinstance(value, float) and math.isfinite(value) and value != 0.0]
+    whole = all(size == int(size) for size in sizes)
+    if not sizes or whole or max(sizes) > _WIDE * min(sizes) or max(sizes) < 1e-3:
+        return [f"{value:.{_DIGITS}g}" if isinstance(value, float) and not whole else shown(value) for value in values]
+    decimals = min(_MOST_DECIMALS, max(0, _DIGITS - 1 - math.floor(math.log10(max(sizes)))))
+    while decimals and all(f"{value:.{decimals}f}".endswith("0") for value in values if isinstance(value, float)):
+        decimals -= 1
+    return [f"{value:.{decimals}f}" if isinstance(value, float) else shown(value) for value in values]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How far the studies are: on stderr, which is not for results.
+
+
+LINE_EVERY_S = 60.0
+
+
+class StudyBar:
+    """A bar over all studies on a terminal, gone while something else is printed; else a line a study and minute."""
+
+    def __init__(self, console: Console, count: int) -> None:
+        self._console = console
+        self._told_s = 0.0
+        self._bar = Bar(
+            TextColumn("{task.fields[name]:<9}"), BarColumn(28), TextColumn("{task.percentage:3.0f} %"),
+            TimeElapsedColumn(), TextColumn("{task.description}"), console=console, transient=True,
+            redirect_stdout=False, redirect_stderr=False, disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=float(count), name="")
+
+    @contextmanager
+    def of(self, index: int, name: str) -> Iterator[Progress]:
+        """While study ``index`` runs."""
+        if not self._console.is_terminal:
+            self._console.print(f"study {name} …", markup=False)
+        self._bar.update(self._task, completed=float(index), name=name, description="")
+        self._told_s = time.monotonic()
+        with self._bar:
+            yield lambda share, text: self._tell(index, name, share, text)
+
+    def _tell(self, index: int, name: str, share: float, text: str) -> None:
+        self._bar.update(self._task, completed=index + share, description=text)
+        if not self._console.is_terminal and time.monotonic() - self._told_s >= LINE_EVERY_S:
+            self._told_s = time.monotonic()
+            self._console.print(f"study {name} {100.0 * share:3.0f} %  {text}", markup=False, soft_wrap=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 INSTALL = f"no pictures without matplotlib; install it with: {page.install_command()}"
 DPI = 120
@@ -127,3 +205,186 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return _plain(value.tolist())
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A study's outcome on a terminal of 80 columns: tables, then what holds and what doesn't.
+
+
+MARKS: dict[bool | None, tuple[str, str, str]] = {
+    True: ("✓", "holds", "green"),
+    False: ("✗", "does not hold", "red"),
+    None: ("~", "open: the paper contradicts itself or leaves out what decides", "yellow"),
+}
+SIMULATED = "SIMULATED"
+_GAP = 2          # between columns
+
+
+def print_outcome(outcome: StudyOutcome, written: Written, console: Console) -> None:
+    """Everything, and where the files are."""
+    console.print(Text.assemble((f"{outcome.name}  {outcome.title}", "bold"), (f"  {SIMULATED}", "magenta")))
+    for table in outcome.tables:
+        console.print(Text(table.name.replace("_", " "), style="italic"))
+        for part in _tables(table, console.width):
+            console.print(part)
+            console.print()
+    console.print(statements(outcome.statements))
+    console.print(Text(f"files: {written.folder}", style="dim"), soft_wrap=True)
+    console.print()
+
+
+def print_list(studies: Iterable[Study], console: Console) -> None:
+    """Names and titles."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for study in studies:
+        grid.add_row(Text(study.name, style="bold"), study.title)
+    console.print(grid)
+
+
+def statements(all_of_them: Iterable[Statement]) -> RenderableType:
+    """Each with its mark, what was published and what came out here."""
+    parts: list[RenderableType] = []
+    for statement in all_of_them:
+        mark, word, style = MARKS[statement.holds]
+        parts.append(Text.assemble((f"{mark} ", style), statement.text, (f"  [{word.partition(':')[0]}]", style)))
+        grid = Table.grid(padding=(0, 1))
+        grid.add_column(style="dim", no_wrap=True)
+        grid.add_column(overflow="fold")
+        grid.add_row("published", Text(statement.published))
+        grid.add_row("ours", Text(statement.ours))
+        parts.append(Padding(grid, (0, 0, 0, 4)))
+    return Group(*parts)
+
+
+def _tables(table: ResultTable, width: int) -> Iterator[Table]:
+    """The table in parts that fit beside the margin, its first column before each: no number is ever folded."""
+    cells = [column_texts([row[index] for row in table.rows]) for index in range(len(table.columns))]
+    widths = [
+        max([len(word) for word in name.split("_")] + [len(text) for text in texts])
+        for name, texts in zip(table.columns, cells, strict=True)
+    ]
+    part, used = [0], widths[0]
+    for index in range(1, len(table.columns)):
+        if len(part) > 1 and used + _GAP + widths[index] > width:
+            yield _part(table, cells, widths, part)
+            part, used = [0], widths[0]
+        part.append(index)
+        used += _GAP + widths[index]
+    yield _part(table, cells, widths, part)
+
+
+def _part(table: ResultTable, cells: list[list[str]], widths: list[int], columns: list[int]) -> Table:
+    drawn = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, _GAP - 1, 0, 0))
+    for index in columns:
+        numeric = any(isinstance(row[index], int | float) for row in table.rows)
+        drawn.add_column(table.columns[index].replace("_", " "), justify="right" if numeric else "left",
+                         header_style="dim", vertical="bottom", width=widths[index])
+    for number in range(len(table.rows)):
+        drawn.add_row(*(Text(cells[index][number], no_wrap=True) for index in columns))
+    return drawn
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One page over all studies of a run: index.html with jinja2, index.md without.
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One study in the report; ``failure`` says why there is no outcome."""
+
+    name: str
+    outcome: StudyOutcome | None
+    written: Written | None
+    failure: str = ""
+
+
+def write_report(chapters: Sequence[Chapter], folder: Path) -> Path:
+    """The index of everything in ``folder``; the other kind of an earlier run is removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        text, path = _html(chapters, folder), folder / "index.html"
+    except ModuleNotFoundError as error:
+        if error.name != "jinja2":
+            raise
+        text, path = _markdown(chapters, folder), folder / "index.md"
+    for old in (folder / "index.html", folder / "index.md"):
+        if old != path:
+            old.unlink(missing_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def tally(chapters: Sequence[Chapter]) -> str:
+    """How many statements hold, don't, or are open."""
+    counted = Counter(s.holds for chapter in chapters if chapter.outcome for s in chapter.outcome.statements)
+    return f"{counted[True]} statements hold, {counted[False]} do not, {counted[None]} are open"
+
+
+def _html(chapters: Sequence[Chapter], folder: Path) -> str:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["shown"] = shown
+    template = environment.from_string(_TEMPLATE)
+    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, beside=_beside(folder),
+                           style=Markup(STYLE))
+
+
+def _beside(folder: Path):  # type: ignore[no-untyped-def]
+    return lambda path: path.relative_to(folder).as_posix()
+
+
+def _markdown(chapters: Sequence[Chapter], folder: Path) -> str:
+    lines = ["# Paper and program, side by side", "", tally(chapters), ""]
+    for chapter in chapters:
+        outcome, written = chapter.outcome, chapter.written
+        lines += [f"## {chapter.name}: {outcome.title}" if outcome else f"## {chapter.name}", ""]
+        if outcome is None or written is None:
+            lines += [f"No result: {chapter.failure}", ""]
+            continue
+        if written.picture is not None:
+            lines += [f"![{outcome.name}]({written.picture.relative_to(folder).as_posix()})", ""]
+        for table in outcome.tables:
+            lines += [f"**{table.name}**", "", "| " + " | ".join(table.columns) + " |"]
+            lines.append("|" + "---|" * len(table.columns))
+            lines += ["| " + " | ".join(shown(cell) for cell in row) + " |" for row in table.rows]
+            lines.append("")
+        for statement in outcome.statements:
+            mark, word, _ = MARKS[statement.holds]
+            lines.append(f"- {mark} {statement.text} ({word}). Published: {statement.published}. Ours: "
+                         f"{statement.ours}.")
+        lines.append("")
+    return "\n".join(lines)
+
+
+_TEMPLATE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>Paper and program, side by side</title>
+<meta name="viewport" content="width=device-width">
+<style>
+{{ style }}
+</style></head><body>
+<h1>Paper and program, side by side</h1>
+<p>Xu et al., <i>Appl. Sci.</i> 2026, 16, 2012, beside what comes out here. {{ tally }}. Everything here is SIMULATED;
+figures 19 to 23 through the drive's own bus protocol.</p>
+<nav>{% for c in chapters %}<a href="#{{ c.name }}">{{ c.name }}</a> {% endfor %}</nav>
+{% for c in chapters %}
+<h2 id="{{ c.name }}">{{ c.name }}{% if c.outcome %}: {{ c.outcome.title }}{% endif %}</h2>
+{% if not c.outcome %}<p class="red">No result: {{ c.failure }}</p>{% else %}
+{% if c.written.picture %}<p><a href="{{ beside(c.written.vector) }}"><img src="{{ beside(c.written.picture) }}"
+alt="{{ c.outcome.title }}"></a></p>{% endif %}
+<div class="wide"><table class="claims"><tr><th></th><th>statement</th><th>published</th><th>ours</th></tr>
+{% for s in c.outcome.statements %}<tr><td class="{{ marks[s.holds][2] }}" title="{{ marks[s.holds][1] }}">\
+{{ marks[s.holds][0] }}</td><td>{{ s.text }}</td><td>{{ s.published }}</td><td>{{ s.ours }}</td></tr>
+{% endfor %}</table></div>
+{% for t in c.outcome.tables %}<div class="wide"><table><caption>{{ t.name }}</caption>
+<tr>{% for column in t.columns %}<th>{{ column }}</th>{% endfor %}</tr>
+{% for row in t.rows %}<tr>{% for cell in row %}<td>{{ cell|shown }}</td>{% endfor %}</tr>
+{% endfor %}</table></div>{% endfor %}
+<p>Files: {% for path in c.written.files %}<a href="{{ beside(path) }}">{{ path.name }}</a> {% endfor %}</p>
+{% endif %}{% endfor %}
+<p>✓ holds · ✗ does not hold · ~ open: the paper contradicts itself or leaves out what decides</p>
+</body></html>
+"""

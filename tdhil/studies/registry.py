@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from tdhil.studies.paper import sweep_statements as claims
-from tdhil.studies.paper.figures import EffectStudy
+from tdhil.studies.paper.figures import EffectStudy, ScatterStudy, SignalStudy
 from tdhil.studies.paper.sweeps import FrequencySweep, InertiaSweep, KiSweepSettings, KpSweepSettings, SweepStudy
 from tdhil.studies.paper.tables import DesignStudy, Table6Settings, Table7Settings
 from tdhil.studies.study import Study
-from tdhil.study.figures_scatter import ScatterStudy
-from tdhil.study.figures_signal import SignalStudy
 
 
 def simulated_studies() -> tuple[Study, ...]:

@@ -22,12 +22,11 @@ from pydantic import BaseModel, Field, ValidationError, create_model
 
 from profiles.errors import DataFileError, Problem
 from profiles.model import DataModel
-from profiles.yaml_loader import load_model, load_with_lines
-from profiles.yaml_messages import messages_of
+from profiles.yaml_loader import load_model, load_with_lines, messages_of
 from profiles.yaml_tree import read_tree
 from tdhil.errors import UsageError
+from tdhil.studies.paper.loop import SYMBOLS, full_name
 from tdhil.studies.study import Study
-from tdhil.study.settings import SYMBOLS, full_name
 
 M = TypeVar("M", bound=BaseModel)
 

@@ -14,9 +14,8 @@ import can.util
 import pytest
 
 from drivers.errors import CommunicationLost, DataFileError, PreflightRefused
-from tdhil import bus_open
-from tdhil.bus_open import check_link, open_bus, parse_link
-from tdhil.cli.buses.can_bus import BusConfig, bus_config
+from tdhil.cli.buses import can_bus
+from tdhil.cli.buses.can_bus import BusConfig, bus_config, check_link, open_bus, parse_link
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
 
@@ -125,7 +124,7 @@ def test_what_ip_should_not_say(text: str) -> None:
 
 
 def test_a_link_with_another_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_open, "_read_link", lambda channel: link(name=channel))
+    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel))
     check_link(bus_config(cli("-i", "socketcan", "-c", "can0")))
     check_link(bus_config(cli("-i", "socketcan", "-c", "can0", "-b", "250000")))
     with pytest.raises(PreflightRefused) as caught:
@@ -135,10 +134,10 @@ def test_a_link_with_another_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_link_that_is_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_open, "_read_link", lambda channel: link(name=channel, up=False))
+    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel, up=False))
     with pytest.raises(PreflightRefused, match="sudo ip link set can0 up type can bitrate 250000"):
         check_link(bus_config(cli("-i", "socketcan", "-c", "can0")))
-    monkeypatch.setattr(bus_open, "_read_link", lambda channel: link(name=channel, up=False, bitrate=None))
+    monkeypatch.setattr(can_bus, "_read_link", lambda channel: link(name=channel, up=False, bitrate=None))
     with pytest.raises(PreflightRefused, match=r"sudo ip link set vcan9 up$"):
         check_link(bus_config(cli("-i", "socketcan", "-c", "vcan9")))
 
@@ -170,7 +169,7 @@ def test_causes_are_named(
         raise error
 
     monkeypatch.setattr(can, "Bus", fail)
-    monkeypatch.setattr(bus_open, "_read_link", lambda channel: None)
+    monkeypatch.setattr(can_bus, "_read_link", lambda channel: None)
     with pytest.raises(kind, match=words):
         open_bus(bus_config(cli("-i", "socketcan", "-c", "can0")))
 
@@ -219,6 +218,6 @@ def test_socketcand_opens_tuned(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_another_server_on_that_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bus_open, "PROBE_S", 0.2)
+    monkeypatch.setattr(can_bus, "PROBE_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(CommunicationLost, match="no socketcand"):
         open_bus(daemon(silent.getsockname()[1]))

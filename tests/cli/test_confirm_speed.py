@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from drivers.errors import PreflightRefused
-from tdhil.commands.confirm import confirm_speed, turns_text
+from tdhil.cli.identify import confirm_speed, turns_text
 from tdhil.config.rig import Run
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
+from tdhil.cli.identify import stop_on_signals
 from tdhil.cli.main import main
-from tdhil.commands.stop_signals import stop_on_signals
-from tdhil.errors import ExitCode, Interrupted
-from tdhil.record.errors import LogBroken
+from tdhil.errors import ExitCode, Interrupted, LogBroken
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog

@@ -8,11 +8,11 @@ import pytest
 
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import CommunicationLost, DriveFault
+from tdhil.cli.identify import summary
 from tdhil.cli.task import machine_limits
-from tdhil.commands.confirm import summary
 from tdhil.config.rig import load_rig, simulated_default_rig
 from tdhil.errors import exit_code
-from tdhil.protocol import no_watchdog
+from tdhil.run import preconditions
 from tdhil.run.settings import ExcitationRequest, MachineLimits
 
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
@@ -50,25 +50,25 @@ def test_it_is_not_the_default_and_no_file_says_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("found", [None, preflight(0.5)])
 def test_where_one_is_armed_nothing_is_changed(found: Preflight | None) -> None:
     error = CommunicationLost("no feedback", next_step=ACTS)
-    no_watchdog.correct(error, found)
+    preconditions.correct(error, found)
     assert error.next_step == ACTS
-    assert found is None or no_watchdog.configuration(found) == {}
+    assert found is None or preconditions.configuration(found) == {}
 
 
 def test_where_none_is_armed_nobody_is_told_that_it_acts() -> None:
     found = preflight(0.0)
     error = CommunicationLost("no feedback", where="node 1", next_step=ACTS)
-    no_watchdog.correct(error, found)
+    preconditions.correct(error, found)
     assert "own watchdog" not in str(error)
     assert str(error).startswith("node 1: no feedback. If the shaft still turns, use the hard-wired emergency stop now")
     assert exit_code(error) == 5
     other = DriveFault("EMCY 7305h", next_step="Mend the sensor")
-    no_watchdog.correct(other, found)
+    preconditions.correct(other, found)
     assert other.next_step == "Mend the sensor"
-    assert len(no_watchdog.warnings(no_watchdog.configuration(found))) == 1
+    assert len(preconditions.warnings(preconditions.configuration(found))) == 1
 
 
 @pytest.mark.parametrize("run", [{}, {"watchdog": None}, {"watchdog": 3}, {"watchdog": {"armed": True}},
                                  {"watchdog": {"armed": 0}}, {"watchdog": ["armed"]}])
 def test_a_log_that_does_not_say_so_warns_of_nothing(run: dict[str, object]) -> None:
-    assert no_watchdog.warnings(run) == ()
+    assert preconditions.warnings(run) == ()

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DataFileError, PreflightRefused
+from tdhil.cli.identify import confirm_motion
 from tdhil.cli.main import main
-from tdhil.commands.confirm import confirm_motion
 from tdhil.config.options import OPTIONS, resolve
 from tdhil.config.rig import load_rig
 
@@ -82,7 +82,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
     from tdhil.run.settings import ExcitationRequest, MachineLimits
 
     monkeypatch.setattr("sys.stdin", None)
-    monkeypatch.setattr("tdhil.cli.confirm.summary", lambda *_: "")
+    monkeypatch.setattr("tdhil.cli.identify.summary", lambda *_: "")
     task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
     preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
     with pytest.raises(PreflightRefused, match="nobody is there"):

@@ -8,10 +8,9 @@ import struct
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
-from sim_bus.modbus.embedded import EmbeddedModbusDrive
-from sim_bus.modbus.timing import LineTiming
+from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.drivers.drive_benches import LIMITS, RPM
 

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import STANDARD, Shape
-from drivers.cia402.feedback import Feedback
+from drivers.canopen.pdo import STANDARD, Feedback, Shape
 from profiles.simulator_marker import CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 
 OLD, NEW, OTHER = b"\x01" * 8, b"\x02" * 8, b"\x03" * 8

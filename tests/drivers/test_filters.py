@@ -6,8 +6,8 @@ import struct
 import pytest
 
 from drivers.canopen.bus import CanLink
+from drivers.canopen.preflight import lag_seconds, read_filters
 from drivers.canopen.sdo import Objects
-from drivers.cia402.filters import lag_seconds, read_filters
 from drivers.clock import SteppedClock
 from drivers.errors import ObjectRefused
 from profiles.canopen import ReportingFilter

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.supervision import Watch
-from drivers.cia402.guarding import Guarding
+from drivers.canopen.supervision import Guarding, Watch
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault

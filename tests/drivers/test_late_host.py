@@ -6,10 +6,9 @@ On a scripted drive in fake time; each TPDO1 bears the number of its SYNC.
 import pytest
 
 from drivers.canopen.drive import Cia402Drive
-from drivers.clock import MonotonicClock, SteppedClock
+from drivers.clock import LOWER_THE_RATE, MonotonicClock, SteppedClock, Ticks, how_late
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost
-from drivers.ticks import LOWER_THE_RATE, Ticks, how_late
 
 LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
 TURN = Command(Mode.SPEED, 1.0, 0.0)

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.clock import SteppedClock
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.simulator_marker import MARKER_REGISTER, MARKER_STAGE_REGISTER, STAGE_NUMBERS
 from sim_bus.modbus.embedded import EmbeddedModbusDrive

@@ -9,8 +9,8 @@ from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
-from drivers.modbus.errors import CycleRefused, LinkLost, NoisyReply
+from drivers.modbus.link import EmbeddedLink
+from drivers.modbus.pdu import CycleRefused, LinkLost, NoisyReply
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, MODE, Bank, high_and_low

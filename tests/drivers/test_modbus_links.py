@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, PreflightRefused
-from drivers.modbus.embedded import EmbeddedLink
-from drivers.modbus.errors import BadReply, LinkLost, NoReply
-from drivers.modbus.rtu import RtuLink
-from drivers.modbus.serial_port import permission_command, refusal
+from drivers.modbus.link import EmbeddedLink
+from drivers.modbus.pdu import BadReply, LinkLost, NoReply
+from drivers.modbus.rtu import RtuLink, permission_command, refusal
 from drivers.modbus.tcp import MOST_RENEWED, TcpLink
 from tests.drivers.modbus_peers import CLOSE, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
 

@@ -7,7 +7,7 @@ from pymodbus.pdu import DecodePDU
 
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.modbus import pdu
-from drivers.modbus.errors import BadReply, CycleRefused, RegisterRefused, exception_text
+from drivers.modbus.pdu import BadReply, CycleRefused, RegisterRefused, exception_text
 
 WORDS = st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=100)
 OTHER_SIDE = DecodePDU(True)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import PreflightRefused
-from drivers.modbus.plan import Span, plan_cycle, spans
+from drivers.modbus.cycle import Span, plan_cycle, spans
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile, Register
 

@@ -7,7 +7,7 @@ import pytest
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.quick_stop import ModbusTarget
 from drivers.quick_stop import Ended, bare_stop
 from profiles.library import load_profile, profile_names

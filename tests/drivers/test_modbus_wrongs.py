@@ -10,7 +10,7 @@ from drivers.clock import SteppedClock
 from drivers.drive import Limits
 from drivers.errors import PreflightRefused
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive

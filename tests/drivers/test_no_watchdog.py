@@ -12,7 +12,7 @@ from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Limits, Mode, Outcome
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.drive_benches import Run

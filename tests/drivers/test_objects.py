@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.canopen import pdo as objects
+from drivers.canopen.pdo import Units, consumer_heartbeat, encode_speed, encode_torque, lsb_decimals, mapping_entry
 from drivers.canopen.pdo_mapping import layout
-from drivers.cia402 import objects
-from drivers.cia402.objects import Units, consumer_heartbeat, encode_speed, encode_torque, lsb_decimals, mapping_entry
 from drivers.errors import CommandRejected
 
 RPM = math.pi / 30.0

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
+from drivers.canopen.limits import fulfils, wanted_text
 from drivers.canopen.quick_stop import Cia402Target
-from drivers.cia402.parameters import fulfils, wanted_text
 from drivers.drive import Mode, Outcome
 from profiles.canopen import CanopenProfile
+from profiles.entry import Require
 from profiles.library import load_canopen_profile
-from profiles.requirement import Require
 from tests.drivers.drive_benches import CanopenBench, Run
 from tests.drivers.profile_benches import AbbBench, Epos4Bench, S120Bench
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.canopen.bus import JUMP_S, FrameStamps
 from drivers.canopen.drive import Cia402Drive
-from drivers.cia402.stamps import JUMP_S, FrameStamps
 from drivers.clock import MonotonicClock
 from drivers.drive import Command, Limits, Mode
 

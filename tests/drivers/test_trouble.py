@@ -5,10 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.bus import CanLink
+from drivers.canopen.bus import CanLink, Condition, condition, queue_is_full
 from drivers.canopen.drive import Cia402Drive
 from drivers.canopen.supervision import Watch
-from drivers.cia402.trouble import Condition, condition, queue_is_full
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Limits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused

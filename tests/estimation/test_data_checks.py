@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tdhil.estimation.data_checks import flat_share
+from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
+from tdhil.estimation.frequency_domain.friction_levels import warming_of
 from tdhil.estimation.frequency_domain.spectrum import period_lines
-from tdhil.estimation.samples import stretches, usable_samples
-from tdhil.identify.faults.clipped import flat_share
-from tdhil.identify.faults.frozen import frozen
-from tdhil.identify.faults.spikes import spikes
-from tdhil.identify.faults.timebase import wrong_period
-from tdhil.identify.faults.undeclared import undeclared_warning
-from tdhil.identify.lines.warming import warming_of
+from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
 from tests.estimation.analytic import closed_form
 
 

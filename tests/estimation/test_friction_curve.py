@@ -8,12 +8,11 @@ from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from sim_bus.plant.rigid import Params
 from tdhil.estimation import Options
-from tdhil.estimation.cross_checks.friction_curve import FrictionCurve, friction_curve
+from tdhil.estimation.cross_checks.friction_curve import FrictionCurve, Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum_fit import Delay
 from tdhil.estimation.frequency_domain.friction_levels import Levels, measure_levels
 from tdhil.estimation.frequency_domain.spectrum import period_lines
 from tdhil.estimation.samples import stretches, usable_samples
-from tdhil.identify.beside.friction_curve_points import Inertia
 from tdhil.recording.recording import Recording
 from tests.estimation.stages_bench import usual_runs
 

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import Model
-from tdhil.identify.lines.fit import box, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.optimiser import box, minimise, rough_inertia_of
 from tests.estimation.test_two_mass import synthetic
 
 AT = Model().at

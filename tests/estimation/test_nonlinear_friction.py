@@ -11,12 +11,9 @@ from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
 from tdhil.estimation.frequency_domain.model import Model
-from tdhil.estimation.frequency_domain.nonlinear_friction import MODEL
+from tdhil.estimation.frequency_domain.nonlinear_friction import BEND, MODEL, Bend, BentShaft, Wave, bends
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import Verdict
-from tdhil.identify.bent.bends import Bend, bends
-from tdhil.identify.bent.shaft import BEND, BentShaft
-from tdhil.identify.bent.wave import Wave
 from tests.estimation.analytic import LINES, closed_form
 from tests.estimation.shaft_bench import Rig
 from tests.estimation.stages_bench import Stages, run_stages

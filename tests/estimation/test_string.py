@@ -12,9 +12,8 @@ from tdhil.estimation import Verdict, identify
 from tdhil.estimation.frequency_domain.compliant_fit import chance_gain, fit_compliant, too_slow
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import Model
-from tdhil.identify.compliant.string_shaft import StringShaft, resonances
-from tdhil.identify.compliant.two_mass import TwoMassShaft, stiffness
-from tdhil.identify.lines.fit import box, lowest, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.optimiser import box, lowest, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, stiffness, string_resonances
 from tdhil.recording.recording import LagPrior
 from tests.estimation.compliant_bench import LINES, Noise, Pipe, TwoMass, run
 from tests.estimation.test_two_mass import KNOWN, MILD, S, parameters, synthetic
@@ -49,7 +48,7 @@ def test_a_string_that_weighs_nothing_is_a_spring():
 @pytest.mark.parametrize("share", (0.0, 0.05, 0.4, 0.9, 1.0))
 def test_resonances_are_where_the_impedance_has_its_pole_and_its_zero(share):
     m = np.array([1500.0, 0.0, 600.0, 1.0, 0.0, 0.0, share])
-    held, free = resonances(m)
+    held, free = string_resonances(m)
     assert 0.0 < held < free
     at = StringShaft().impedance(m, 1j * np.array([held * (1 - 1e-7), held * (1 + 1e-7), free, 0.5 * held])).imag
     assert at[0] > 1e5 * at[3] and at[1] < -1e5 * at[3]
@@ -114,7 +113,7 @@ def test_a_string_has_a_double_that_the_lines_cannot_tell(wave, resistance, end,
     double = pipe(wave + n / (2.0 * base))
     for hz in LINES:
         assert double.impedance(hz) == pytest.approx(pipe(wave).impedance(hz), rel=1e-6)
-    assert resonances(string_parameters(double))[0] <= np.pi * base
+    assert string_resonances(string_parameters(double))[0] <= np.pi * base
 
 
 def test_the_double_of_a_string_does_not_stand_in_its_place():
@@ -133,7 +132,7 @@ def test_the_double_of_a_string_does_not_stand_in_its_place():
         start[4] = 2.0 * m[4] * (resistance / spring / wave) ** 2       # as little damping as the spring has
         ends.append(minimise(problem, limits, start, held))
     beside = fit_compliant(StringShaft(), lines, tie, (), {}, two)
-    doubles = [fit for fit in ends if resonances(fit.theta[:7])[0] < np.pi * LINES[0]]
+    doubles = [fit for fit in ends if string_resonances(fit.theta[:7])[0] < np.pi * LINES[0]]
     assert min(abs(fit.objective - beside.fitted.simple.objective) for fit in doubles) < 1.0, "as good, all but"
     likelier = replace(doubles[0], objective=beside.fitted.simple.objective - 1.0)
     apart = too_slow(problem)

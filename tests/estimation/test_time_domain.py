@@ -8,9 +8,8 @@ import pytest
 from tdhil.estimation import Options, Verdict, identify
 from tdhil.estimation.samples import usable_samples
 from tdhil.estimation.time_domain.equation import PARAMETERS, evaluate
-from tdhil.estimation.time_domain.windows import joined, measure, windows
-from tdhil.identify.record_route.stretches import runs, thinned
-from tdhil.identify.record_route.tapers import flat_top
+from tdhil.estimation.time_domain.taylor import flat_top
+from tdhil.estimation.time_domain.windows import joined, measure, runs, thinned, windows
 from tdhil.recording.recording import LagPrior
 from tdhil.studies.coverage import plants
 from tdhil.studies.coverage.simulate import simulate as simulate_plan

@@ -7,18 +7,22 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from tdhil.commands.models import MODELS as OFFERED
+from tdhil.cli.arguments import MODELS as OFFERED
 from tdhil.estimation import Options, Verdict, identify
-from tdhil.estimation.frequency_domain.compliant_fit import fit_compliant, inertias
+from tdhil.estimation.frequency_domain.compliant import Chosen, choose, may_swing
+from tdhil.estimation.frequency_domain.compliant_fit import (
+    RESONANCE,
+    STIFFNESS,
+    TOTAL,
+    ViewedShaft,
+    fit_compliant,
+    inertias,
+)
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
+from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, resonances, stiffness
 from tdhil.estimation.frequency_domain.spectrum import Line
-from tdhil.estimation.result import Refusal
-from tdhil.identify.compliant.choice import Chosen, choose, may_swing
-from tdhil.identify.compliant.string_shaft import StringShaft
-from tdhil.identify.compliant.two_mass import TwoMassShaft, resonances, stiffness
-from tdhil.identify.compliant.views import RESONANCE, STIFFNESS, TOTAL, ViewedShaft
-from tdhil.identify.options import MODELS
+from tdhil.estimation.result import MODELS, Refusal
 from tdhil.recording.recording import LagPrior
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
 

@@ -11,8 +11,7 @@ import pytest
 
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
-from tdhil.errors import ExitCode, Interrupted, exit_code
-from tdhil.record.errors import LogError
+from tdhil.errors import ExitCode, Interrupted, LogError, exit_code
 from tdhil.run.control_loop import Bench
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.task import STAGES

@@ -4,8 +4,8 @@ import random
 
 import pytest
 
-from drivers.modbus.embedded import EmbeddedLink
-from drivers.modbus.errors import NoisyReply
+from drivers.modbus.link import EmbeddedLink
+from drivers.modbus.pdu import NoisyReply
 from tests.faults.rehearsal import at, run
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON
+from sim_bus.modbus.faults import KINDS, ONLY_ON
 from tests.path.path_runs import Shaft, process, tdhil, wait_for
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.drive import PowerState
 from sim_bus.canopen.simulator import EmbeddedSimulator
-from tdhil.record.errors import LogBroken
+from tdhil.errors import LogBroken
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.run_log import RunLog
 from tdhil.report.live import LiveDisplay

@@ -16,7 +16,7 @@ from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
-from drivers.modbus.embedded import EmbeddedLink
+from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_canopen_profile, load_modbus_profile
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus.embedded import EmbeddedModbusDrive

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.record.pump import Pump
 from tdhil.recording.log_reader import read_run
+from tdhil.recording.log_writer import Pump
 from tests.faults.rehearsal import at
 
 RIG = """

@@ -33,7 +33,7 @@ def test_every_named_test_exists(text):
 
 def test_every_scripted_fault_is_rehearsed():
     """Each name that the simulator knows stands in one of this room's tests."""
-    from sim_bus.fault_catalogue import KINDS
+    from sim_bus.canopen.faults import KINDS
 
     source = "".join(path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("test_*.py"))
     assert [name for name in KINDS if f'"{name}' not in source] == []

@@ -129,7 +129,7 @@ def _excitation(path: Path) -> None:
 
 
 def _csv(path: Path) -> None:
-    from tdhil.record.csv_choice import USUAL, parse_columns
+    from tdhil.recording.csv.layout import USUAL, parse_columns
     from tdhil.recording.csv.reader import Bench, read_recording
 
     choices = USUAL

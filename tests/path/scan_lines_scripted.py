@@ -1,8 +1,8 @@
 """Modbus lines of the tests' own: one on which nobody answers, one that garbles, and one with a drive on unit 3."""
 
 from drivers.clock import Clock
-from drivers.modbus.errors import BadReply, NoReply
 from drivers.modbus.link import Reply
+from drivers.modbus.pdu import BadReply, NoReply
 
 IDENTIFICATION = (bytes.fromhex("2b 0e 01 01 00 00 03") + b"\x00\x07Danfoss" + b"\x01\x06FC 302" + b"\x02\x038.1")
 """Function 43/14: vendor, product code, revision (Modbus Application Protocol V1.1b3, section 6.21)."""

@@ -11,7 +11,7 @@ import sys
 from profiles.simulator_marker import MARKER_INDEX
 from sim_bus import command
 from sim_bus.canopen import node, simulator
-from sim_bus.modbus import slots
+from sim_bus.modbus import registers
 
 
 def be_patient() -> None:
@@ -26,7 +26,7 @@ def be_real() -> None:
         del self.store.object_dictionary[MARKER_INDEX]
 
     node.Cia402Node.__init__ = without_marker
-    slots._marker = lambda stepped: ()  # type: ignore[attr-defined]
+    registers._marker = lambda stepped: ()  # type: ignore[attr-defined]
 
 
 if __name__ == "__main__":

@@ -172,9 +172,9 @@ def test_a_drive_in_another_process_over_tcp():
 @pytest.fixture
 def real(monkeypatch, tmp_path):
     """The embedded drive without the simulator's marker, in real time; its profile has doubtful entries."""
-    from sim_bus.modbus import slots
+    from sim_bus.modbus import registers
 
-    monkeypatch.setattr(slots, "MARKER_TEXT", "somebody's drive")
+    monkeypatch.setattr(registers, "MARKER_TEXT", "somebody's drive")
     text = profile_path("generic/modbus").read_text(encoding="utf-8")
     text = text.replace("confidence: verified", "confidence: likely", 1)                     # line
     text = text.replace("name: check_sign", "name: sign_check", 1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sim_bus.trace import HEADER, NotATrace, Trace
-from tdhil.commands.log_file import LogPlace, is_live
+from tdhil.cli.identify import LogPlace, is_live
 from tdhil.errors import UsageError
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter

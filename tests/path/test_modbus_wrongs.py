@@ -14,9 +14,9 @@ import pytest
 from drivers.errors import PreflightRefused
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
-from sim_bus.modbus import embedded, slots
+from sim_bus.modbus import embedded, registers
 from sim_bus.modbus.wrong_maps import parse
-from tdhil.commands.unverified import accepted_lines, require_accepted
+from tdhil.cli.profile_text import accepted_lines, require_accepted
 from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import Shaft, identify
 
@@ -117,7 +117,7 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     from drivers.clock import SteppedClock
     from drivers.drive import Limits
     from drivers.modbus.drive import ModbusDrive
-    from drivers.modbus.embedded import EmbeddedLink
+    from drivers.modbus.link import EmbeddedLink
 
     profile = load_modbus_profile(name)
     peer = embedded.EmbeddedModbusDrive(embedded.RigParams(), profile)
@@ -154,7 +154,7 @@ def test_a_real_drive_with_a_setpoint_that_no_register_tells_is_refused_unless_i
 ])
 def test_so_no_wrong_of_such_a_setpoint_moves_a_real_shaft_unasked(name, wrong, monkeypatch, tmp_path):
     wired(monkeypatch, wrong)
-    monkeypatch.setattr(slots, "MARKER_TEXT", "somebody's drive")         # taken for a real one
+    monkeypatch.setattr(registers, "MARKER_TEXT", "somebody's drive")         # taken for a real one
     profile, trace = load_modbus_profile(name), tmp_path / "shaft.csv"
     asked = {f"echoes.{setpoint}" for setpoint in unseen(profile)}
     others = {"likely", *profile.below("unverified")} - asked

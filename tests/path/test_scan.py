@@ -12,12 +12,11 @@ from profiles.canopen import CanopenProfile
 from profiles.library import load_canopen_profile, load_profile, profile_names
 from sim_bus.canopen.simulator import EmbeddedSimulator, Simulator
 from sim_bus.params import RigParams
-from tdhil import bus_open
-from tdhil.cli.buses import modbus
+from tdhil.cli.buses import can_bus, modbus
 from tdhil.cli.buses.canopen_scan import match
+from tdhil.cli.buses.modbus_scan import parse_identification, parse_units
 from tdhil.cli.found_drive import FoundDrive
-from tdhil.commands.scan_modbus import parse_identification, parse_units
-from tdhil.commands.scan_rig import starter
+from tdhil.cli.scan import starter
 from tdhil.config.rig import load_rig, require_limits
 from tests.path.path_runs import tdhil
 from tests.path.scan_lines_scripted import Answering, Garbled, Silent
@@ -59,7 +58,7 @@ def test_a_node_says_who_it_is(tmp_path):
 def test_scanning_writes_nothing_to_a_drive(monkeypatch):
     with EmbeddedSimulator(RigParams(), node_id=3, stepped=True) as simulated:
         bus = WatchedBus(simulated.channel)
-        monkeypatch.setattr(bus_open, "open_bus", lambda config: bus)
+        monkeypatch.setattr(can_bus, "open_bus", lambda config: bus)
         done = tdhil("scan", "-i", "virtual", "-c", simulated.channel, *QUICK)
     assert done.code == 0, done.err
     assert bus.identifiers == {0x600 + node for node in range(1, 128)}
@@ -159,7 +158,7 @@ class Full(ErrorFrames):
 @pytest.mark.parametrize("command", ["scan", "doctor", "identify"])
 @pytest.mark.parametrize("bus", [ErrorFrames, Full])
 def test_a_wrong_bit_rate(monkeypatch, command, bus):
-    monkeypatch.setattr(bus_open, "open_bus", lambda config: bus())
+    monkeypatch.setattr(can_bus, "open_bus", lambda config: bus())
     more = QUICK if command == "scan" else ()
     done = tdhil(command, "-i", "virtual", "-c", "x", *more)
     said = done.err + done.out

@@ -50,7 +50,7 @@ def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, p
 def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
     from sim_bus.params import RigParams
     from sim_bus.params import load_rig as load_plant
-    from tdhil.commands.simulated_bench import suited
+    from tdhil.cli.task import suited
     from tdhil.config.rig import Rig, load_rig
 
     bench = suited(None, load_plant(EXAMPLES / "plant_string.yaml"))

@@ -12,9 +12,8 @@ from drivers.errors import PreflightRefused
 from profiles.library import profile_names
 from tdhil.cli.support import Scrub
 from tdhil.config.rig import load_rig, require_limits
-from tdhil.record.event import Event
-from tdhil.record.messages import Ours, messages
-from tdhil.recording.log_reader import read_run
+from tdhil.recording.log_format import Event
+from tdhil.recording.log_reader import Ours, messages, read_run
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Stage
 from tests.path.path_runs import tdhil

@@ -3,7 +3,7 @@
 import pytest
 
 from profiles.quantities import TIME
-from tdhil.commands.quantities import amount, share
+from tdhil.cli.arguments import amount, share
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import QUICK, Shaft, identify, tdhil
 

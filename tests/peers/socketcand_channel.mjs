@@ -1,6 +1,6 @@
 // A CAN channel over our socketcand hub, shaped as the npm package `canopen` wants it: send({id, data}), 'message' events.
 //
-// The words (server's side: sim_bus/socketcand.py): `< hi >`, then `< open can0 >` and `< rawmode >`, each answered by
+// The words (server's side: sim_bus/canopen/socketcand.py): `< hi >`, then `< open can0 >` and `< rawmode >`, each answered by
 // `< ok >`; from then on `< send 123 2 a 1f >` goes out and `< frame 123 1700000000.123456 0A1F >` comes in.
 
 import { EventEmitter } from 'node:events';

@@ -10,18 +10,15 @@ from drivers.drive import Command, Mode
 from drivers.drive import Limits as DriveLimits
 from drivers.modbus import pdu as requests
 from drivers.modbus.access import Access
-from drivers.modbus.cycle import Codec, shown_mode
-from drivers.modbus.limits import wanted_setting
+from drivers.modbus.codec import find_scales, settle, si_per_count
+from drivers.modbus.cycle import Codec, plan_cycle, shown_mode
 from drivers.modbus.link import Reply
-from drivers.modbus.parameters import Parameters, find_filters
-from drivers.modbus.plan import plan_cycle
-from drivers.modbus.scales import find_scales, settle, si_per_count
+from drivers.modbus.parameters import Parameters, find_filters, wanted_setting
 from drivers.modbus.state_machine import Wish, controlword_towards, decode, seen
 from drivers.preflight import Table
 from profiles.library import load_modbus_profile, load_profile, profile_names
-from sim_bus.modbus.embedded import EmbeddedModbusDrive
+from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
 from sim_bus.modbus.parameters import reporting_lag_s
-from sim_bus.modbus.timing import LineTiming
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 from tests.profiles.golden import Exchange, Golden, Means, load, names, pdu
 

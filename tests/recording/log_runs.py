@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from drivers.drive import Command, Mode, PowerState, RawFrame, Sample
-from tdhil.record.event import Event
 from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.log_format import Event
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Excitation, LagPrior, Level, Ramp, Recording, Segment, Stage
 

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from tdhil.errors import TdhilError, exit_code
 from tdhil.estimation import identify
 from tdhil.estimation.result import Verdict
-from tdhil.record.csv_choice import USUAL, parse_columns
 from tdhil.recording.csv.excitation import load_excitation
+from tdhil.recording.csv.layout import USUAL, parse_columns
 from tdhil.recording.csv.reader import Bench, read_recording
 
 HEAD = "time_s,speed_rad_s,torque_nm\n"

@@ -5,14 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from tdhil.errors import ExitCode, UsageError, exit_code
-from tdhil.record import csv_trace
-from tdhil.record.csv_choice import USUAL, parse_columns
-from tdhil.record.csv_clock import ClockReader
-from tdhil.record.csv_errors import CsvMisnamed, CsvUnusable
-from tdhil.record.csv_trace import read_trace
+from tdhil.errors import CsvMisnamed, CsvUnusable, ExitCode, UsageError, exit_code
+from tdhil.recording.csv import reader as csv_trace
 from tdhil.recording.csv import text as csv_text
-from tdhil.recording.csv.reader import resolution
+from tdhil.recording.csv.layout import USUAL, parse_columns
+from tdhil.recording.csv.reader import read_trace, resolution
+from tdhil.recording.csv.text import ClockReader
 
 RPM = 2.0 * math.pi / 60.0
 FOOT_POUND = 1.3558179483314004

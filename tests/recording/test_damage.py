@@ -16,7 +16,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import Writer
 
-from tdhil.record.errors import LogError
+from tdhil.errors import LogError
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.mcap_container import LIBRARY, MAGIC
 from tests.recording.log_runs import make_run

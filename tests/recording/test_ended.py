@@ -6,11 +6,10 @@ import pytest
 
 from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRefused
 from tdhil.errors import Interrupted, exit_code
-from tdhil.record.ended import find_ended
-from tdhil.record.event import Event
+from tdhil.recording.log_format import Event
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.run_log import RunLog
+from tdhil.recording.run_log import RunLog, find_ended
 
 ERRORS = [
     PreflightRefused("wanted 1, found 2", where="6502h", next_step="Choose the profile"),

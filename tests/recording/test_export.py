@@ -12,9 +12,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from tdhil.cli.main import main
-from tdhil.record.event import Event
 from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import CHANNELS, CLASSES
+from tdhil.recording.log_format import CHANNELS, CLASSES, Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
 from tests.recording.log_runs import FACTS, PERIOD_S, fill, make_run

@@ -43,7 +43,7 @@ def test_a_disk_without_room_refuses_the_run(tmp_path):
 
 def test_a_disk_that_fails_at_the_very_end_does_not_take_the_result_with_it(tmp_path, monkeypatch, capsys):
     from tdhil.cli.main import main
-    from tdhil.record.errors import LogBroken
+    from tdhil.errors import LogBroken
     from tdhil.recording.log_writer import RunWriter
     from tdhil.recording.mcap_container import Container
 

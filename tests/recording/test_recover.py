@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from tdhil.cli.main import main
-from tdhil.record.errors import LogError
-from tdhil.record.event import RECOVERED
+from tdhil.errors import LogError
+from tdhil.recording.log_format import RECOVERED
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.salvage import examine, write_copy

@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from drivers.drive import Command, Mode
-from tdhil.record.event import Event
 from tdhil.recording.builder import FACTS as FACT_NAMES
 from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.log_format import Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import LagPrior, Recording

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.drive import Command, Mode, PowerState, RawFrame, Sample
-from tdhil.record.wire import pack_command, pack_frames, pack_sample
 from tdhil.recording.log_format import CLASSES, MESSAGES, MODES, STATES
+from tdhil.recording.log_messages import pack_command, pack_frames, pack_sample
 
 NUMBERS = st.floats(width=64)
 SAMPLES = st.builds(

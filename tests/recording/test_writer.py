@@ -10,11 +10,10 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.drive import Command, Mode
-from tdhil.errors import ExitCode, exit_code
-from tdhil.record import sync
-from tdhil.record.errors import LogBroken, LogError
-from tdhil.record.event import Event
+from tdhil.errors import ExitCode, LogBroken, LogError, exit_code
+from tdhil.recording import log_writer
 from tdhil.recording.builder import RecordingBuilder
+from tdhil.recording.log_format import Event
 from tdhil.recording.log_reader import read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Stage
@@ -245,7 +244,7 @@ def test_a_slow_sync_holds_up_nobody_but_the_end(tmp_path, monkeypatch):
         asked.set()
         gate.wait()
 
-    monkeypatch.setattr(sync, "_data_to_disk", slow)
+    monkeypatch.setattr(log_writer, "_data_to_disk", slow)
     path = tmp_path / "run.mcap"
     writer = RunWriter(path, epoch_ns=0, block=True)
     fill(writer, RecordingBuilder(), 2000)

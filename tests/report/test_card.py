@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from tdhil.report.card import print_card
+from tdhil.report.card import percent, plus_minus, print_card, with_interval
 from tdhil.report.document import result_document
-from tdhil.report.numbers import percent, plus_minus, with_interval
 from tests.report.findings import bare, full, open_sided, recording
 
 

@@ -13,8 +13,8 @@ from rich.table import Table
 from drivers.drive import Check, Identity, Outcome, Preflight
 from drivers.errors import PreflightRefused
 from profiles.visible import visible
+from tdhil.cli.identify import summary
 from tdhil.cli.main import main
-from tdhil.commands.confirm import summary
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table
 from tdhil.run.settings import ExcitationRequest

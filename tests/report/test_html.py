@@ -15,7 +15,7 @@ from tdhil.errors import UsageError
 from tdhil.report.content import report_of
 from tdhil.report.document import result_document
 from tdhil.report.html import check_report_path, report_page, sha256_of, write_report
-from tdhil.report.picture_run import envelope
+from tdhil.report.plots import envelope
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
 pytest.importorskip("matplotlib")

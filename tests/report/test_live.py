@@ -9,8 +9,7 @@ from rich.console import Console
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from tdhil.recording.recording import Stage
-from tdhil.report.live import LiveDisplay
-from tdhil.report.painter import MOST_LINES, Painter
+from tdhil.report.live import MOST_LINES, LiveDisplay, Painter
 
 COMMAND = Command(Mode.SPEED, 3.0, 0.0)
 

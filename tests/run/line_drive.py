@@ -14,8 +14,7 @@ import numpy as np
 
 from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState, Preflight, Sample
-from sim_bus.control import Regulation
-from sim_bus.inverter import Inverter
+from sim_bus.inverter import Inverter, Regulation
 from sim_bus.params import DriveParams, RigParams
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.recording import Recording

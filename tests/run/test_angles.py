@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.drive import Mode, PositionReading, PowerState, Sample
-from tdhil.protocol.angles import Angles
+from tdhil.run.speed_check import Angles
 
 PERIOD_S, EVERY = 0.004, 15
 WIDTHS = (None, 2.0 * math.pi, 65536 * 2.0 * math.pi / 4096)

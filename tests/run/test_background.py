@@ -26,7 +26,7 @@ from tdhil.run.settings import ExcitationRequest
 HANGS_S = 60.0
 REST = Command(Mode.SPEED, 0.0, 0.0)
 LIGHT = background._PROGRAM.replace(
-    "from tdhil", "import tdhil.run.choose_rate as rate; rate.quieten = lambda: None\nfrom tdhil"
+    "from tdhil", "import tdhil.run.preconditions as rate; rate.quieten = lambda: None\nfrom tdhil"
 )
 """Loads no more than it must: these tests are not about cycles that are late."""
 

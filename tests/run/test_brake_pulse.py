@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdhil.protocol.braking_pulse import Before, NoPulse, Pulse, plan_pulse
 from tdhil.run.excitation import RigGuess
 from tdhil.run.guard import Guard
 from tdhil.run.settings import ControlAssumptions
+from tdhil.run.stages.brake_test import Before, NoPulse, Pulse, plan_pulse
 from tests.run.fake_drive import LIMITS
 
 USUAL = RigGuess(104.0, 8.0, 60.0)

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.drive import Command, Mode, Paced
 from tdhil.errors import Interrupted
-from tdhil.protocol.choose_rate import CYCLES, WARM_UP, choose_rate
+from tdhil.run.preconditions import CYCLES, WARM_UP, choose_rate
 from tests.run.fake_drive import FakeDrive
 
 REST = Command(Mode.SPEED, 0.0, 0.0)

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdhil.protocol.control import MeanSpeedControl
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions
+from tdhil.run.stages.hold import MeanSpeedControl
 
 MODEL = RigGuess(inertia_kg_m2=100.0, viscous_nm_s_rad=8.0, coulomb_nm=60.0)
 DT_S = 0.004

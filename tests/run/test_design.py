@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from tdhil.estimation.samples import Samples
-from tdhil.protocol.design.noise import assumed_theta
 from tdhil.recording.recording import LagPrior
 from tdhil.run.design import Knowledge, Noise, assumed_noise, choose, expected_half_width, measured_noise
+from tdhil.run.design.prediction import assumed_theta
 from tdhil.run.excitation import ExcitationWish, MachineLimits, PlanRefused, RigGuess, make_plan
 from tdhil.run.guard import Guard
 from tdhil.run.settings import ControlAssumptions
 from tdhil.studies.coverage.bound import density
-from tdhil.study.coverage_fleet import FLEET
+from tdhil.studies.coverage.plants import FLEET
 
 FORESIGHT_S = Guard.foresight_s(ControlAssumptions())
 PLANTS = {plant.name: plant for plant in FLEET}

@@ -6,11 +6,11 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdhil.protocol.dither import dither, dither_peak
 from tdhil.run.excitation import MachineLimits, RigGuess, make_plan
 from tdhil.run.guard import Guard
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.settings import MachineLimits as GuardLimits
+from tdhil.run.stages.acquire import dither, dither_peak
 
 RPM = 2.0 * math.pi / 60.0
 

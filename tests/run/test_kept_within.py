@@ -6,14 +6,12 @@ A setpoint that the guard rejects is a mistake of this program, and ends the run
 import pytest
 
 from drivers.drive import Mode
-from tdhil.protocol.control import MeanSpeedControl
-from tdhil.protocol.stage_swing import run_swings
 from tdhil.run.excitation import MachineLimits as Room
 from tdhil.run.excitation import RigGuess, SwingPlan
 from tdhil.run.excitation.pulses import CALM_S, Way
 from tdhil.run.settings import ControlAssumptions
-from tdhil.run.stages.acquire import Follower
-from tdhil.run.stages.hold import run_hold
+from tdhil.run.stages.acquire import Follower, run_swings
+from tdhil.run.stages.hold import MeanSpeedControl, run_hold
 from tests.run.fake_drive import LIMITS, FakeDrive
 
 ROOM = Room(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)

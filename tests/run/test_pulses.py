@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from drivers.drive import Mode
 from drivers.errors import PreflightRefused
 from tdhil.estimation import identify
-from tdhil.estimation.result import Verdict
-from tdhil.identify.options import Options
+from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.recording import LagPrior
 from tdhil.run.design import Knowledge, assumed_noise
 from tdhil.run.excitation import MachineLimits, PlanRefused, RigGuess, make_swings

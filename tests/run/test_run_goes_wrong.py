@@ -6,8 +6,7 @@ import pytest
 
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
-from tdhil.errors import ExitCode, Interrupted, exit_code
-from tdhil.record.errors import LogError
+from tdhil.errors import ExitCode, Interrupted, LogError, exit_code
 from tdhil.run.settings import ExcitationRequest
 from tests.run.fake_drive import FakeDrive, lost
 from tests.run.run_outcomes import EACH_STAGE, after, assert_at_rest, outcomes, up_to

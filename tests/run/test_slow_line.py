@@ -8,8 +8,7 @@ import pytest
 from drivers.drive import Mode
 from sim_bus.params import ReportingParams, RigParams
 from tdhil.estimation import identify
-from tdhil.estimation.result import Verdict
-from tdhil.identify.options import Options
+from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.builder import FACTS
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest
 from tests.run.line_drive import COARSE, RIG_LIMITS, Line, LineDrive, run_line

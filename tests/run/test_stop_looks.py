@@ -6,9 +6,8 @@ import pytest
 
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
-from tdhil.protocol.stop_looks import AFTER_S, EVERY_S, SLOWING_S, Looks, Slowing
 from tdhil.run.settings import ControlAssumptions
-from tdhil.run.stop import REST_AFTER_S, SILENT_S, UNMOVED_S
+from tdhil.run.stop import AFTER_S, EVERY_S, REST_AFTER_S, SILENT_S, SLOWING_S, UNMOVED_S, Looks, Slowing
 from tests.run.fake_drive import LIMITS, PERIOD_S, FakeDrive
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 
 from drivers.drive import Check, Identity, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
-from tdhil.protocol.stop_patience import BLOCK_S, LONGEST_S, Patience
-from tdhil.protocol.string_rules import refuse_with_string
+from tdhil.run.preconditions import refuse_with_string
 from tdhil.run.settings import ExcitationRequest
-from tdhil.run.stop import MODE_S
+from tdhil.run.stop import BLOCK_S, LONGEST_S, MODE_S, Patience
 from tdhil.run.string_release import FASTEST_SWING_S, QUIET_S, STIFFEST, TRAVEL_RAD, LetGo, LetGoLimits
 from tests.run.fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
 from tests.run.string_drive import RESIDUAL_NM, STRING, StringWorld

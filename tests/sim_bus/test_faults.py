@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID, CYCLE_OVER, CYCLES_END, STAGE_NUMBERS
+from sim_bus.canopen.faults import KINDS, make, parse_all
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.command import main
-from sim_bus.fault_catalogue import KINDS, make, parse_all
 from sim_bus.fault_script import FaultRefused, Moment, Schedule, Scripted, parse
 
 TIMES = st.integers(0, 99_999).map(lambda ms: f"{ms}ms")

@@ -15,9 +15,9 @@ import pytest
 from profiles.library import load_canopen_profile
 from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 from sim_bus.canopen import simulator
+from sim_bus.canopen.faults import parse_all
 from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.canopen.simulator import EmbeddedSimulator
-from sim_bus.fault_catalogue import parse_all
 
 Said = list[tuple[int, bytes]]
 TURNING = (

@@ -3,10 +3,9 @@ import math
 import numpy as np
 import pytest
 
-from sim_bus.inverter import Inverter
+from sim_bus.inverter import RPM, Inverter
 from sim_bus.params import FAITHFUL, QUIET, NoiseParams, ReportingParams, RigParams
 from sim_bus.plant.rigid import Params
-from sim_bus.reporting import RPM
 
 DT = 0.002
 

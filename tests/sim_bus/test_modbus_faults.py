@@ -17,10 +17,8 @@ from hypothesis import strategies as st
 from profiles.simulator_marker import MARKER_STAGE_REGISTER, STAGE_NUMBERS
 from sim_bus.command import main
 from sim_bus.fault_script import FaultRefused
-from sim_bus.modbus.fault_catalogue import KINDS, ONLY_ON, WRONGS, parse_all
-from sim_bus.modbus.faults import Faults
-from sim_bus.modbus.framing import crc
-from sim_bus.modbus.lines import RtuListener, TcpListener
+from sim_bus.modbus.faults import KINDS, ONLY_ON, WRONGS, Faults, parse_all
+from sim_bus.modbus.lines import RtuListener, TcpListener, crc
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import Server
 from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_bus.modbus.framing import NotModbus, Request, RtuReceiver, crc, rtu_reply, tcp_reply, tcp_requests
+from sim_bus.modbus.lines import NotModbus, Request, RtuReceiver, crc, rtu_reply, tcp_reply, tcp_requests
 
 HOME = Path(__file__).parents[2]
 READ = struct.pack(">BHH", 3, 42, 2)

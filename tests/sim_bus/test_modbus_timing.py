@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from sim_bus.modbus.timing import LineTiming
+from sim_bus.modbus.embedded import LineTiming
 from tests.sim_bus.modbus_host import Host, drive
 
 TURN_AROUND_S = 0.010

@@ -15,9 +15,7 @@ import can
 import pytest
 
 from sim_bus.canopen.simulator import EmbeddedSimulator
-from sim_bus.canopen.socketcand import Hub
-from sim_bus.hub_port import HubPort
-from sim_bus.socketcand import WireFrame, frame_word, parse_send, split
+from sim_bus.canopen.socketcand import Hub, HubPort, WireFrame, frame_word, parse_send, split
 
 
 @contextmanager

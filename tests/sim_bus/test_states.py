@@ -1,6 +1,6 @@
 import pytest
 
-from sim_bus.cia402_states import STATUS, Command, State, decode, fault_reset_edge, next_state
+from sim_bus.cia402 import STATUS, Command, State, decode, fault_reset_edge, next_state
 
 # Typed from CiA 402-2's table of transitions: number, from, command, to.
 TABLE = """

@@ -7,11 +7,17 @@ import pytest
 from pydantic import ValidationError
 
 from tdhil.studies.coverage.bound import Watched, bound_of, cramer_rao, density, information
-from tdhil.studies.coverage.plants import Noise, Report
-from tdhil.studies.coverage.study import COVERAGE, CoverageSettings
-from tdhil.study.coverage_figures import clopper_pearson, covers, figures_of, not_too_wide, unbiased
-from tdhil.study.coverage_fleet import FLEET
-from tdhil.study.coverage_runs import Run
+from tdhil.studies.coverage.plants import FLEET, Noise, Report
+from tdhil.studies.coverage.simulate import Run
+from tdhil.studies.coverage.study import (
+    COVERAGE,
+    CoverageSettings,
+    clopper_pearson,
+    covers,
+    figures_of,
+    not_too_wide,
+    unbiased,
+)
 
 PLANT = {plant.name: plant for plant in FLEET}
 

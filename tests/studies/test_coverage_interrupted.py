@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from tdhil.studies.coverage import study
+from tdhil.studies.coverage.simulate import Run
 from tdhil.studies.coverage.study import COVERAGE, CoverageSettings
-from tdhil.study.coverage_runs import Run
-from tdhil.study.write_progress import StudyBar
+from tdhil.studies.output import StudyBar
 
 ROOT = Path(__file__).parents[2]
 
@@ -66,10 +66,10 @@ def test_where_there_is_no_terminal_a_line_a_minute(monkeypatch):
 
     from rich.console import Console
 
-    from tdhil.study import write_progress
+    from tdhil.studies import output
 
     now = [0.0]
-    monkeypatch.setattr(write_progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(output.time, "monotonic", lambda: now[0])
     out = StringIO()
     with StudyBar(Console(file=out), 1).of(0, "coverage") as progress:
         for second in range(0, 200, 10):
@@ -83,7 +83,7 @@ def test_where_there_is_no_terminal_a_line_a_minute(monkeypatch):
 ONE_BY_ONE = """
 import sys
 from tdhil.cli.main import main
-from tdhil.studies import coverage_runs
+from tdhil.studies.coverage import simulate as coverage_runs
 if __name__ == "__main__":
     coverage_runs.GROUP = 1            # the first figures come sooner
     sys.exit(main())

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tdhil.studies.coverage.plants import FloatArray, Noise, Reading, Report
-from tdhil.studies.coverage.simulate import lagged, quiet_shaft, shown, simulate
-from tdhil.study.coverage_fleet import FLEET
-from tdhil.study.coverage_shaft import coloured
+from tdhil.studies.coverage.plants import FLEET, FloatArray, Noise, Reading, Report
+from tdhil.studies.coverage.simulate import coloured, lagged, quiet_shaft, shown, simulate
 
 STEP = 0.002
 PLANT = {plant.name: plant for plant in FLEET}

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor
-from tdhil.study.design_arrays import fault_of, shipped_arrays
+from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor, fault_of, shipped_arrays
 
 TABLE5 = [
     (1, 1, 1, 1), (1, 2, 2, 2), (1, 3, 3, 3), (2, 1, 2, 3), (2, 2, 3, 1), (2, 3, 1, 2), (3, 1, 3, 2), (3, 2, 1, 3),

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from tdhil.commands.field_bench import SimulatedFieldBench
+from tdhil.cli.study import SimulatedFieldBench
 from tdhil.studies.field.gains import KiSweep, KpSweep
+from tdhil.studies.field.loops import ToneSweep, best_kp, gain
 from tdhil.studies.field.settings import SimulatedRig
-from tdhil.study.field_loop import best_kp, gain
-from tdhil.study.field_tones import ToneSweep
 
 pytestmark = [pytest.mark.heavy, pytest.mark.one_worker]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import LimitHit
-from tdhil.commands.field_bench import SimulatedFieldBench, bench_rig, plant_of
+from tdhil.cli.study import SimulatedFieldBench, bench_rig, plant_of
 from tdhil.errors import Interrupted
 from tdhil.studies.field.bench import FieldRun
 from tdhil.studies.field.settings import SimulatedRig

@@ -8,7 +8,7 @@ import pytest
 from tdhil.estimation import identify
 from tdhil.estimation.result import Verdict
 from tdhil.recording.recording import Excitation, Recording, Segment
-from tdhil.study.joint import expected_slope, joined, slope_of
+from tdhil.studies.field.slopes import expected_slope, joined, slope_of
 
 INERTIA, VISCOUS, COULOMB, SPEED_LAG, TORQUE_LAG = 104.0, 8.0, 60.0, 0.40, 0.15
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tdhil.commands.field_bench import SimulatedFieldBench
+from tdhil.cli.study import SimulatedFieldBench
 from tdhil.studies.field.settings import SlopeSettings
 from tdhil.studies.field.slopes import FieldSlopes
 

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 
-from tdhil.studies.paper.loop import simulate
+from tdhil.studies.paper.loop import Chirp, LoopSettings, Multisine, Sine, Step, changed, reference_of, simulate
 from tdhil.studies.paper.processing import torque_line
-from tdhil.study.loop_reference import Chirp, Multisine, Sine, Step, reference_of
-from tdhil.study.settings import LoopSettings, changed
 
 QUIET = LoopSettings(noise_power_nm2_s=0.0, coulomb_nm=0.0, duration_s=4.0)
 

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tdhil.study.design_arrays import shipped_arrays
-from tdhil.study.ranges import is_saturated, main_effects, ranking, runs_from_means
+from tdhil.studies.paper.orthogonal_design import is_saturated, main_effects, ranking, runs_from_means, shipped_arrays
 
 L4 = [(1, 1, 1), (1, 2, 2), (2, 1, 2), (2, 2, 1)]
 

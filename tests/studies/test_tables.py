@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from tdhil.studies.paper.design_runs import run_design
-from tdhil.studies.paper.figures import draw_effects
+from tdhil.studies.paper.design_runs import closed_form_inertia, run_design
+from tdhil.studies.paper.figures import draw_effects, draw_scatter
+from tdhil.studies.paper.loop import LoopSettings, changed
 from tdhil.studies.paper.published import published
 from tdhil.studies.paper.tables import Table6Settings, Table7Settings, published_for
 from tdhil.studies.registry import simulated_studies
-from tdhil.study.figures_scatter import draw_scatter
-from tdhil.study.settings import LoopSettings, changed
-from tdhil.study.tables_bias import closed_form_inertia
 
 pytestmark = pytest.mark.one_worker
 

@@ -9,8 +9,7 @@ the profile says only how the drive has been wired by its user (`Wiring`).
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_bus.cia402 import Application, Mode
-from sim_bus.cia402_states import FAULT_RESET, Command, State
+from sim_bus.cia402 import FAULT_RESET, Application, Command, Mode, State
 
 _WORDS = {
     Command.SHUTDOWN: 0x0006,

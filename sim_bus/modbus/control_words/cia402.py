@@ -6,7 +6,7 @@ _OF_THE_MODE = 0x3000
 
 
 class Cia402Words(Words):
-    """Controlword and statusword as in `sim_bus.cia402_states`; the power side speaks them by itself.
+    """Controlword and statusword as in `sim_bus.cia402`; the power side speaks them by itself.
 
     Option codes are the standard's defaults: shutdown coasts, disabling operation goes down the ramp. Whether the drive
     holds after a quick stop is the profile's. Bits 4 to 6 (ramp generator of velocity mode) are not looked at.

@@ -15,7 +15,7 @@ stop 043Ch, running shows 0F07h), which is to be checked in the manual of the dr
 choice of set-ups are not simulated.
 """
 
-from sim_bus.cia402_states import State
+from sim_bus.cia402 import State
 from sim_bus.modbus.control_words.base import StartStop
 
 

@@ -9,7 +9,7 @@ forwards and 11 backwards; 8 frequency and 10 operation come from the bus. It ha
 4 output on; 5 alarm. The stop is the ramp stop, and any quick stop is the same at the rate of the quick-stop parameter.
 """
 
-from sim_bus.cia402_states import State
+from sim_bus.cia402 import State
 from sim_bus.modbus.control_words.base import Extra, StartStop
 
 _EXTERNAL_FAULT = 49

@@ -21,7 +21,7 @@ acts, and bit 1 goes on ABB (OFF1 active) and stays on PROFIdrive. Bits 4 to 6 o
 ramp is simulated.
 """
 
-from sim_bus.cia402_states import Command, State
+from sim_bus.cia402 import Command, State
 from sim_bus.modbus.control_words.base import Words
 
 _OFF1, _OFF2, _OFF3, _ENABLE, _RESET, _BUS = 0x0001, 0x0002, 0x0004, 0x0008, 0x0080, 0x0400

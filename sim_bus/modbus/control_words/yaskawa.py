@@ -13,7 +13,7 @@ the facts at hand have; 0020h 0 run · 1 backwards · 2 ready · 3 fault and 004
 backwards · 4 speed agree · 5 ready · 6 alarm · 7 fault, from memory: to be checked in the manual.
 """
 
-from sim_bus.cia402_states import State
+from sim_bus.cia402 import State
 from sim_bus.modbus.control_words.base import StartStop
 
 

@@ -4,8 +4,7 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from profiles.model import refuse_if
-from sim_bus.validated import NonNegative, Positive, Validated
+from profiles.model import NonNegative, Positive, Validated, refuse_if
 
 
 class Shaft(Validated):

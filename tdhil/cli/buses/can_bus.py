@@ -5,20 +5,29 @@ python-can's files, the last of which that names an option has the say, as pytho
 the environment and from files pass through python-can's own conversion, so that they mean what they mean there.
 """
 
+import contextlib
+import errno
 import json
 import os
+import shutil
+import socket
+import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drivers.errors import DataFileError, Problem
+from drivers.errors import CommunicationLost, DataFileError, PreflightRefused, Problem
 from tdhil.config.options import Origin, Setting
 from tdhil.config.rig import Rig, bit_rate_problem
 from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    import can
+
 
 _FLAGS = {
     "interface": "--interface",
@@ -177,3 +186,180 @@ def _check(settings: dict[str, Setting]) -> None:
             raise UsageError(f"{name} must be a positive whole number, not {given.value!r}", where=given.source)
     if (given := settings.get("bitrate")) and (wrong := bit_rate_problem(given.value)):
         raise UsageError(f"bitrate {wrong}", where=given.source)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Opens the bus, and says what to do when that fails, before python-can has its say in a traceback.
+#
+# On socketcan the kernel's link has the bit rate and ``-b`` does nothing: the link is read, and a mismatch refused.
+
+
+PROBE_S = 2.0
+"""How long a socketcand server may take to answer a connection; python-can would wait 10 s, spinning."""
+
+_GREETING = b"< hi >"
+
+
+def open_bus(config: BusConfig) -> "can.BusABC":
+    """The open bus; the caller shuts it down.
+
+    UsageError without an interface; PreflightRefused if the device is missing, may not be used, is down or has
+    another bit rate; CommunicationLost if a socketcand server can't be reached.
+    """
+    import can
+
+    if not config.configured:
+        raise UsageError("no CAN interface", next_step="Name one, such as -i socketcan -c can0, or use --simulate")
+    arguments = config.kwargs()
+    if config.interface == "socketcan" and not config.channel:
+        raise UsageError("socketcan needs a channel", next_step="Name one, such as -c can0")
+    if config.interface == "socketcan":
+        check_link(config)
+    elif config.interface == "socketcand":
+        arguments.setdefault("tcp_tune", True)     # without it Nagle and delayed ACK leave 22 cycles a second
+        _probe_server(arguments)
+    try:
+        return can.Bus(**arguments)
+    except Exception as error:      # each backend raises what its library raises
+        raise _explained(config, error) from error
+
+
+def check_link(config: BusConfig) -> None:
+    """Refuses a SocketCAN link that is down or runs at another bit rate than asked for; PreflightRefused."""
+    text = _read_link(config.channel)
+    if text is None:
+        return
+    up, bitrate = parse_link(text, config.channel)
+    wanted = config.bitrate
+    rate = wanted or bitrate or 500_000
+    # A virtual link has neither a bit rate nor a way to set one.
+    setting = f" type can bitrate {rate}" if bitrate is not None or not config.channel.startswith("vcan") else ""
+    set_up = f"sudo ip link set {config.channel} up{setting}"
+    if not up:
+        raise PreflightRefused("the link is down", where=config.channel, next_step=f"Run: {set_up}")
+    if wanted is not None and bitrate is not None and wanted != bitrate:
+        raise PreflightRefused(
+            f"the link runs at {bitrate} bit/s, {config.source('bitrate')} says {wanted}",
+            where=config.channel,
+            next_step=f"Find out which of them the drive has; to change the link: "
+            f"sudo ip link set {config.channel} down && {set_up}",
+        )
+
+
+def parse_link(text: str, channel: str) -> tuple[bool, int | None]:
+    """(is it up, bit rate in bit/s or None if it has none) from ``ip -details -json link show``.
+
+    Anything unexpected counts as up and without a rate: opening the bus will tell.
+    """
+    try:
+        links = json.loads(text)
+    except (ValueError, RecursionError):
+        return True, None
+    for link in links if isinstance(links, list) else []:
+        if isinstance(link, dict) and link.get("ifname") == channel:
+            flags = link.get("flags")
+            rate: Any = link
+            for key in ("linkinfo", "info_data", "bittiming", "bitrate"):
+                rate = rate.get(key) if isinstance(rate, dict) else None
+            return not isinstance(flags, list) or "UP" in flags, rate if isinstance(rate, int) and rate > 0 else None
+    return True, None
+
+
+def _read_link(channel: str) -> str | None:
+    """What ``ip`` says of the link; None where it can't be asked. PreflightRefused if there is no such link."""
+    command = shutil.which("ip", path="/usr/sbin:/sbin:/usr/bin:/bin")
+    if command is None:
+        return None
+    try:
+        done = subprocess.run(
+            [command, "-details", "-json", "link", "show", "dev", channel],
+            capture_output=True, text=True, timeout=5, check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired, ValueError):
+        return None
+    if done.returncode and "does not exist" in done.stderr:
+        raise _no_device(channel)
+    return done.stdout if done.returncode == 0 else None
+
+
+def _no_device(channel: str) -> PreflightRefused:
+    step = "See what there is: ip link show type can. Is the adapter plugged in and its kernel module loaded?"
+    if channel.startswith("vcan"):
+        step = f"Make one: sudo ip link add dev {channel} type vcan && sudo ip link set {channel} up"
+    return PreflightRefused("no such CAN device", where=channel or "channel", next_step=step)
+
+
+def _probe_server(arguments: dict[str, Any]) -> None:
+    for name in ("channel", "host", "port"):
+        if arguments.get(name) in (None, ""):
+            raise UsageError(
+                f"socketcand needs '{name}'",
+                next_step="Such as -i socketcand -c can0 --bus-kwargs host=127.0.0.1 port=29536",
+            )
+    host, port = str(arguments["host"]), arguments["port"]
+    try:
+        with socket.create_connection((host, port), timeout=PROBE_S) as probe:
+            greeting = _greeting(probe)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise CommunicationLost(
+            f"no socketcand server answers ({error})",
+            where=f"{host}:{port}",
+            next_step=f"Is it started, is the port right, does a firewall stand between? Try: nc -vz {host} {port}",
+        ) from error
+    if greeting != _GREETING:      # python-can would wait for it for ever
+        raise CommunicationLost(
+            "what answers there is no socketcand server", where=f"{host}:{port}", next_step="Check host and port"
+        )
+
+
+def _greeting(probe: socket.socket) -> bytes:
+    """What the server says first, as far as it comes in time."""
+    found = b""
+    probe.settimeout(PROBE_S)
+    with contextlib.suppress(TimeoutError):
+        while len(found) < len(_GREETING) and (more := probe.recv(len(_GREETING) - len(found))):
+            found += more
+    return found
+
+
+def _explained(config: BusConfig, error: Exception) -> Exception:
+    """The likely cause, from the error number where there is one below python-can's wrapping."""
+    where = f"{config.interface} {config.channel}".strip()
+    number = _number(error)
+    if number in {errno.ENODEV, errno.ENOENT, errno.ENXIO}:
+        if config.interface == "socketcan":
+            return _no_device(config.channel)
+        return PreflightRefused("no such device", where=where, next_step="Is the adapter plugged in? Check -c")
+    if number in {errno.EACCES, errno.EPERM}:
+        step = "Give your user the right: sudo usermod -aG dialout $USER (serial adapters), then log in again"
+        return PreflightRefused("permission denied", where=where, next_step=step)
+    if number == errno.EBUSY:
+        return PreflightRefused("in use by another program", where=where, next_step="End it, then try again")
+    if number in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT}:
+        step = "Load it: sudo modprobe can_raw. Without it, use an adapter through python-can, or socketcand"
+        return PreflightRefused("this kernel has no SocketCAN", where=where, next_step=step)
+    if isinstance(error, ImportError | NotImplementedError):
+        step = "Install the vendor's driver and the Python package that python-can's manual names for it"
+        return UsageError(f"the interface can't be used here ({error})", where=where, next_step=step)
+    if isinstance(error, TypeError | ValueError):
+        return UsageError(f"the interface refuses its options ({error})", where=where, next_step="Check its options")
+    if config.interface == "socketcand":
+        step = "Is the channel name one that the server offers?"
+        return CommunicationLost(f"the server did not accept us ({error})", where=where, next_step=step)
+    return PreflightRefused(f"can't be opened ({error})", where=where, next_step="Check the adapter, its driver and -c")
+
+
+def _number(error: BaseException | None) -> int | None:
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error.errno
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def link_report(channel: str) -> str | None:
+    """What ``ip -details -json link show`` says of a SocketCAN link; None where it can't be asked.
+
+    Raises PreflightRefused if there is no such link.
+    """
+    return _read_link(channel)

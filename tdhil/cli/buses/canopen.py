@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import can
 
     from sim_bus.canopen.simulator import Simulator
-    from tdhil.cli.open_drive import PeerPlan
+    from tdhil.cli.connection import PeerPlan
 
 PLAIN = "generic/cia402"
 """What the simulator is when it wears no profile."""
@@ -63,7 +63,7 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
             # Before the simulator runs out by itself: what comes then is no part of the run.
             stack.callback(lambda: plan.never_came.extend(simulator.faults_waiting))
         else:
-            from tdhil.bus_open import open_bus
+            from tdhil.cli.buses.can_bus import open_bus
 
             channel = open_bus(connection.bus)
         stack.callback(channel.shutdown)

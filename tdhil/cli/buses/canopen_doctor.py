@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from drivers.canopen.bus import CanLink
+from drivers.canopen.limits import check_parameters
+from drivers.canopen.preflight import find_units
 from drivers.canopen.sdo import Objects, name
 from drivers.canopen.state_machine import State, decode
-from drivers.cia402.parameters import check_parameters
-from drivers.cia402.units import find_units
 from drivers.clock import MonotonicClock
 from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.no_watchdog import FLAG
-from drivers.preflight import Table
+from drivers.preflight import NO_WATCHDOG_FLAG, Table
 from profiles.canopen import CanopenProfile
 from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
 from tdhil.cli.finding import Finding, Grade, bad, note, of_check, ok
@@ -112,7 +111,7 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
     dog = profile.watchdog
     if dog.kind == "none":
         yield bad("watchdog", f"profile {profile.name} knows none",
-                  f"A host that dies would leave the shaft turning: identify takes it by name only, {FLAG}")
+                  f"A host that dies would leave the shaft turning: identify takes it by name only, {NO_WATCHDOG_FLAG}")
         return
     wanted = [(0x100C, 0), (0x100D, 0)] if dog.kind == "node_guarding" else [(dog.consumer_index, dog.consumer_sub)]
     if dog.reaction_index is not None:
@@ -122,7 +121,8 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
             value = objects.read_bytes(*at)
             yield ok("watchdog", f"{name(*at)} is there and reads {int.from_bytes(value, 'little'):X}h")
         except ObjectRefused:
-            step = f"Choose the drive's own profile: without a watchdog nothing is moved, or by name only, {FLAG}"
+            step = "Choose the drive's own profile: without a watchdog nothing is moved, "
+            step += f"or by name only, {NO_WATCHDOG_FLAG}"
             yield bad("watchdog", f"the drive has no {name(*at)}", step)
 
 

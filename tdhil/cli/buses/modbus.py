@@ -20,7 +20,7 @@ from tdhil.config.rig import DriveData
 
 if TYPE_CHECKING:
     from drivers.modbus.link import Link
-    from tdhil.cli.open_drive import PeerPlan
+    from tdhil.cli.connection import PeerPlan
 
 
 class SettingsRefused(PreflightRefused):
@@ -93,7 +93,7 @@ def open_wire(line: ModbusConfig, clock: Clock) -> Link:
 def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData, clock: Clock,
               trace: Path | None) -> OpenLine:
     """What nobody states of a simulated drive it states itself: there is no panel to read it from."""
-    from drivers.modbus.embedded import EmbeddedLink
+    from drivers.modbus.link import EmbeddedLink
     from sim_bus.modbus.embedded import EmbeddedModbusDrive
 
     drive = EmbeddedModbusDrive(plan.plant, profile, unit=unit, seed=plan.seed or 0, trace=trace,

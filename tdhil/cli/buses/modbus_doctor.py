@@ -8,17 +8,15 @@ from dataclasses import dataclass
 from drivers.drive import PowerState
 from drivers.errors import ObjectRefused
 from drivers.modbus.access import Access
+from drivers.modbus.codec import settle
 from drivers.modbus.identity import read_marker
 from drivers.modbus.link import Link
 from drivers.modbus.parameters import check_name_plate, check_required, find_filters, find_rated_torque, read_parameters
-from drivers.modbus.scales import settle
 from drivers.modbus.state_machine import decode, power_state, seen
-from drivers.no_watchdog import FLAG
-from drivers.preflight import Table
+from drivers.preflight import NO_WATCHDOG_FLAG, Table
 from profiles.modbus import ModbusProfile, Parameter
 from tdhil.cli.finding import Finding, bad, note, of_check, ok
-from tdhil.cli.profile_text import watchdog_text
-from tdhil.commands.profile_registers import RegisterUse, register_uses, unit_text
+from tdhil.cli.profile_text import RegisterUse, register_uses, unit_text, watchdog_text
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,8 @@ def _watchdog(profile: ModbusProfile, values: Mapping[str, float]) -> Finding:
     dog = profile.watchdog
     if dog.kind == "none":
         return bad("watchdog", f"profile {profile.name} knows none",
-                   f"A host that dies would leave the shaft turning: identify takes it by name only, {FLAG}")
+                   "A host that dies would leave the shaft turning: "
+                   f"identify takes it by name only, {NO_WATCHDOG_FLAG}")
     parameter: Parameter | None = profile.parameter(dog.parameter) if dog.parameter is not None else None
     if parameter is None:
         return note("watchdog", watchdog_text(profile))

@@ -12,7 +12,7 @@ from typing import Any, Literal, cast
 from pydantic import ValidationError
 
 from profiles.modbus import Line, ModbusProfile
-from profiles.yaml_messages import messages_of
+from profiles.yaml_loader import messages_of
 from tdhil.config.options import Origin, Setting
 from tdhil.config.rig import Modbus, Rig
 from tdhil.errors import UsageError

@@ -2,24 +2,181 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from drivers.clock import Clock, MonotonicClock, SteppedClock
-from drivers.errors import CommunicationLost
+from drivers.errors import CommunicationLost, PreflightRefused
+from drivers.modbus.access import Access
+from drivers.modbus.codec import from_words, settle
+from drivers.modbus.identity import read_marker
 from drivers.modbus.link import Link
+from drivers.modbus.parameters import Parameters, check_name_plate, find_rated_torque
+from drivers.modbus.pdu import READ_HOLDING, READ_INPUT, BadReply, NoReply, read
+from drivers.preflight import Table
+from profiles.library import load_profile, profile_names
+from profiles.modbus import ModbusProfile, Register
+from profiles.visible import visible
 from tdhil.cli.buses.modbus import SettingsRefused, open_line
 from tdhil.cli.buses.modbus_line import ModbusConfig
 from tdhil.cli.connection import Connection
 from tdhil.cli.found_drive import FoundDrive
-from tdhil.commands.scan_modbus import BAUDS, FORMATS, identify, probe
+from tdhil.cli.profile_text import register_uses
 from tdhil.config.options import Origin, Setting
 from tdhil.config.rig import DriveData
 
 if TYPE_CHECKING:
-    from tdhil.cli.open_drive import PeerPlan
+    from tdhil.cli.connection import PeerPlan
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Who is on a Modbus line: a read of one register each, then the device identification and what the profiles expect.
+#
+# Reads only (functions 3, 4 and 43/14). Whoever answers is there, also with an exception.
+
+
+ANSWER_S = 0.25
+"""For one reply: at 9600 baud a request and its reply take 17 ms, and drives turn around in 5 to 100 ms."""
+UNITS_TCP, UNITS_RTU = "1-5,255", "1-5"
+BAUDS = (19200, 9600, 38400, 115200, 57600)
+FORMATS = (("E", 1), ("N", 1), ("N", 2))
+"""Parity and stop bits as drives leave the factory, the most common first."""
+_IDENTIFY = bytes((0x2B, 0x0E, 0x01, 0x00))
+"""Function 43, MEI 14: read device identification, the basic stream (Modbus Application Protocol, section 6.21)."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a profile suits a drive: all its registers answer, and its name plate fits (None: it names none)."""
+
+    profile: str
+    plate: bool | None
+    named: bool                 # the drive's vendor name is the profile's vendor
+
+
+def parse_units(text: str) -> tuple[int, ...]:
+    """``1-5,247`` → 1 2 3 4 5 247. ValueError for anything else, and beyond 0 to 255."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        low, high = int(first), int(last if dash else first)
+        if not 0 <= low <= high <= 255:
+            raise ValueError(f"{part}: unit numbers are 0 to 255")
+        found += range(low, high + 1)
+    return tuple(dict.fromkeys(found))
+
+
+def probe(link: Link, units: Iterable[int]) -> tuple[list[int], int]:
+    """(units that answer, how many replies could not be read). Raises LinkLost where the line is gone."""
+    present, garbled = [], 0
+    for unit in units:
+        try:
+            link.transact(unit, read(READ_HOLDING, 0, 1), ANSWER_S)
+            present.append(unit)
+        except NoReply:
+            continue
+        except BadReply:
+            garbled += 1
+    return present, garbled
+
+
+def identify(link: Link, unit: int, transport: str, line: dict[str, Any]) -> FoundDrive:
+    """Name and profile of a unit that answered."""
+    vendor, product, revision = device_identification(link, unit)
+    said = " ".join(part for part in (vendor, product, revision) if part)
+    plain = Access(link, unit, "high_first", frozenset({READ_HOLDING}))
+    simulated = False
+    with contextlib.suppress(CommunicationLost):
+        simulated = read_marker(plain).simulated
+    fits = [fit for profile in _profiles(transport) if (fit := _fit(link, unit, profile, vendor)) is not None]
+    profile, why = choose(fits)
+    return FoundDrive("modbus", unit, product or vendor or "Modbus device", said or "not told (function 43)", simulated,
+                      profile, why, line=line)
+
+
+def choose(fits: Sequence[Fit]) -> tuple[str | None, str]:
+    """(profile, why): by name and name plate. Registers that merely answer are no reason."""
+    good = [fit for fit in fits if fit.plate is not False]
+    ranked = sorted(good, key=lambda fit: (fit.plate is True, fit.named), reverse=True)
+    if ranked and (ranked[0].plate or ranked[0].named):
+        best = ranked[0]
+        reasons = [text for text, holds in (
+            ("the vendor's name", best.named), ("a name plate that fits P = T·ω", best.plate is True)) if holds]
+        return best.profile, "all registers answer, and " + " and ".join(reasons)
+    if good:
+        names = ", ".join(fit.profile for fit in good)
+        return None, f"the registers of {names} answer, which proves nothing: choose by the drive's type plate"
+    return None, "no profile's registers all answer: copy profiles/generic/modbus.yaml and describe it"
+
+
+def device_identification(link: Link, unit: int) -> tuple[str, str, str]:
+    """Vendor, product code and revision by function 43; empty where the drive doesn't know it."""
+    try:
+        pdu = link.transact(unit, _IDENTIFY, ANSWER_S).pdu
+    except (NoReply, BadReply):
+        return "", "", ""
+    return parse_identification(pdu)
+
+
+def parse_identification(pdu: bytes) -> tuple[str, str, str]:
+    """A reply of function 43/14: 2B 0E 01 conformity more next count, then id, length, text of each object."""
+    found = {0: "", 1: "", 2: ""}
+    if len(pdu) < 7 or pdu[:2] != _IDENTIFY[:2]:
+        return "", "", ""
+    at = 7
+    for _ in range(pdu[6]):
+        if at + 2 > len(pdu):
+            break
+        number, length = pdu[at], pdu[at + 1]
+        found[number] = visible(pdu[at + 2 : at + 2 + length].decode("ascii", "replace").strip())
+        at += 2 + length
+    return found[0], found[1], found[2]
+
+
+def _profiles(transport: str) -> list[ModbusProfile]:
+    found = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
+    return [profile for profile in found if transport in profile.line.transports]
+
+
+def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> Fit | None:
+    """None as soon as one of the profile's registers can't be read."""
+    counts: dict[str, int] = {}
+    access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
+    for use in register_uses(profile):
+        try:
+            raw = _read_once(access, use.register, profile)
+        except (CommunicationLost, PreflightRefused):
+            return None
+        if use.name.startswith("parameters."):
+            counts[use.name.partition(".")[2]] = raw
+    maker = profile.name.partition("/")[0]
+    return Fit(profile.name, _plate(profile, counts), bool(vendor) and maker in vendor.lower())
+
+
+def _read_once(access: Access, register: Register, profile: ModbusProfile) -> int:
+    """Without the patience of a preflight: a scan asks many that aren't there."""
+    function = READ_HOLDING if register.table == "holding" else READ_INPUT
+    words = access.once(read(function, register.address, register.count), ANSWER_S).words
+    return from_words(words, register.type, profile.line.word_order)
+
+
+def _plate(profile: ModbusProfile, counts: dict[str, int]) -> bool | None:
+    if profile.name_plate is None:
+        return None
+    table = Table()
+    found = Parameters(counts, settle(profile, counts, {}))
+    rated_nm = find_rated_torque(table, profile, found, None)
+    if rated_nm is None and profile.parameter(profile.name_plate.torque).unit == "rated":
+        return None
+    table.checks.clear()
+    check_name_plate(table, profile, found, rated_nm or 0.0)
+    return bool(table.checks) and all(check.outcome.value == "ok" for check in table.checks)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 SCAN = "scan"
 """Where a setting of the line came from that was tried."""

@@ -1,14 +1,274 @@
 """The balances of a run: knots where it turned calmly, swung or coasted, and a row from each to the next."""
 
 from dataclasses import dataclass
+from enum import Enum
 from itertools import pairwise
 
 import numpy as np
 
 from tdhil.estimation.samples import Samples
-from tdhil.identify.beside.momentum_calm import Blocks, Span, block_means, calm_spans, coasting_spans
-from tdhil.identify.beside.momentum_rows import Knot, Row, balance
-from tdhil.recording.recording import Recording, Segment
+from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where a run stood calm, and where it coasted: read off half-second means of what was reported, whoever ran it.
+#
+# Calm is what every reporting lag agrees on: while speed hardly changes, reported and true speed and torque are the
+# same, whatever filters stand between. Between two calm stretches a momentum balance needs no model of the reports
+# (`momentum_rows`). Coasting is motion without torque: there the torque's lag has nothing to act on.
+
+
+BLOCK_S = 0.5
+_MOST_BLOCKS = 1_000_000
+_CALM_PER_S = 0.02        # of the range of speed per second: costs a lag of 0.5 s some 1 % of a full change of speed
+_DRIFT_PER_S = 0.05       # slow enough to take J times the acceleration off and keep the friction
+_POINT_WIDTH = 0.15       # of the fastest: how far the speed may go within one point of a friction curve
+_TURNING = 0.05           # of the greatest speed: slower is standstill or creep
+_LEAST_CALM = 5           # blocks, the first of which is left to the lags
+_LEAST_COAST = 4
+_COAST_TORQUE = 0.03      # of the torque that steady turning takes
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of time, s."""
+
+    start_s: float
+    end_s: float
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """M means over half a second each, empty ones left out: time of the middle (s), speed, torque, acceleration."""
+
+    time_s: FloatArray
+    speed_rad_s: FloatArray
+    torque_nm: FloatArray
+    acceleration_rad_s2: FloatArray
+
+    def extremes(self, start_s: float, end_s: float) -> tuple[float, float]:
+        """Least and greatest speed of the blocks that lie within; (inf, -inf) if none does."""
+        half = 0.5 * BLOCK_S
+        inside = self.speed_rad_s[(self.time_s >= start_s + half) & (self.time_s <= end_s - half)]
+        return (float(inside.min()), float(inside.max())) if len(inside) else (np.inf, -np.inf)
+
+
+def block_means(samples: Samples) -> Blocks | None:
+    """None for too few samples, or times that make no sense as a record."""
+    if len(samples) < 16:
+        return None
+    start, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0])
+    if not 4.0 * BLOCK_S <= length < _MOST_BLOCKS * BLOCK_S:
+        return None
+    edges = start + np.arange(int(length / BLOCK_S) + 1) * BLOCK_S
+    first = np.searchsorted(samples.time_s, edges)
+    counts = np.diff(np.append(first, len(samples)))
+    kept = counts > 0
+    if np.any(counts < 0) or np.count_nonzero(kept) < 4:
+        return None
+    means = [np.add.reduceat(x, first[kept]) / counts[kept] for x in (samples.speed_rad_s, samples.torque_nm)]
+    time = (edges + 0.5 * BLOCK_S)[kept].astype(np.float64)
+    speed, torque = (mean.astype(np.float64) for mean in means)
+    acceleration = np.gradient(speed, time).astype(np.float64)
+    return Blocks(time, speed, torque, acceleration)
+
+
+def calm_spans(blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
+    """Stretches of 2 s or more at a steady speed other than zero, outside of the excited segments.
+
+    The first half second is left out: there a lag still brings something of what was before.
+    """
+    return _slower_than(_CALM_PER_S, blocks, excluded)
+
+
+def drifting_spans(blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
+    """Calm ones, and others of 2 s or more in which speed drifts slowly, cut where it goes too far for one point."""
+    fastest = float(np.max(np.abs(blocks.speed_rad_s)))
+    found = []
+    for span in _slower_than(_DRIFT_PER_S, blocks, excluded):
+        inside = np.flatnonzero((blocks.time_s > span.start_s) & (blocks.time_s < span.end_s))
+        start, begun = span.start_s, float(blocks.speed_rad_s[inside[0]])
+        for at in inside:
+            end = float(blocks.time_s[at]) + 0.5 * BLOCK_S
+            if abs(float(blocks.speed_rad_s[at]) - begun) > _POINT_WIDTH * fastest:
+                found.append(Span(start, end))
+                start, begun = end, float(blocks.speed_rad_s[at])
+        found.append(Span(start, span.end_s))
+    return tuple(span for span in found if span.duration_s >= (_LEAST_CALM - 1) * BLOCK_S)
+
+
+def _slower_than(rate_per_s: float, blocks: Blocks, excluded: tuple[Segment, ...]) -> tuple[Span, ...]:
+    """Runs of blocks in which the speed changes by less than a share of its range per second, from the second on."""
+    speed = np.abs(blocks.speed_rad_s)
+    fastest, reach = float(np.max(speed)), float(np.ptp(blocks.speed_rad_s))
+    calm = (np.abs(blocks.acceleration_rad_s2) <= rate_per_s * reach) & (speed > _TURNING * fastest)
+    for segment in excluded:
+        calm &= (blocks.time_s < segment.start_s - 0.5 * BLOCK_S) | (blocks.time_s > segment.end_s + 0.5 * BLOCK_S)
+    return tuple(Span(span.start_s + BLOCK_S, span.end_s) for span in _runs(calm, blocks.time_s, _LEAST_CALM))
+
+
+def coasting_spans(blocks: Blocks, calm: tuple[Span, ...], torque_resolution_nm: float) -> tuple[Span, ...]:
+    """Stretches of 2 s or more in which the shaft slows down and the drive gives no torque."""
+    level = np.zeros(len(blocks.time_s), dtype=np.bool_)
+    for span in calm:
+        level |= (blocks.time_s >= span.start_s) & (blocks.time_s <= span.end_s)
+    if not np.any(level):
+        return ()
+    usual = float(np.median(np.abs(blocks.torque_nm[level])))
+    nothing = np.abs(blocks.torque_nm) <= max(_COAST_TORQUE * usual, torque_resolution_nm)
+    turning = np.abs(blocks.speed_rad_s) > _TURNING * float(np.max(np.abs(blocks.speed_rad_s)))
+    slowing = blocks.acceleration_rad_s2 * np.sign(blocks.speed_rad_s) < 0.0
+    return _runs(nothing & turning & slowing, blocks.time_s, _LEAST_COAST)
+
+
+def _runs(chosen: BoolArray, time_s: FloatArray, least: int) -> tuple[Span, ...]:
+    """Unbroken runs of chosen blocks, as stretches of time."""
+    padded = np.concatenate(([False], chosen, [False])).astype(np.int8)
+    begins, ends = np.flatnonzero(np.diff(padded) == 1), np.flatnonzero(np.diff(padded) == -1)
+    found = []
+    for begin, end in zip(begins, ends, strict=True):
+        times = time_s[begin:end]
+        if end - begin >= least and float(np.max(np.diff(times))) < 1.5 * BLOCK_S:
+            found.append(Span(float(times[0]) - 0.5 * BLOCK_S, float(times[-1]) + 0.5 * BLOCK_S))
+    return tuple(found)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One balance of momentum, between two instants at which no reporting lag matters.
+#
+# A knot is a short window in which speed is read; a row is what happened between one knot and the next. With w(t)
+# rising from 0 to 1 over the first knot and falling back over the second, J ω̇ = T − B ω − T_c sgn ω − d integrates
+# by parts to
+#
+#     ∫w T = J Δω + B ∫w ω + T_c ∫w sgn ω + ∫w d,        Δx = ∫w ẋ = mean over the second knot − mean over the first.
+#
+# Reports: T_rep = T − τ_T Ṫ + …, ω_rep = ω − τ_w ω̇ + …, for filters of any kind with delays τ_T and τ_w. Put in,
+# with Ṫ = J ω̈ + B ω̇ + ḋ and δ = τ_w − τ_T, to first order
+#
+#     ∫w T_rep = J (Δω_rep + δ Δα) + B (∫w ω_rep + δ Δω_rep) + T_c ∫w sgn ω + ∫w d.
+#
+# At calm knots Δα is next to nothing, and so are the terms of higher order, whatever the filters: of everything
+# unknown in the reports only B δ is left, some percent of J. Over a knot of one whole period of a periodic motion Δα
+# is nothing. A coasting shaft obeys a linear equation without torque, of which every filtered speed is a solution as
+# well: δ = 0.
+#
+# The disturbance d is taken as white of density D, (N·m)²·s: row i has variance D ∫w_i², and neighbours that share a
+# knot of length a covary by D a/6, since ∫ u (1 − u) du = 1/6.
+
+
+_LONGEST_GAP_S = 0.3
+_CHUNK = 65_536           # samples worked on at once: a long row never stands in memory as a whole
+
+
+class Kind(Enum):
+    """What a row is for."""
+
+    TURNING = "turning"       # steady or changing speed under torque
+    COASTING = "coasting"
+
+
+@dataclass(frozen=True)
+class Knot:
+    """A window in which speed is read; ``periodic``: one whole period of an excitation."""
+
+    start_s: float
+    end_s: float
+    periodic: bool = False
+    coasting: bool = False
+
+    @property
+    def length_s(self) -> float:
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class Row:
+    """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w²."""
+
+    first: Knot
+    second: Knot
+    kind: Kind
+    change_rad_s: float
+    change_rad_s2: float
+    travel_rad: float         # ∫w ω
+    time_s: float             # ∫w
+    impulse_nm_s: float       # ∫w T
+    energy_s: float
+
+
+def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
+    """The row from one knot to the next; None where samples are missing."""
+    begin, end = (int(i) for i in np.searchsorted(samples.time_s, (first.start_s - 1e-9, second.end_s - 1e-9)))
+    if end - begin < 8:
+        return None
+    readings = [_reading(samples, knot) for knot in (first, second)]
+    totals = np.zeros(3)
+    for at in range(begin, end, _CHUNK):
+        part = slice(at, min(at + _CHUNK, end))
+        time, cells, longest = _cells(samples.time_s, part)
+        if longest > _LONGEST_GAP_S:
+            return None
+        weight = np.minimum((time - first.start_s) / first.length_s, (second.end_s - time) / second.length_s)
+        weight = np.clip(weight, 0.0, 1.0) * cells
+        totals += np.sum(weight), weight @ samples.speed_rad_s[part], weight @ samples.torque_nm[part]
+    if None in readings or not float(totals[0]) > 0.0:
+        return None
+    (mean_a, slope_a), (mean_b, slope_b) = (reading for reading in readings if reading is not None)
+    middle = second.start_s - first.end_s
+    return Row(
+        first,
+        second,
+        Kind.COASTING if first.coasting and second.coasting else Kind.TURNING,
+        change_rad_s=mean_b - mean_a,
+        change_rad_s2=slope_b - slope_a,
+        travel_rad=float(totals[1]),
+        time_s=float(totals[0]),
+        impulse_nm_s=float(totals[2]),
+        energy_s=middle + (first.length_s + second.length_s) / 3.0,
+    )
+
+
+def _cells(time_s: FloatArray, part: slice) -> tuple[FloatArray, FloatArray, float]:
+    """Times of some samples, how long each stands for (half of the way to either neighbour), and the widest gap."""
+    low, high = max(part.start - 1, 0), min(part.stop + 1, len(time_s))
+    gaps = np.diff(time_s[low:high])
+    before = gaps[: part.stop - part.start] if low < part.start else np.append(0.0, gaps)[: part.stop - part.start]
+    after = gaps[part.start - low :]
+    after = after if high > part.stop else np.append(after, 0.0)
+    return time_s[part], 0.5 * (before + after), float(np.max(gaps)) if len(gaps) else np.inf
+
+
+def _reading(samples: Samples, knot: Knot) -> tuple[float, float] | None:
+    """Mean speed and mean acceleration within a knot; a whole period of a periodic motion has no acceleration."""
+    begin, end = (int(i) for i in np.searchsorted(samples.time_s, (knot.start_s - 1e-9, knot.end_s - 1e-9)))
+    if end - begin < 2:
+        return None
+    time, width, _ = _cells(samples.time_s, slice(begin, end))
+    speed, whole = samples.speed_rad_s[begin:end], float(np.sum(width))
+    if not whole > 0.0:
+        return None
+    mean = float(width @ speed) / whole
+    if knot.periodic:
+        return mean, 0.0
+    lever = time - float(width @ time) / whole
+    spread = float(width @ lever**2)
+    return (mean, float(width @ (lever * speed)) / spread) if spread > 0.0 else None
+
+
+def overlap_s(earlier: Row, later: Row) -> float:
+    """∫w_i w_{i+1} of two neighbouring rows, s."""
+    return earlier.second.length_s / 6.0 if earlier.second == later.first else 0.0
+
+
+def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *, periodic: bool = False) -> Row | None:
+    """The balance over one stretch, from a knot at its start to one at its end; None where samples are missing."""
+    return balance(samples, Knot(start_s, start_s + knot_s, periodic), Knot(end_s - knot_s, end_s, periodic))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 KNOT_S = 1.0
 _COAST_KNOT_S = 0.5

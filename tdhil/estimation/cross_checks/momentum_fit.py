@@ -12,9 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.estimation.cross_checks.momentum import Balances
+from tdhil.estimation.cross_checks.momentum import Balances, Kind, Row, overlap_s
 from tdhil.estimation.frequency_domain.inference import student_quantile
-from tdhil.identify.beside.momentum_rows import Kind, Row, overlap_s
 from tdhil.recording.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01

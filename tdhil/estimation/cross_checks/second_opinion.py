@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.cross_checks.friction_curve import friction_curve
-from tdhil.estimation.cross_checks.momentum import Balances, balances
+from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
+from tdhil.estimation.cross_checks.momentum import Balances, Kind, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
     UNKNOWN_DELAY,
     Delay,
@@ -29,8 +29,6 @@ from tdhil.estimation.cross_checks.momentum_fit import (
 from tdhil.estimation.frequency_domain.inference import student_quantile
 from tdhil.estimation.result import Estimate, SecondOpinion
 from tdhil.estimation.samples import Samples
-from tdhil.identify.beside.friction_curve_points import Inertia
-from tdhil.identify.beside.momentum_rows import Kind
 from tdhil.recording.recording import FloatArray, Recording
 
 _LEAST_DOF = 3.0

@@ -1,26 +1,279 @@
 """A compliant shaft fitted to lines, and the intervals of what is asked of it."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
 from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+from tdhil.estimation.frequency_domain.inference import REJECT_P, estimate, residual_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
-from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
-from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.frequency_domain.optimiser import Apart, Fit, Held, box, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.shafts import (
+    DAMPING,
+    INERTIA,
+    LOAD,
+    STRING_SHARE,
+    SWING,
+    VISCOUS,
+    RigidShaft,
+    Shaft,
+    StringShaft,
+    TwoMassShaft,
+    string_resonances,
+)
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.estimation.result import Estimate, ResidualTest
-from tdhil.identify.compliant.starts import compliant_starts
-from tdhil.identify.compliant.string_shaft import STRING_SHARE, StringShaft
-from tdhil.identify.compliant.string_shaft import resonances as string_resonances
-from tdhil.identify.compliant.two_mass import DAMPING, LOAD, SWING, TwoMassShaft
-from tdhil.identify.compliant.views import RESONANCE, STIFFNESS, TOTAL, viewed
-from tdhil.identify.lines.fit import Apart, Held
-from tdhil.identify.lines.interval import estimate
-from tdhil.identify.lines.residual import REJECT_P, residual_of
 from tdhil.recording.recording import FloatArray
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where the descents of a compliant shaft begin: linear least squares over a grid of resonances.
+#
+# Given how the load swings, what hangs below the motor is J_L H(s) with a known H, and behind first-order lags and a
+# skew d the equation of a line, Z = J_r s + B + J_L H, is linear: with T' = T e^(ds),
+#
+#     T' = (J_r τ_w) s² W + (J_r + B τ_w) s W + B W + (J_L τ_w) s H W + J_L H W − τ_T s T',
+#
+# six real unknowns. τ_w is then the ratio of the quadratic terms to the linear ones. The swing lies on a grid over
+# the band and around it, with little damping and with much; the string's share of the load on another.
+#
+# No line may count for more than the grid's coarseness allows: with errors as small as they are, a resonance off by
+# some per cent is as wrong as none. So the lines are first taken for less exact than they are; the best of the grid
+# are brought down there, where the valleys are wide, and the best of those is where the real descents begin.
+
+
+_PER_OCTAVE = 24
+_BEYOND = (0.6, 2.0)                     # the grid's ends, of the lowest and highest line
+_RATIOS = (0.01, 0.1)                    # damping, of critical
+_SHARES = (0.08, 0.15, 0.22, 0.3, 0.38, 0.46, 0.55, 0.65, 0.8, 1.0)
+_SKEWS = (-0.05, 0.0, 0.05)
+_BLUR = 0.08                             # relative error that every line is given
+_ALIKE = (0.15, 0.12)                    # octaves of swing, share of the string
+_TRIED, _KEPT = 24, 5
+
+
+def compliant_starts(problem: Likelihood, held: Held) -> list[FloatArray]:
+    """The most promising theta, (P,) each; for `TwoMassShaft` and `StringShaft`."""
+    lines = tuple(
+        replace(line, s_tt=line.s_tt + _BLUR**2 * float(np.mean(np.abs(line.torque) ** 2 * line.periods)))
+        for line in problem.lines
+    )
+    blurred = Likelihood(lines, problem.model, problem.tie, problem.priors)
+    limits = box(problem, rough_inertia_of(problem))
+    first_order = {**dict.fromkeys(problem.model.structure, 0.0), **held}
+    fits = [minimise(blurred, limits, start, first_order) for start in _proposals(blurred)]
+    return [fit.theta for fit in sorted(fits, key=lambda fit: fit.objective)[:_KEPT]]
+
+
+def _proposals(problem: Likelihood) -> list[FloatArray]:
+    """Of every neighbourhood of the grid the best, in rising misfit."""
+    shapes = _shapes(problem)
+    hung = np.array([problem.model.shaft.impedance(shape, problem.s) for shape in shapes])[:, problem.owner]
+    solved = [_solved(problem, hung, skew) for skew in _SKEWS]
+    misfits = np.array([misfit for misfit, _ in solved])           # (skews, shapes)
+    found: list[FloatArray] = []
+    kept: list[FloatArray] = []
+    for flat in np.argsort(misfits, axis=None, kind="stable"):
+        skew_at, at = (int(i) for i in np.unravel_index(flat, misfits.shape))
+        if not np.isfinite(misfits[skew_at, at]) or any(_alike(shapes[at], other) for other in kept):
+            continue
+        theta = _theta(problem, shapes[at], solved[skew_at][1][at], _SKEWS[skew_at])
+        if theta is not None:
+            found.append(theta)
+            kept.append(shapes[at])
+        if len(found) == _TRIED:
+            break
+    return found
+
+
+def _shapes(problem: Likelihood) -> list[FloatArray]:
+    """Mechanical parameters of nothing but a load of 1 kg·m², swinging in every way of the grid."""
+    omega = np.abs(problem.s)
+    low, high = _BEYOND[0] * float(np.min(omega)), _BEYOND[1] * float(np.max(omega))
+    swings = np.geomspace(low, high, max(2, round(_PER_OCTAVE * np.log2(high / low))))
+    size = problem.model.mechanical
+    shapes = []
+    for share in _SHARES if size > STRING_SHARE else (0.0,):
+        for ratio in _RATIOS:
+            for swing in swings:
+                shape = np.zeros(size)
+                shape[LOAD], shape[SWING], shape[DAMPING] = 1.0, swing, 2.0 * ratio * swing
+                shape[STRING_SHARE:] = share
+                shapes.append(shape)
+    return shapes
+
+
+def _alike(one: FloatArray, other: FloatArray) -> bool:
+    near = abs(np.log2(one[SWING] / other[SWING])) < _ALIKE[0]
+    return bool(near and np.all(np.abs(one[STRING_SHARE:] - other[STRING_SHARE:]) < _ALIKE[1]))
+
+
+def _solved(problem: Likelihood, hung: ComplexArray, skew: float) -> tuple[FloatArray, FloatArray]:
+    """Misfit (H,) and unknowns (H, 6) for every shape; ``hung`` (H, N): its H(s) at every observation."""
+    w, s = problem.speed, problem.s[problem.owner]
+    lines = len(problem.s)
+    ratio = problem.torque / w
+    mean = (np.bincount(problem.owner, ratio.real, lines) + 1j * np.bincount(problem.owner, ratio.imag, lines))
+    weight = problem.root_periods / np.sqrt(problem.variance(mean / problem.segments))[problem.owner]
+    torque = problem.torque * np.exp(skew * s)
+    plain = np.broadcast_to(np.stack([s * s * w, s * w, w, -s * torque], axis=1), (len(hung), len(w), 4))
+    columns = np.concatenate([plain, (hung * s * w)[:, :, None], (hung * w)[:, :, None]], axis=2) * weight[:, None]
+    design = np.concatenate([columns.real, columns.imag], axis=1)
+    target = np.concatenate([(torque * weight).real, (torque * weight).imag])
+    scale = np.maximum(np.linalg.norm(design, axis=1), 1e-300)     # (H, 6)
+    design = design / scale[:, None, :]
+    normal = np.swapaxes(design, 1, 2) @ design + 1e-10 * np.eye(design.shape[2])
+    x = np.linalg.solve(normal, (np.swapaxes(design, 1, 2) @ target)[:, :, None])[:, :, 0]
+    left = target - (design @ x[:, :, None])[:, :, 0]
+    return np.sum(left**2, axis=1), x / scale
+
+
+def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -> FloatArray | None:
+    """The unknowns as parameters; None where an inertia comes out negative."""
+    quadratic, linear, viscous, torque_lag, load_late, load = (float(value) for value in x)
+    size = linear**2 + load**2
+    speed_lag = (quadratic * linear + load_late * load) / size if size > 0.0 else 0.0
+    speed_lag = float(np.clip(speed_lag, 0.0, signal_filters.LAG_BOUND_S))
+    inertia = linear - viscous * speed_lag
+    if inertia <= 0.0 or load <= 0.0:
+        return None
+    mechanical = shape.copy()
+    mechanical[INERTIA], mechanical[VISCOUS], mechanical[LOAD] = inertia, viscous, load
+    mechanical[DAMPING] *= load
+    phi = np.zeros(signal_filters.COUNT)
+    phi[signal_filters.SPEED_LAG] = speed_lag
+    phi[signal_filters.TORQUE_LAG] = float(np.clip(torque_lag, 0.0, signal_filters.LAG_BOUND_S))
+    phi[signal_filters.SKEW] = skew
+    theta = np.concatenate([mechanical, phi])
+    for prior in problem.priors:
+        theta[prior.index] = prior.mean
+    return theta
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The same shaft with one of its parameters replaced by another that is asked for: the total inertia, the stiffness, a
+# resonance. Its interval is then a profile like any other (`interval.estimate`), bounds and curved valleys included.
+#
+# The parameter m_i gives way to u with m_i = h(u, the others); the rest keep their places. By the chain rule
+# ∂Z/∂u = ∂Z/∂m_i ∂h/∂u, and every other slope gains ∂Z/∂m_i ∂h/∂m_j.
+
+
+@dataclass(frozen=True)
+class View:
+    """``of`` m: what takes the place of m[index]; ``back`` from m with it there: (m[index], its gradient (M,))."""
+
+    index: int
+    of: Callable[[FloatArray], float]
+    back: Callable[[FloatArray], tuple[float, FloatArray]]
+
+
+def _light(m: FloatArray) -> float:
+    """1 − 2η/3, the share of the load that swings (`string_shaft.py`); 1 of two lumps."""
+    return 1.0 - 2.0 / 3.0 * float(m[STRING_SHARE]) if len(m) > STRING_SHARE else 1.0
+
+
+def _total_back(m: FloatArray) -> tuple[float, FloatArray]:
+    slope = np.zeros(len(m))
+    slope[INERTIA], slope[LOAD] = 1.0, -1.0
+    return float(m[INERTIA] - m[LOAD]), slope
+
+
+def _stiffness_back(m: FloatArray) -> tuple[float, FloatArray]:
+    """ω_a = √(k/(J_L (1 − 2η/3)))."""
+    swing = math.sqrt(max(float(m[SWING]), 1e-300) / (float(m[LOAD]) * _light(m)))
+    slope = np.zeros(len(m))
+    slope[SWING], slope[LOAD] = 0.5 * swing / max(float(m[SWING]), 1e-300), -0.5 * swing / float(m[LOAD])
+    if len(m) > STRING_SHARE:
+        slope[STRING_SHARE] = swing / (3.0 * _light(m))
+    return swing, slope
+
+
+def _resonance_back(m: FloatArray) -> tuple[float, FloatArray]:
+    """ω_a = Ω/√(1 + J_L/J_r)."""
+    motor, load = float(m[INERTIA]), float(m[LOAD])
+    swing = float(m[SWING]) / math.sqrt(1.0 + load / motor)
+    slope = np.zeros(len(m))
+    slope[SWING] = swing / float(m[SWING])
+    slope[LOAD] = -0.5 * swing / (motor + load)
+    slope[INERTIA] = 0.5 * swing * load / (motor * (motor + load))
+    return swing, slope
+
+
+TOTAL = View(INERTIA, lambda m: float(m[INERTIA] + m[LOAD]), _total_back)
+STIFFNESS = View(SWING, lambda m: float(m[SWING] ** 2 * m[LOAD] * _light(m)), _stiffness_back)
+RESONANCE = View(SWING, lambda m: float(m[SWING] * math.sqrt(1.0 + m[LOAD] / m[INERTIA])), _resonance_back)
+
+
+class ViewedShaft:
+    """A compliant shaft through a view."""
+
+    def __init__(self, inner: Shaft, view: View) -> None:
+        self.inner, self.view = inner, view
+        self.names = inner.names
+        slope = _total_back(np.ones(len(inner.names)))[1] if view is TOTAL else None
+        self.inertia_row = inner.inertia_row if slope is None else _through(inner.inertia_row, view.index, slope)
+        self.viscous_row = inner.viscous_row
+
+    def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        return self.inner.impedance(self._inside(m)[0], s)
+
+    def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        inside, slope = self._inside(m)
+        found = self.inner.jacobian(inside, s)
+        replaced = found[:, self.view.index].copy()
+        found[:, self.view.index] = 0.0
+        viewed: ComplexArray = found + replaced[:, None] * slope
+        return viewed
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        low, high = self.inner.bounds(rough_inertia, s)
+        if self.view is STIFFNESS:
+            at = self.view.index
+            low[at], high[at] = 1e-3 * rough_inertia * low[at] ** 2, 1e3 * rough_inertia * high[at] ** 2
+        return low, high
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        scales = self.inner.scales(rough_inertia, s)
+        if self.view is STIFFNESS:
+            scales[self.view.index] = rough_inertia * float(np.median(np.abs(s))) ** 2
+        return scales
+
+    def _inside(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        inside = m.copy()
+        inside[self.view.index], slope = self.view.back(m)
+        return inside, slope
+
+
+def viewed(fitted: Fitted, view: View) -> Fitted:
+    """The same fits in the view's parameters; `view.index` is where the interval is asked for."""
+    old = fitted.problem
+    problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.tie, old.priors)
+    size = old.model.mechanical
+
+    def seen(fit: Fit) -> Fit:
+        theta = fit.theta.copy()
+        theta[view.index] = view.of(fit.theta[:size])
+        return Fit(theta, fit.objective)
+
+    simple = seen(fitted.simple)
+    whole = simple if fitted.whole is fitted.simple else seen(fitted.whole)
+    limits = box(problem, rough_inertia_of(problem))
+    return replace(fitted, problem=problem, limits=limits, simple=simple, whole=whole)
+
+
+def _through(row: FloatArray, index: int, slope: FloatArray) -> FloatArray:
+    """A linear combination of m, in the view's parameters."""
+    kept = row.copy()
+    kept[index] = 0.0
+    kept += row[index] * slope
+    return kept
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 SLOWEST_SEEN = 0.5        # of the lowest line: a slower swing is not seen
 _RIGID = len(RigidShaft.names)

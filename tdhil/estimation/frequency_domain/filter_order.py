@@ -21,9 +21,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit
+from tdhil.estimation.frequency_domain.optimiser import (
+    Apart,
+    Box,
+    Fit,
+    Held,
+    best_fit,
+    box,
+    lowest,
+    minimise,
+    rough_inertia_of,
+)
 from tdhil.estimation.frequency_domain.signal_filters import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
-from tdhil.identify.lines.fit import Apart, Held, best_fit, box, lowest, minimise, rough_inertia_of
 from tdhil.recording.recording import FloatArray
 
 # where the whole family's descents begin, besides the first-order fit itself

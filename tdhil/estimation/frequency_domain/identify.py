@@ -10,21 +10,24 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.estimation.case import Case, Finding, PeriodicCase
-from tdhil.estimation.cross_checks.friction_curve import friction_curve
+from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
-from tdhil.estimation.frequency_domain.compliant import identify_compliant
+from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, measure_levels, tie_viscous
+from tdhil.estimation.frequency_domain.inference import contradicted
 from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent
-from tdhil.estimation.frequency_domain.rigid import RigidResult, fit_rigid, rigid_finding
+from tdhil.estimation.frequency_domain.rigid import (
+    RigidResult,
+    fit_rigid,
+    known_of,
+    refuse_count,
+    rigid_finding,
+    unfiltered,
+)
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.estimation.result import Refusal, Refused
-from tdhil.estimation.samples import Stretch, stretches
-from tdhil.identify.beside.friction_curve_points import Inertia
-from tdhil.identify.compliant.choice import may_swing, usable_lines
-from tdhil.identify.faults.left_out import log_warnings
-from tdhil.identify.lines.identifiable import known_of, refuse_count, unfiltered
-from tdhil.identify.lines.residual import contradicted
+from tdhil.estimation.samples import Stretch, log_warnings, stretches
 from tdhil.recording.recording import Excitation
 
 _ROUGH_REL_SD = 0.1

@@ -6,13 +6,89 @@ bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-squa
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit
+from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Held, minimise
+from tdhil.estimation.frequency_domain.shafts import INERTIA
+from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.result import BudgetLine, Estimate, InertiaEstimate, ResidualTest
 from tdhil.recording.recording import FloatArray
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Do the residuals look like the scatter between periods? If not, the model is wrong, and so would its number be.
+#
+# Of M segment means with weights estimated on ν complex degrees of freedom, q/M follows F(2M, 2ν). Bartlett's form of
+# its logarithm,
+#
+#     (2ν + M − 1) ln(1 + q/ν)  ~  χ²(2M),
+#
+# holds far into the tail, where sums of F itself do not; the tie of B to the levels, t(n), adds (n − ½) ln(1 + z²/n)
+# ~ χ²(1), and what is known of the lags χ²(1) each. Their sum at the best parameters has lost one degree of freedom
+# to each parameter that was free to follow the data: those at a bound were not.
+
+
+REJECT_P = 0.001
+_AT_BOUND = 1e-6      # of the natural scale
+
+
+def rejects(test: ResidualTest | None) -> bool:
+    """Do the data contradict the model? Also where the statistic is no number."""
+    return test is not None and not test.p_value >= REJECT_P
+
+
+def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:
+    """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds.
+
+    ``chosen``: how many more were, by a choice among models.
+    """
+    theta, limits = fitted.whole.theta, fitted.limits
+    near = _AT_BOUND * limits.scale
+    inside = (theta > limits.low + near) & (theta < limits.high - near)
+    return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])) + chosen)
+
+
+def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[Line, ...]) -> bool:
+    """Do lines that were not fitted contradict theta (P,)? For lines that were too weak in one signal.
+
+    A shaft that swings stands still at its antiresonance while the torque goes on: that line has no speed to speak of,
+    and says most. Each by itself, by Bartlett's form as above; theta is all but exact for lines as weak as these.
+    """
+    from scipy.stats import chi2
+
+    if not others:
+        return False
+    beside = Likelihood(others, problem.model, None, ())
+    _, q = beside.weighted(theta)
+    m, nu = beside.segments, beside.nu
+    p_values = chi2.sf((2.0 * nu + m - 1.0) * np.log1p(q / nu), 2.0 * m)
+    return bool(np.min(p_values) < REJECT_P / len(others))
+
+
+def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> ResidualTest | None:
+    """The sum against its expectation; None where as much was fitted as was measured."""
+    _, q = problem.weighted(theta)
+    m, nu = problem.segments, problem.nu
+    measured = 2.0 * float(np.sum(m)) + len(problem.priors)
+    statistic = float(np.sum((2.0 * nu + m - 1.0) * np.log1p(q / nu)))
+    statistic += float(sum(((theta[p.index] - p.mean) / p.sd) ** 2 for p in problem.priors))
+    if problem.tie is not None:
+        n = problem.tie.dof
+        measured += 1.0
+        statistic += max(n - 0.5, 0.5) * math.log1p(problem.tie_error(theta) ** 2 / n)
+    left = measured - fitted
+    if left < 1.0:
+        return None
+    from scipy.stats import chi2
+
+    return ResidualTest(statistic=statistic, degrees_of_freedom=left, p_value=float(chi2.sf(statistic, left)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _TRIES = 14
 _CLOSE = 5e-3     # of t: how well the edge is found
@@ -78,3 +154,170 @@ def profile_edge(refit: Refit, limits: Box, best: Fit, index: int, step: float, 
             share = (target - inside_root) / (outside[1] - inside_root)
             x = inside + min(max(share, 0.05), 0.95) * (outside[0] - inside)
     return x if outside is not None else math.copysign(math.inf, step)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The interval of one parameter of a fitted model: its profile over the whole family of lag structures.
+#
+# While first-order lags are the likelier answer, what lies within one standard deviation of theirs is part of it:
+# where the whole family's fit follows noise away from them, its own interval follows too. (Their whole interval would
+# be too much: on the plants of the coverage study with first-order lags 2 % would miss, not 5 %; without them it is 5
+# %, with one standard deviation 4 %, and the value is never at the interval's edge.)
+
+
+def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
+    """The root of how far −2 ln L may rise: Student's quantile, enlarged for what is fitted besides.
+
+    Its degrees of freedom are those of the first-order fit (the whole family's would be spread over directions that the
+    data hardly speak of). Student's quantile allows for the weights' own uncertainty if nothing else is fitted; what is
+    refitted all along the profile is allowed for by `excess_rise`.
+    """
+    free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held]
+    if index not in free:
+        free = fitted.free
+    _, dof = standard_deviation(fitted.problem, fitted.simple.theta, index, free)
+    return student_quantile(confidence, dof) * math.sqrt(excess_rise(fitted.problem, len(fitted.free)))
+
+
+def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0) -> Estimate:
+    """Value and interval of theta[index]; infinite on a side that the data leave open. Held: no width.
+
+    ``behind``: by how much −2 ln L lies above that of another model's fit, to which this one is a rival.
+    """
+    value = fitted.value(unit(fitted, index))
+    if index in fitted.held:
+        return Estimate(value, value, value)
+    quantile = quantile_of(fitted, index, confidence)
+    if behind >= quantile**2:
+        return Estimate(value, value, value)
+    seen = [value, *_edges(fitted, fitted.whole, fitted.held, index, quantile, behind)]
+    if behind == 0.0 and fitted.first_order and fitted.simple is not fitted.whole and index not in fitted.simple_held:
+        seen += _edges(fitted, fitted.simple, fitted.simple_held, index, 1.0, 0.0)
+    for rival in fitted.rivals:
+        further = behind + rival.objective - fitted.whole.objective
+        if further < quantile**2:
+            seen += _edges(fitted, rival, fitted.held, index, quantile, further)
+    return Estimate(value, min(seen), max(seen))
+
+
+def first_order_estimate(fitted: Fitted, index: int, confidence: float) -> Estimate:
+    """Value and interval of theta[index] if the lags are first order: for the lags themselves, whose meaning it is.
+
+    (Over the whole family a lag is open above, since what both reports share can't be seen.)
+    """
+    value = float(fitted.simple.theta[index])
+    if index in fitted.simple_held:
+        return Estimate(value, value, value)
+    quantile = quantile_of(fitted, index, confidence)
+    low, high = _edges(fitted, fitted.simple, fitted.simple_held, index, quantile, 0.0)
+    return Estimate(value, min(low, value), max(high, value))
+
+
+def _edges(
+    fitted: Fitted, fit: Fit, held: Held, index: int, quantile: float, behind: float
+) -> tuple[float, float]:
+    problem, limits = fitted.problem, fitted.limits
+    sd, _ = standard_deviation(problem, fit.theta, index, [i for i in range(len(fit.theta)) if i not in held])
+    natural = float(limits.scale[index])
+    step = min(max(quantile * sd, 1e-7 * natural), 0.3 * max(abs(float(fit.theta[index])), natural))
+
+    def refit(start: FloatArray, value: float) -> Fit:
+        return minimise(problem, limits, start, {**held, index: value})
+
+    rise = quantile**2 - behind
+    low, high = (profile_edge(refit, limits, fit, index, side * step, rise) for side in (-1.0, 1.0))
+    return low, high
+
+
+def half_width_first_order(fitted: Fitted, index: int, confidence: float, known: tuple[int, ...] = ()) -> float:
+    """Half-width in the quadratic approximation, with first-order lags and the parameters ``known`` at their values."""
+    free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held and i not in known]
+    if index not in free:
+        return 0.0
+    sd, dof = standard_deviation(fitted.problem, fitted.simple.theta, index, free)
+    return student_quantile(confidence, dof) * sd
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The drive's torque scale, to which J is proportional: what it adds to an interval, and its line of the budget.
+
+
+_CERTAIN = 1e6      # degrees of freedom: what a data sheet states is taken for normally distributed
+
+
+def scale_half_width(value: float, rel_sd: float, confidence: float) -> float:
+    """Half-width of a quantity in proportion to the scale, from the scale alone."""
+    return student_quantile(confidence, _CERTAIN) * rel_sd * abs(value)
+
+
+def with_total(
+    one: Estimate, rel_sd: float, confidence: float, conditional_on: tuple[str, ...]
+) -> InertiaEstimate:
+    """J with both intervals: as the data have it, and with the scale's uncertainty in quadrature."""
+    scale = scale_half_width(one.value, rel_sd, confidence)
+    return InertiaEstimate(
+        value=one.value,
+        low=one.low,
+        high=one.high,
+        low_total=one.value - math.hypot(one.value - one.low, scale),
+        high_total=one.value + math.hypot(one.high - one.value, scale),
+        confidence=confidence,
+        conditional_on=conditional_on,
+    )
+
+
+def torque_scale_line(value: float, rel_sd: float, confidence: float) -> BudgetLine:
+    """The last line of a budget."""
+    half = scale_half_width(value, rel_sd, confidence)
+    return BudgetLine("torque scale", half, "of the drive; not in repeatability")
+
+
+def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
+    """Is the torque scale more of the total interval than all else together?"""
+    repeatable, total = inertia.high - inertia.low, inertia.high_total - inertia.low_total
+    return total > 0.0 and total * total > 2.0 * repeatable * repeatable
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The error budget of J: what each thing that isn't known adds to the half-width, line by line.
+#
+# Unknowns are set free one group after another: J alone (noise), then the skew (timing), the lags, the friction, and
+# last the structure of the lags; a line is what its group adds, in squares: √(h_n² − h_(n−1)²); they add up to the
+# interval. Friction comes behind the lags since without them a line tells J and B apart by itself (imaginary and real
+# part); it is lags that mix the two.
+
+
+def budget_of(
+    fitted: Fitted, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+) -> tuple[BudgetLine, ...]:
+    """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
+    model = fitted.problem.model
+    lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
+    timing = (model.at(signal_filters.SKEW),)
+    friction = tuple(range(1, model.mechanical))
+    half = 0.5 * (inertia.high - inertia.low)
+    grown = (
+        ("noise", half_width_first_order(fitted, INERTIA, confidence, (*lags, *timing, *friction)),
+         "scatter from period to period, everything else known"),
+        ("timing", half_width_first_order(fitted, INERTIA, confidence, (*lags, *friction)),
+         "skew between speed and torque"),
+        ("lags", half_width_first_order(fitted, INERTIA, confidence, friction),
+         "time constants of the reports' filters"),
+        ("friction model", half_width_first_order(fitted, INERTIA, confidence),
+         "its slope" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
+        ("lag structure", half, "filters of two poles, moving averages"),
+    )
+    return (*grown_lines(grown, half), torque_scale_line(inertia.value, torque_scale_rel_sd, confidence))
+
+
+def grown_lines(grown: Iterable[tuple[str, float, str]], half: float) -> tuple[BudgetLine, ...]:
+    """What each step adds in squares.
+
+    ``grown`` are (source, half-width reached with it free, note), ``half`` the last of them.
+    """
+    found, before = [], 0.0
+    for source, reached, note in grown:
+        total = min(max(reached, before), max(half, before))
+        found.append(BudgetLine(source, math.sqrt(max(total**2 - before**2, 0.0)), note))
+        before = total
+    return tuple(found)

@@ -5,22 +5,293 @@ Its two parameters more, c and the bell's width, must lower −2 ln L by more th
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from tdhil.estimation.case import Finding, PeriodicCase
-from tdhil.estimation.frequency_domain.friction_levels import ViscousTie, tie_viscous
-from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, slope_over_speed, tie_viscous
+from tdhil.estimation.frequency_domain.inference import (
+    budget_of,
+    estimate,
+    quantile_of,
+    rejects,
+    residual_of,
+    student_quantile,
+)
+from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
+from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.optimiser import Fit, Held, box, minimise, rigid_rivals, rough_inertia_of
 from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of, rigid_finding
-from tdhil.estimation.frequency_domain.shafts import INERTIA
-from tdhil.estimation.result import BudgetLine, Estimate, Refusal
-from tdhil.identify.bent.fit import BentFit, Motion, fit_bends, inertia_of
-from tdhil.identify.bent.wave import wave_of
-from tdhil.identify.lines.budget import budget_of
-from tdhil.identify.lines.fit import rigid_rivals
-from tdhil.identify.lines.interval import estimate
-from tdhil.identify.lines.residual import rejects
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines
+from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest
+from tdhil.recording.recording import FloatArray, Segment
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The shapes that friction over speed may have besides its straight line.
+#
+#     T_f(ω) = T_c sgn ω + B ω + c g(ω)
+#
+# g is Stribeck's bell, exp(−(ω/ω_s)²), whose ω_s runs over a grid, or the parabola ω |ω| of a fan and of churned oil,
+# which wide bells come near. One shape with either sign of c, not a sum of them: over the speeds of one run two of
+# them could hardly be told apart.
+
+
+_WIDTHS = 9
+_NARROWEST, _WIDEST = 0.35, 1.0     # of the slowest and of the fastest speed: outside, a bell is not to be seen
+
+
+@dataclass(frozen=True)
+class Bend:
+    """One shape; ``width_rad_s`` None: the parabola."""
+
+    width_rad_s: float | None
+
+    def over(self, speed: FloatArray) -> FloatArray:
+        """The shape g at speeds (rad/s)."""
+        if self.width_rad_s is None:
+            parabola: FloatArray = speed * np.abs(speed)
+            return parabola
+        bell: FloatArray = np.sign(speed) * np.exp(-((speed / self.width_rad_s) ** 2))
+        return bell
+
+
+def bends(slowest_rad_s: float, fastest_rad_s: float) -> tuple[Bend, ...]:
+    """All that is tried for a run between two speeds of one direction, both in magnitude."""
+    widths = np.geomspace(_NARROWEST * slowest_rad_s, _WIDEST * fastest_rad_s, _WIDTHS)
+    return (*(Bend(float(width)) for width in widths), Bend(None))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A rigid shaft whose friction has a third parameter, c, of a shape that is given.
+
+
+BEND = 2
+
+
+@dataclass(frozen=True)
+class BentShaft:
+    """m = J, B, c.
+
+    ``chord``: how much the levels' slope of friction over speed rises with c; ``typical``: c of a bend as large as B ω
+    is, over B. c is not in the impedance: what it adds at a line does not go with the speed there (`likelihood.Load`).
+    """
+
+    chord: float
+    typical: float
+
+    names = ("inertia", "viscous", "bend")
+    inertia_row = np.array([1.0, 0.0, 0.0])
+
+    @property
+    def viscous_row(self) -> FloatArray:
+        return np.array([0.0, 1.0, self.chord])
+
+    def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        z: ComplexArray = m[INERTIA] * s + m[VISCOUS]
+        return z
+
+    def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        return np.stack([s, np.ones_like(s), np.zeros_like(s)], axis=1)
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        low, high = RigidShaft().bounds(rough_inertia, s)
+        return np.append(low, -np.inf), np.append(high, np.inf)
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        plain = RigidShaft().scales(rough_inertia, s)
+        return np.append(plain, plain[VISCOUS] * self.typical)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a bend of friction does at the lines: the speed's true wave over a period, through the bend, and its lines.
+#
+# The lines of the reported speed, W_k, divided by its report's filter, are those of the shaft's speed,
+#
+#     ω(t) = ω̄ + Re Σ_k W_k/F_w(s_k) e^(jω_k t),
+#
+# which keeps repeating with the segment's period. Friction follows it at once, so that c g(ω(t)) has the lines
+#
+#     G_k = 2/N Σ_n g(ω(t_n)) e^(−jω_k t_n)    and the mean    ḡ,
+#
+# and the drive reports them through the torque's filter: T_k = F_T (J s + B) W_k/F_w + c F_T G_k. Only F_T/F_w can be
+# seen in the first term; the second is a correction, for which the filters that fit are good enough.
+
+
+_POINTS = 16      # to a cycle of the fastest line
+
+
+@dataclass(frozen=True)
+class Wave:
+    """One segment: ``lines_hz`` (K,) rising or not, ``speed`` (K,) complex as reported, its mean, and its period."""
+
+    lines_hz: tuple[float, ...]
+    speed: ComplexArray
+    mean: float
+    period_s: float
+
+    @cached_property
+    def _s(self) -> ComplexArray:
+        """(K,)."""
+        return 2j * math.pi * np.asarray(self.lines_hz)
+
+    @cached_property
+    def _turned(self) -> ComplexArray:
+        """e^(jω_k t_n), (N, K): each line makes a whole number of turns in a period."""
+        turns = np.round(np.asarray(self.lines_hz) * self.period_s)
+        count = _POINTS * int(max(turns.max(), 1.0))
+        turned: ComplexArray = np.exp(2j * math.pi / count * np.multiply.outer(np.arange(count), turns))
+        return turned
+
+    def over_period(self, phi: FloatArray) -> FloatArray:
+        """The shaft's own speed behind the report ``phi`` (6,) (`reports`), (N,) rad/s."""
+        found: FloatArray = self.mean + (self._turned @ (self.speed / signal_filters.filters(phi, self._s)[0])).real
+        return found
+
+    def through(self, bend: Bend, phi: FloatArray) -> tuple[ComplexArray, float]:
+        """F_T G (K,) and ḡ."""
+        torque = bend.over(self.over_period(phi))
+        lines = torque @ self._turned.conj() * (2.0 / len(torque))
+        return signal_filters.filters(phi, self._s)[1] * lines, float(torque.mean())
+
+
+def wave_of(fit: PeriodLines, segment: Segment) -> Wave:
+    """Of all its periods together."""
+    return Wave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A rigid shaft with bent friction, fitted: every shape in turn, the filters of its wave found on the way.
+#
+# The bend's lines depend on the filters, and these on the fit: a few rounds settle that. The shape that explains the
+# data best stands; in the interval counts every shape that the data do not contradict, from where its own −2 ln L
+# lies.
+
+
+_ROUNDS = 3
+_RIGID = len(RigidShaft.names)
+_HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: looked at no further
+_FINE = 0.003       # of a bell's width
+_SLOWEST = 0.1      # of the mean speed: what comes nearer to rest than that is another kind of friction
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What the shaft did: a wave for each segment, the levels (the segments' first, in their order), the lines."""
+
+    waves: tuple[Wave, ...]
+    levels: Levels
+    lines: tuple[Line, ...]
+    tie: ViscousTie | None
+
+
+@dataclass(frozen=True)
+class BentFit:
+    """One shape, fitted."""
+
+    bend: Bend
+    fitted: Fitted
+    residual: ResidualTest | None
+
+    @property
+    def objective(self) -> float:
+        return self.fitted.whole.objective
+
+
+def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, rigid: RigidResult) -> list[BentFit]:
+    """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``held``: as rigid."""
+    # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
+    start = rigid.fitted.simple.theta
+    speeds = [wave.over_period(start[_RIGID:]) for wave in motion.waves]
+    ways = {float(np.sign(wave.mean)) for wave in motion.waves}
+    slowest = min(float(np.min(speed * np.sign(wave.mean))) for speed, wave in zip(speeds, motion.waves, strict=True))
+    if len(ways) != 1 or slowest <= _SLOWEST * min(abs(wave.mean) for wave in motion.waves):
+        return []
+    priors = tuple(replace(prior, index=prior.index + 1) for prior in priors)
+    held = {index + 1: value for index, value in held.items()}
+    fastest = max(float(np.max(np.abs(speed))) for speed in speeds)
+
+    def near(bend: Bend) -> _Near:
+        return _near(bend, motion, priors, held, np.insert(start, BEND, 0.0))
+
+    tried = [near(bend) for bend in bends(slowest, fastest)]
+    tried += _between(tried, near)
+    least = min(fit.objective for _, _, fit in tried)
+    found = [
+        BentFit(bend, whole := fit_model(problem, held, [fit.theta]), residual_of(whole, 1))
+        for bend, problem, fit in tried
+        if fit.objective <= least + _HOPELESS
+    ]
+    return sorted(found, key=lambda one: one.objective)
+
+
+def inertia_of(found: Sequence[BentFit], best: Estimate, confidence: float) -> Estimate:
+    """``best``, the best shape's, with an interval that holds whatever the others leave open. ``found``: it first."""
+    rise = quantile_of(found[0].fitted, INERTIA, confidence) ** 2
+    low, high = [best.low], [best.high]
+    for one in found[1:]:
+        behind = one.objective - found[0].objective
+        if behind < rise:
+            other = estimate(one.fitted, INERTIA, confidence, behind)
+            low.append(other.low)
+            high.append(other.high)
+    return Estimate(best.value, min(low), max(high))
+
+
+_Near = tuple[Bend, Likelihood, Fit]
+
+
+def _between(tried: list[_Near], near: Callable[[Bend], _Near]) -> list[_Near]:
+    """The best bell between the neighbours of the grid's best."""
+    bells = [(bend.width_rad_s, fit.objective) for bend, _, fit in tried if bend.width_rad_s is not None]
+    best = min(range(len(bells)), key=lambda number: bells[number][1])
+    around = (math.log(bells[max(best - 1, 0)][0]), math.log(bells[min(best + 1, len(bells) - 1)][0]))
+    seen: list[_Near] = []
+
+    def objective(log_width: float) -> float:
+        seen.append(near(Bend(math.exp(log_width))))
+        return seen[-1][2].objective
+
+    from scipy.optimize import minimize_scalar
+
+    minimize_scalar(objective, bounds=around, method="bounded", options={"xatol": _FINE, "maxiter": 20})
+    return [min(seen, key=lambda one: one[2].objective)]
+
+
+def _near(
+    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, start: FloatArray
+) -> _Near:
+    """With first-order lags, one descent in each round, from where the last one ended."""
+    theta = start
+    for _ in range(_ROUNDS):
+        problem = _problem(bend, motion, priors, theta[BEND + 1 :])
+        first_order = {**dict.fromkeys(problem.model.structure, 0.0), **held}
+        fit = minimise(problem, box(problem, rough_inertia_of(problem)), theta, first_order)
+        theta = fit.theta
+    return bend, problem, fit
+
+
+def _problem(bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], phi: FloatArray) -> Likelihood:
+    """With the bend's lines as the filters ``phi`` (6,) have them."""
+    seen = [wave.through(bend, phi) for wave in motion.waves]
+    by_hertz = [
+        {round(hertz, 9): line for hertz, line in zip(wave.lines_hz, lines, strict=True)}
+        for wave, (lines, _) in zip(motion.waves, seen, strict=True)
+    ]
+    entries = np.array([own[line.hertz] for line in motion.lines for own in by_hertz if line.hertz in own])
+    levels = motion.levels
+    friction = np.concatenate([[mean for _, mean in seen], bend.over(levels.speed[len(seen) :])])
+    typical = float(np.mean(np.abs(levels.speed)) / np.max(np.abs(friction)))
+    shaft = BentShaft(slope_over_speed(levels, friction), typical)
+    return Likelihood(motion.lines, Model(shaft), motion.tie, priors, Load(BEND, entries))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 MODEL = f"{RIGID}, bent friction"
 _MORE = 2      # parameters than with straight friction

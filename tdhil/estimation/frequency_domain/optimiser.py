@@ -8,11 +8,14 @@ at the bounds. λ falls with every success and rises with every failure; a start
 stays bit for bit.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.recording.recording import BoolArray, FloatArray
 
 Linearised = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -88,3 +91,159 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where to begin: rough sizes, and linear least squares for shafts behind first-order lags; then the best of many.
+
+
+# τ_w, τ_T, d to start from besides what linear least squares proposes: the field rig's, and its mirror image
+_STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
+_SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
+_PROPOSALS = 3
+_NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
+
+Held = dict[int, float]
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Answers (P,) that stand apart, and by how much they must lower −2 ln L to be preferred."""
+
+    stands: Callable[[FloatArray], bool]
+    gain: float
+
+
+def box(problem: Likelihood, rough_inertia: float) -> Box:
+    """Bounds of theta; wider where a prior says so."""
+    low, high = problem.model.bounds(rough_inertia, problem.s)
+    for prior in problem.priors:
+        high[prior.index] = max(high[prior.index], prior.mean + 6.0 * prior.sd)
+    return Box(low, high, problem.model.scales(rough_inertia, problem.s))
+
+
+def rough_inertia_of(problem: Likelihood) -> float:
+    """|T|/(ω|W|) of the lowest line: the right size, whatever the lags."""
+    first = problem.owner == 0
+    ratio = np.abs(problem.torque[first]) / np.maximum(np.abs(problem.speed[first] * problem.s[0]), 1e-300)
+    return float(np.median(ratio))
+
+
+def minimise(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
+    """A descent, and another from beside a lag of zero; the parameters in ``held`` keep the value that stands there.
+
+    At no lag at all descents stand still, a minimum or not: a short lag whose delay the skew takes back is felt through
+    its square only, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and the slope of that is zero at τ = 0.
+    """
+    fit = _descent(problem, limits, start, held)
+    for begin in _beside_no_lag(problem, fit.theta, held):
+        other = _descent(problem, limits, begin, held)
+        fit = other if other.objective < fit.objective else fit
+    return fit
+
+
+def _descent(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
+    free = np.ones(len(start), dtype=np.bool_)
+    begin = np.array(start, dtype=np.float64)
+    for index, value in held.items():
+        free[index], begin[index] = False, value
+    return descend(problem.linearised, problem.residuals, begin, free, limits)
+
+
+def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterator[FloatArray]:
+    """Starts with a lag of some size instead of hardly any, and the skew that makes up for its delay."""
+    at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
+    if at(signal_filters.SKEW) in held:
+        return
+    for lag, shape, sign in (
+        (signal_filters.SPEED_LAG, signal_filters.SPEED_SHAPE, 1.0),
+        (signal_filters.TORQUE_LAG, signal_filters.TORQUE_SHAPE, -1.0),
+    ):
+        if at(lag) in held or theta[at(lag)] * fastest > _NO_LAG:
+            continue
+        begin = theta.copy()
+        begin[at(lag)] = _SOME_LAG / fastest
+        begin[at(shape)] = 0.0
+        begin[at(signal_filters.SKEW)] += sign * (begin[at(lag)] - theta[at(lag)])
+        yield begin
+
+
+def best_fit(
+    problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray], apart: Apart | None = None
+) -> Fit:
+    """The `lowest` of several descents."""
+    return lowest([minimise(problem, limits, start, held) for start in starts], apart)
+
+
+def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:
+    """The first of equals, so that the same data give the same bits; what stands ``apart`` must gain more."""
+    best = min(fits, key=lambda fit: fit.objective)
+    if apart is None or not apart.stands(best.theta):
+        return best
+    others = [fit for fit in fits if not apart.stands(fit.theta)]
+    other = min(others, key=lambda fit: fit.objective, default=best)
+    return best if other.objective - best.objective > apart.gain else other
+
+
+def rigid_starts(problem: Likelihood) -> list[FloatArray]:
+    """The most promising of the linear proposals, and two guesses."""
+    proposals = sorted(_proposals(problem), key=problem.objective)
+    return proposals[:_PROPOSALS] + [_start(problem, lags) for lags in _STARTS]
+
+
+def rigid_rivals(theta: FloatArray) -> list[FloatArray]:
+    """Where a rigid shaft's lag and the lag of its speed's report have changed places.
+
+    (J s + B)(1 + τ_w s) = (B τ_w s + B)(1 + (J/B) s): shaft and report can't be told apart if both J/B and τ_w are
+    plausible lags of a report. An answer has this rival, and so has an interval.
+    """
+    inertia, viscous, lag = theta[INERTIA], theta[VISCOUS], theta[2 + signal_filters.SPEED_LAG]
+    if viscous <= 0.0 or inertia > 1.2 * signal_filters.LAG_BOUND_S * viscous:
+        return []
+    rival = theta.copy()
+    rival[INERTIA], rival[2 + signal_filters.SPEED_LAG] = viscous * max(lag, 1e-3), inertia / viscous
+    return [rival]
+
+
+def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
+    """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
+    phi = np.zeros(signal_filters.COUNT)
+    phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
+    seen = problem.torque / (np.exp(signal_filters.log_ratio(phi, problem.s))[problem.owner] * problem.speed)
+    s = problem.s[problem.owner]
+    weight = np.abs(problem.speed)
+    inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))
+    viscous = float(np.sum(weight * seen.real) / np.sum(weight))
+    if inertia <= 0.0:
+        inertia = rough_inertia_of(problem)
+    theta = np.concatenate([np.zeros(problem.model.mechanical), phi])
+    theta[INERTIA], theta[VISCOUS] = inertia, viscous
+    return theta
+
+
+def _proposals(problem: Likelihood) -> list[FloatArray]:
+    """Starts by linear least squares: for a given skew, first-order lags make the equation linear.
+
+    With T' = T e^(ds):  T' = (J τ_w) s² W + (J + B τ_w) s W + B W − τ_T s T', four real unknowns, each equation divided
+    by its standard deviation. J and τ_w follow from a = J τ_w and b = J + B τ_w, hence B τ_w² − b τ_w + a = 0, smaller
+    root.
+    """
+    found = []
+    s = problem.s[problem.owner]
+    w = problem.speed
+    ratio = np.bincount(problem.owner, weights=np.abs(problem.torque / w)) / problem.segments
+    weight = problem.root_periods / np.sqrt(problem.variance(ratio.astype(np.complex128)))[problem.owner]
+    for skew in _SKEWS:
+        shifted = problem.torque * np.exp(skew * s)
+        columns = np.stack([s * s * w, s * w, w, -s * shifted], axis=1) * weight[:, None]
+        target = shifted * weight
+        both = np.concatenate([columns.real, columns.imag])
+        scale = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
+        x = np.linalg.lstsq(both / scale, np.concatenate([target.real, target.imag]), rcond=1e-10)[0] / scale
+        a, b, viscous, torque_lag = (float(value) for value in x)
+        root = b * b - 4.0 * viscous * a
+        denominator = b + np.sign(b) * np.sqrt(max(root, 0.0))
+        speed_lag = 2.0 * a / denominator if denominator != 0.0 else 0.0
+        lags = np.clip([speed_lag, torque_lag], 0.0, signal_filters.LAG_BOUND_S)
+        found.append(_start(problem, (float(lags[0]), float(lags[1]), skew)))
+    return found

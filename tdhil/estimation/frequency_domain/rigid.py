@@ -3,22 +3,165 @@
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from tdhil.estimation.case import Case, Finding, Words
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, coulomb_level
-from tdhil.estimation.frequency_domain.inference import standard_deviation, student_quantile
+from tdhil.estimation.frequency_domain.inference import (
+    REJECT_P,
+    budget_of,
+    estimate,
+    first_order_estimate,
+    rejects,
+    residual_of,
+    standard_deviation,
+    student_quantile,
+)
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.optimiser import Held, rigid_rivals, rigid_starts
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
-from tdhil.estimation.frequency_domain.spectrum import Line
-from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest
-from tdhil.identify.lines.budget import budget_of
-from tdhil.identify.lines.fit import Held, rigid_rivals, rigid_starts
-from tdhil.identify.lines.interval import estimate, first_order_estimate
-from tdhil.identify.lines.line_points import fitted_points
-from tdhil.identify.lines.residual import REJECT_P, rejects, residual_of
+from tdhil.estimation.frequency_domain.signal_filters import (
+    AVERAGE,
+    SKEW,
+    SPEED_LAG,
+    SPEED_SHAPE,
+    TORQUE_LAG,
+    TORQUE_SHAPE,
+)
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
+from tdhil.estimation.result import BudgetLine, Estimate, LinePoint, Refusal, ResidualTest
 from tdhil.recording.recording import LagPrior
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Can these lines tell the inertia at all? Count equations and unknowns before fitting.
+#
+# Each distinct excited frequency is two equations (real and imaginary part of T/ω); two mean speeds add one (B), each
+# lag stated by the drive or the rig one. Unknown are five: J, B, the two lags, and the skew. (The structure of the
+# lags is unknown too; where the lines cannot tell it, the interval is wide or open, but is one.) At a second mean
+# speed the same frequency says the same again: it helps the scatter, not the count.
+#
+# The parameters are those of the rigid model.
+
+
+UNKNOWNS = 5
+_AT = Model().at
+_LEAST_SD_S = 1e-4     # a lag "known exactly" is known to a tenth of a millisecond at best
+
+
+def lag_priors(
+    prior: LagPrior, speed_index: int = _AT(SPEED_LAG), torque_index: int = _AT(TORQUE_LAG)
+) -> tuple[GaussianPrior, ...]:
+    """What is known of the two lags; the indices are where they stand in theta."""
+    known = []
+    if prior.speed_lag_s is not None:
+        known.append(GaussianPrior(speed_index, prior.speed_lag_s, max(prior.speed_lag_sd_s, _LEAST_SD_S)))
+    if prior.torque_lag_s is not None:
+        known.append(GaussianPrior(torque_index, prior.torque_lag_s, max(prior.torque_lag_sd_s, _LEAST_SD_S)))
+    return tuple(known)
+
+
+def known_structure(prior: LagPrior) -> dict[int, float]:
+    """A stated lag is a first-order one. What the manual states of both reports leaves no room for an average."""
+    held = {}
+    if prior.speed_lag_s is not None:
+        held[_AT(SPEED_SHAPE)] = 0.0
+    if prior.torque_lag_s is not None:
+        held[_AT(TORQUE_SHAPE)] = 0.0
+    if len(held) == 2:
+        held[_AT(AVERAGE)] = 0.0
+    return held
+
+
+def unfiltered() -> dict[int, float]:
+    """The paper's assumption: what is reported is what is."""
+    return {_AT(index): 0.0 for index in (SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW)}
+
+
+def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | None, sd_s: float) -> tuple[
+    GaussianPrior, ...
+]:
+    """If only the skew is missing from the count, and both lags are known: torque and speed come in one frame."""
+    known = len(priors) + (tie is not None) + 2 * lines
+    if known < UNKNOWNS and len(priors) == 2:
+        return (*priors, GaussianPrior(_AT(SKEW), 0.0, max(sd_s, _LEAST_SD_S)))
+    return priors
+
+
+def known_of(
+    prior: LagPrior, lines: int, tie: ViscousTie | None
+) -> tuple[tuple[GaussianPrior, ...], dict[int, float]]:
+    """What is known of a rigid shaft's reports beforehand: the priors, and what is held."""
+    return with_skew(lag_priors(prior), lines, tie, prior.skew_sd_s), known_structure(prior)
+
+
+def refuse_count(lines: int, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:
+    """A refusal that names equations, unknowns and the motion that would do."""
+    equations = 2 * lines + (tie is not None) + len(priors)
+    if equations >= UNKNOWNS:
+        return None
+    sources = [f"{lines} excited {'line gives' if lines == 1 else 'lines give'} {2 * lines} equations"]
+    if tie is not None:
+        sources.append("two mean speeds give one")
+    if priors:
+        sources.append(f"what is known of the lags gives {len(priors)}")
+    missing = "more lines (a multisine)" if tie is not None else "more lines about two mean speeds (a multisine)"
+    return Refusal(
+        f"{', '.join(sources)}, but there are five unknowns: inertia, viscous friction, the lags of the reported speed "
+        "and torque, and their skew",
+        f"excite with {missing}, or state the drive's speed and torque filters with their uncertainty",
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Lines as a reader sees them: the inertia that each frequency shows by itself, beside what the model makes of it.
+#
+#     G = T/ω,    apparent inertia Im G/ω_k (what regressing torque on acceleration gives at that line),    damping Re G
+#
+# pooled over the segments, G = Σ P T W* / Σ P |W|², of variance v / Σ P |W|² (`likelihood`), half of it in either
+# part.
+
+
+def fitted_points(fitted: Fitted, confidence: float) -> tuple[LinePoint, ...]:
+    """The lines of a fit beside the likelier of its two answers."""
+    problem, theta = fitted.problem, fitted.likelier.theta
+    return line_points(problem.unloaded(theta), problem.model.impedance(theta, problem.s), confidence)
+
+
+def line_points(lines: tuple[Line, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:
+    """One for each line, in their order; ``fitted`` (K,) is the model's T/ω at them, N·m·s/rad."""
+    found = []
+    for line, model in zip(lines, fitted, strict=True):
+        g = complex(model)
+        weight = line.periods * np.abs(line.speed) ** 2
+        energy = float(np.sum(weight))
+        if not (energy > 0.0 and math.isfinite(energy)):
+            continue
+        seen = complex(np.sum(line.periods * line.torque * line.speed.conj())) / energy
+        variance = line.s_tt + abs(g) ** 2 * line.s_ww - 2.0 * (g.conjugate() * line.s_tw).real
+        sd = math.sqrt(max(variance, 0.0) / (2.0 * energy))
+        half = student_quantile(confidence, max(2.0 * line.nu, 1.0)) * sd
+        omega = 2.0 * math.pi * line.hertz
+        found.append(
+            LinePoint(
+                hertz=line.hertz,
+                apparent_inertia_kg_m2=_around(seen.imag / omega, half / omega),
+                fitted_inertia_kg_m2=g.imag / omega,
+                apparent_damping_nm_s_rad=_around(seen.real, half),
+                fitted_damping_nm_s_rad=g.real,
+                residual_sd=abs(seen - g) / (math.sqrt(2.0) * sd) if sd > 0.0 else 0.0,
+            )
+        )
+    return tuple(found)
+
+
+def _around(value: float, half: float) -> Estimate:
+    return Estimate(value, value - half, value + half)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 RIGID = "rigid+lags"
 _OPEN = Refusal(

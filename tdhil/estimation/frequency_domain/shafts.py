@@ -3,6 +3,7 @@
 About a mean speed that keeps its sign Coulomb friction is constant, and the shaft is linear: T = Z(s) ω, s = jω.
 """
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +11,89 @@ import numpy as np
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray
 from tdhil.recording.recording import FloatArray
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Two masses on a torsion spring, seen from the motor (the paper's figure 7, which it draws and then drops).
+#
+#     J_r dω_r/dt = T − B_r ω_r − τ      J_L dω_L/dt = τ − B_L ω_L      dτ/dt = k (ω_r − ω_L) + c d(ω_r − ω_L)/dt
+#
+# At s = jω the spring says ω_r − ω_L = a τ with the compliance a = s/(k + c s), the load τ = Z_L ω_L, Z_L = J_L s +
+# B_L. So ω_r = (1/Z_L + a) τ: speeds add up, as voltages do in a row,
+#
+#     Z = T/ω_r = J_r s + B_r + Z_L/(1 + a Z_L) = J_r s + B_r + (J_L s + B_L)(k + c s)/(J_L s² + (B_L + c) s + k).
+#
+# Dry friction at either end is a constant torque while both keep turning one way: it is in the mean, not in the
+# lines.
+#
+# Where Z is large, the load swings by itself at √(k/J_L) and holds the motor still (antiresonance of the motor's
+# speed). Where Z is small, above it, the ends swing against each other at √(k (1/J_r + 1/J_L)) and little torque
+# moves much (resonance).
+#
+# Below both, Z → (J_r + J_L) s + B_r + B_L: what turns with mean speed, and what the levels show. Parameters, chosen
+# so that lines speak of them one by one:
+#
+#     m = J_r, B = B_r + B_L, J_L, ω_a = √(k/J_L), c, B_L            k = ω_a² J_L.
+#
+# c and B_L damp alike and can hardly be told apart.
+
+
+LOAD, SWING, DAMPING, LOAD_VISCOUS = range(2, 6)    # in m, after shaft.py's INERTIA and VISCOUS
+
+_SLOWEST, _FASTEST = 0.2, 10.0     # swing, of the lowest and of the highest line
+_SMALL_LOSS = 0.03                 # damping's natural size, of J ω
+
+
+class TwoMassShaft:
+    """J_r, B, J_L, ω_a (rad/s), c, B_L."""
+
+    names: tuple[str, ...] = ("inertia", "viscous", "load_inertia", "swing_rad_s", "damping", "load_viscous")
+    inertia_row = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    viscous_row = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+    def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        inertia, viscous, load, swing, damping, load_viscous = m
+        hung = load * s + load_viscous
+        spring = swing**2 * load + damping * s
+        z: ComplexArray = inertia * s + viscous - load_viscous + hung / (1.0 + hung * s / spring)
+        return z
+
+    def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        """With D = 1 + a Z_L: ∂(Z_L/D)/∂Z_L = 1/D², ∂(Z_L/D)/∂a = −Z_L²/D², ∂a/∂k = −a²/s, ∂a/∂c = −a²."""
+        _, _, load, swing, damping, load_viscous = m
+        a = s / (swing**2 * load + damping * s)
+        hung = load * s + load_viscous
+        d = 1.0 + a * hung
+        by_hung = 1.0 / d**2
+        by_damping = (a * hung / d) ** 2
+        by_stiffness = by_damping / s
+        one = np.ones_like(s)
+        by_load = s * by_hung + swing**2 * by_stiffness
+        by_swing = 2.0 * swing * load * by_stiffness
+        return np.stack([s, one, by_load, by_swing, by_damping, by_hung - 1.0], axis=1)
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        omega = np.abs(s)
+        loss = 10.0 * rough_inertia * float(np.max(omega))
+        low = np.array([1e-6 * rough_inertia, -np.inf, 1e-6 * rough_inertia, _SLOWEST * float(np.min(omega)), 0.0, 0.0])
+        high = np.array([1e6 * rough_inertia, np.inf, 1e6 * rough_inertia, _FASTEST * float(np.max(omega)), loss, loss])
+        return low, high
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        omega = float(np.median(np.abs(s)))
+        loss = _SMALL_LOSS * rough_inertia * omega
+        return np.array([rough_inertia, rough_inertia * omega, rough_inertia, omega, loss, loss])
+
+
+def stiffness(m: FloatArray) -> float:
+    """k, N·m/rad, of two lumps."""
+    return float(m[SWING] ** 2 * m[LOAD])
+
+
+def resonances(m: FloatArray) -> tuple[float, float]:
+    """(antiresonance, resonance) of the motor's speed without damping, rad/s."""
+    return float(m[SWING]), float(m[SWING] * np.sqrt(1.0 + m[LOAD] / m[0]))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Shaft(Protocol):
     """A mechanical impedance Z(s; m), m (M,).
@@ -63,3 +147,124 @@ class RigidShaft:
 
     def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
         return np.array([rough_inertia, rough_inertia * float(np.median(np.abs(s)))])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A drill string: torsional waves between the motor and what turns at the bottom; two masses are its limit.
+#
+# Along the string, per length, the wave equation of a bar with drag and inner friction (d'Alembert; Chen and Géradin
+# 1995), s = jω, is −∂τ/∂x = (b/L) ω, −∂ω/∂x = (a/L) τ, with the totals
+#
+#     b = J_s s + D       inertia J_s = ρ I L and drag of the string
+#     a = s/(k + c s)     compliance, k = G I/L its static stiffness.
+#
+# The solution is waves e^(±√(ab) x/L); with the end's impedance Z_e = J_e s + B_e at the bottom, the top sees
+#
+#     Z_s = (Z_e + √(b/a) tanh √(ab)) / (1 + Z_e √(a/b) tanh √(ab)) = (Z_e + b q)/(1 + Z_e a q)
+#     q = tanh √x / √x,    x = a b,
+#
+# and the motor Z = J_r s + B_r + Z_s. Without drag √(b/a) is the characteristic impedance I √(Gρ) = √(J_s k), √(ab) =
+# s T with the delay T = L √(ρ/G) = √(J_s/k). A string that weighs nothing (b = 0, q = 1) leaves two masses,
+# `two_mass.py`, and that is how it is parametrised: with the load J_L = J_s + J_e and the string's share of it, η =
+# J_s/J_L,
+#
+#     m = J_r, B, J_L, ω_a, c, B_L, η        k = ω_a² J_L (1 − 2η/3),    J_s = η J_L,    J_e = (1 − η) J_L,
+#
+# η = 0 two masses, η = 1 a free bottom. J_e + J_s/3 is what a string's swing weighs by Rayleigh, so that ω_a stays
+# near the lowest antiresonance (10 % off at worst) whatever η. Friction below, B_L, is taken as shared between string
+# and bottom as their inertias are (D = η B_L): where along the string a weak drag acts can't be told from the top.
+
+
+STRING_SHARE = 6         # in m
+_RAYLEIGH = 2.0 / 3.0
+
+
+class StringShaft:
+    """J_r, B, J_L, ω_a (rad/s), c, B_L, η."""
+
+    names: tuple[str, ...] = (*TwoMassShaft.names, "string_share")
+    inertia_row = np.append(TwoMassShaft.inertia_row, 0.0)
+    viscous_row = np.append(TwoMassShaft.viscous_row, 0.0)
+
+    def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        load, damping, share = m[LOAD], m[DAMPING], m[STRING_SHARE]
+        a = s / (string_stiffness(m) + damping * s)
+        hung = load * s + m[LOAD_VISCOUS]
+        end, string = (1.0 - share) * hung, share * hung
+        q, _ = _q(a * string)
+        z: ComplexArray = m[0] * s + m[1] - m[LOAD_VISCOUS] + (end + string * q) / (1.0 + end * a * q)
+        return z
+
+    def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Chain rule through Z_e, a, b: of Z_s = N/D, N = Z_e + b q, D = 1 + Z_e a q; ∂a/∂k = −a²/s, ∂a/∂c = −a²."""
+        load, swing, share = m[LOAD], m[SWING], m[STRING_SHARE]
+        light = 1.0 - _RAYLEIGH * share
+        a = s / (string_stiffness(m) + m[DAMPING] * s)
+        hung = load * s + m[LOAD_VISCOUS]
+        end, string = (1.0 - share) * hung, share * hung
+        q, slope = _q(a * string)
+        n, d = end + string * q, 1.0 + end * a * q
+        by_q = (string - n * end * a / d) / d
+        by_end = (1.0 - n * a * q / d) / d
+        by_string = q / d + by_q * slope * a
+        by_a = -n * end * q / d**2 + by_q * slope * string
+        by_stiffness, by_damping = -by_a * a**2 / s, -by_a * a**2
+        by_hung = (1.0 - share) * by_end + share * by_string
+        by_share = hung * (by_string - by_end) - by_stiffness * swing**2 * load * _RAYLEIGH
+        return np.stack(
+            [s, np.ones_like(s), s * by_hung + by_stiffness * swing**2 * light,
+             2.0 * by_stiffness * swing * load * light, by_damping, by_hung - 1.0, by_share],
+            axis=1,
+        )
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        low, high = TwoMassShaft().bounds(rough_inertia, s)
+        return np.append(low, 0.0), np.append(high, 1.0)
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        return np.append(TwoMassShaft().scales(rough_inertia, s), 0.3)
+
+
+def string_stiffness(m: FloatArray) -> float:
+    """k, N·m/rad, from the motor to the bottom."""
+    return float(m[SWING] ** 2 * m[LOAD] * (1.0 - _RAYLEIGH * m[STRING_SHARE]))
+
+
+def string_resonances(m: FloatArray) -> tuple[float, float]:
+    """Lowest (antiresonance, resonance) of the motor's speed without damping, rad/s.
+
+    With x = √(J_s/k) ω and β = J_e/J_s, the string carries Z_s/s = J_s g, g = (β + tan x/x)/(1 − β x tan x): its pole,
+    then the first x beyond it where J_r + J_s g = 0, each the one root of a monotonic function in its interval.
+    """
+    from scipy.optimize import brentq
+
+    share, load = float(m[STRING_SHARE]), float(m[LOAD])
+    if share < 1e-6:
+        swing = math.sqrt(string_stiffness(m) / load)
+        return swing, swing * math.sqrt(1.0 + load / float(m[INERTIA]))
+    string = share * load
+    beta, motor = (1.0 - share) / share, float(m[INERTIA]) / string
+    delay = math.sqrt(string / string_stiffness(m))
+
+    def pole(x: float) -> float:
+        return math.cos(x) - beta * x * math.sin(x)
+
+    def zero(x: float) -> float:
+        return motor * pole(x) + beta * math.cos(x) + math.sin(x) / x
+
+    held = float(brentq(pole, 1e-12, 0.5 * math.pi + 1e-12))
+    # just above the pole Z_s/s is −∞; it has risen through −J_r before it is 0, at or before π
+    free = float(brentq(zero, held, math.pi))
+    return held / delay, free / delay
+
+
+def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """The even function tanh √x/√x and its derivative, (1 − x q² − q)/(2x); by series where x is small."""
+    small = np.abs(x) < 1e-3
+    safe = np.where(small, 1.0, x)
+    root = np.sqrt(safe)
+    q = np.where(small, 1.0 - x / 3.0 + 2.0 * x**2 / 15.0 - 17.0 * x**3 / 315.0, np.tanh(root) / root)
+    slope = np.where(
+        small, -1.0 / 3.0 + 4.0 * x / 15.0 - 17.0 * x**2 / 105.0, (1.0 - safe * q**2 - q) / (2.0 * safe)
+    )
+    return q, slope

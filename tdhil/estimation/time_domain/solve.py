@@ -5,9 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tdhil.estimation.frequency_domain.inference import profile_edge, student_quantile
 from tdhil.estimation.frequency_domain.model import GaussianPrior
 from tdhil.estimation.frequency_domain.optimiser import Fit
 from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest
+from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
     BACK,
     BEND,
@@ -19,14 +21,231 @@ from tdhil.estimation.time_domain.equation import (
     TORQUE_LAG,
     TORQUE_SHAPE,
     VISCOUS,
+    evaluate,
 )
-from tdhil.estimation.time_domain.fit import Problem, covariance, minimise
-from tdhil.estimation.time_domain.windows import Bins, Window
-from tdhil.identify.record_route.interval import Spread, best_shapes, profile, spread, with_shapes
-from tdhil.identify.record_route.misfit import local_test
-from tdhil.identify.record_route.moments import block_scores
-from tdhil.identify.record_route.search import search
+from tdhil.estimation.time_domain.fit import Problem, covariance, minimise, search
+from tdhil.estimation.time_domain.taylor import flat_top, times
+from tdhil.estimation.time_domain.windows import Bins, Window, seen_through
 from tdhil.recording.recording import FloatArray
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Does any smooth response explain the bins better than the model? Then the model is wrong, and so may be its number.
+#
+# Within some neighbouring bins of one window every shaft's response is nearly a straight line over frequency,
+#
+#     T = g₀ W_0 + g₁ (W_1 + (s − s₀) W_0),
+#
+# two complex unknowns (the local polynomial method). What that leaves is noise, measured without a model. If the model
+# leaves so much more that F says it is no chance, then the data contradict it.
+
+
+_GROUP = 6
+_FIRST = 2       # bins of a window below it are friction's, constant and all
+
+
+def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTest | None:
+    """F test of the model against local straight lines; None if there are not enough bins in a row.
+
+    ``factor``: by how much more than its noise model says the inertia scatters over time. Noise that comes with the
+    motion is shared by many bins, so F is divided by factor², and its degrees of freedom are taken as half as many.
+    """
+    found = evaluate(theta, problem.bins)
+    bins, variance = problem.bins, problem.variance
+    by_model, by_line, dof_model, dof_line = 0.0, 0.0, 0, 0
+    for number in np.unique(bins.window):
+        mine = np.flatnonzero((bins.window == number) & (bins.hertz > 0.0))[_FIRST - 1 :]
+        for first in range(0, len(mine) - _GROUP + 1, _GROUP):
+            part = mine[first : first + _GROUP]
+            weight = 1.0 / np.sqrt(variance[part])
+            s = bins.s[part]
+            lines = np.stack([bins.speed[part, 0],
+                              bins.speed[part, 1] + (s - s.mean()) * bins.speed[part, 0]], axis=1)
+            u, _ = np.linalg.qr(lines * weight[:, None])
+            error = found.error[part] * weight
+            left = error - u @ (u.conj().T @ error)
+            by_model += 2.0 * float(np.sum(np.abs(error) ** 2))
+            by_line += 2.0 * float(np.sum(np.abs(left) ** 2))
+            dof_model += 2 * _GROUP
+            dof_line += 2 * (_GROUP - 2)
+    fitted = len(problem.free)
+    extra = dof_model - fitted - dof_line
+    if dof_line < 8 or extra < 2 or by_line <= 0.0:
+        return None
+    from scipy.stats import f
+
+    statistic = (by_model - by_line) / extra / (by_line / dof_line) / factor**2
+    return ResidualTest(float(statistic), float(extra), float(f.sf(statistic, extra, 0.5 * dof_line)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Is the scatter the same at all times? Errors of time stamps, rounding and friction come with the motion.
+#
+# The fit's score is a sum over test functions; cut by smooth blocks u_b that add up to one, φ = Σ_b u_b φ, it is a sum
+# over stretches of time too,
+#
+#     g_b = Σ_m 2 Re(∂e_m* e_mb)/v_m,      Σ_b g_b = 0 at the best fit,
+#
+# and Σ g_b g_bᵀ with its neighbours (weight ½) estimates the score's covariance whatever the noise does over time and
+# across frequencies: H⁻¹ (Σ …) H⁻¹ is the covariance of theta that needs no noise model ("sandwich").
+
+
+_BLOCK_S = 4.0
+_BLOCKS = 40
+_LEAST_BLOCKS = 10
+_WHITE = 0.89         # γ₀ + γ₁ of overlapping blocks over the whole variance γ₀ + 2γ₁, for white noise
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Of one direction in parameter space: the sandwich's variance, and how many blocks it rests on."""
+
+    variance: float
+    count: float
+
+
+def block_scores(problem: Problem, placed: tuple[Window, ...], theta: FloatArray) -> FloatArray:
+    """g_b (blocks, 10), in the order of time."""
+    total = sum(window.hop_s for window in placed)
+    length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
+    whole = evaluate(theta, problem.bins)
+    weight = np.where(problem.bins.hertz > 0.0, 2.0, 1.0) / problem.variance
+    scores = []
+    for window in placed:
+        mine = problem.bins.window == float(window.number)
+        if not np.any(mine):
+            continue
+        own = problem.bins.chosen(mine)
+        pull = whole.slopes[mine].conj() * weight[mine, None]
+        for part, shape in _blocks(window, length):
+            error = evaluate(theta, seen_through(window, part, shape, own.s)).error
+            scores.append((pull * error[:, None]).real.sum(axis=0))
+    return np.array(scores).reshape(-1, len(theta))
+
+
+def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
+    """Of directionᵀ·theta, where ``direction`` = H⁻¹ e (10,)."""
+    each = scores @ direction
+    if len(each) < 3:
+        return Blocks(0.0, 1.0)
+    square = float(each @ each)
+    neighbours = float(each[1:] @ each[:-1])
+    count = square**2 / max(float(np.sum(each**4)), 1e-300)
+    # each block's share has lost what the fit took from it: about one part in their effective number
+    return Blocks(max(square + neighbours, 0.5 * square) / _WHITE * count / max(count - 1.0, 1.0), count)
+
+
+def _blocks(window: Window, length: float) -> list[tuple[Samples, FloatArray]]:
+    """The window cut by blocks, half of each shared with either neighbour."""
+    count = max(1, round(window.length_s / length))
+    hop = window.length_s / count
+    found = []
+    for number in range(count + 1):
+        begin, end = (number - 1) * hop, (number + 1) * hop
+        part = window.part(begin, end)
+        if len(part) < 3:
+            continue
+        time = part.time_s - window.start_s
+        found.append((part, times(flat_top(time - begin, 2.0 * hop, hop), window.shape(time))))
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Intervals: every value that the data don't contradict, whatever the structure of the reporting filters.
+#
+# The profile P(x) = min over all other parameters of −2 ln L, the filters' shapes κ among them, follows the valley in
+# which inertia and lags make up for each other. The interval is {x: P(x) ≤ P_min + (i t)²}: t is Student's quantile
+# for as many degrees of freedom as the scatter was measured with, i ≥ 1 how much more the parameter scatters over
+# time than the noise model says (`moments`).
+
+
+_LEAST_DOF = 3.0
+_SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Of one parameter: sd of the quadratic approximation, the sandwich's factor on it, the quantile.
+
+    ``lean``: how far the other direction of regression would put the value (see `direction_gap`).
+    """
+
+    sd: float
+    factor: float
+    quantile: float
+    lean: float
+
+
+def spread(problem: Problem, fit: Fit, scores: FloatArray, index: int, confidence: float) -> Spread:
+    """How uncertain a parameter is; ``scores`` of the blocks of time at this fit (`moments`)."""
+    found, _ = covariance(problem, fit.theta, problem.free)
+    at = problem.free.index(index)
+    sd = math.sqrt(max(float(found[at, at]), 0.0))
+    direction = np.zeros(len(fit.theta))
+    direction[list(problem.free)] = found[at]
+    blocks = sandwich(scores, direction)
+    share = _shares(problem, fit.theta, direction)
+    dof = 2.0 * share - len(problem.free)
+    factor = math.sqrt(blocks.variance) / sd if sd > 0.0 else 1.0
+    if factor > 1.0:
+        dof = min(dof, blocks.count)
+    lean = float(direction_gap(problem, fit.theta) @ direction)
+    return Spread(sd, max(factor, 1.0), student_quantile(confidence, max(dof, _LEAST_DOF)), lean)
+
+
+def direction_gap(problem: Problem, theta: FloatArray) -> FloatArray:
+    """The score's shift, (10,), if all noise were in the speed instead of the torque.
+
+    Least squares makes the residual e orthogonal to ∂G W, the speed as reported. If the noise moved the speed, T/G
+    is the clean signal, W + e/G, and the normal equations gain Σ 2 Re(∂ln G* |e|²/v). The truth lies between.
+    """
+    bins = problem.bins
+    found = evaluate(theta, bins)
+    weight = np.where(bins.hertz > 0.0, 2.0, 1.0) * np.abs(found.error) ** 2 / problem.variance
+    tone, nothing = np.zeros_like(bins.speed), np.zeros_like(bins.bend)
+    tone[:, 0] = 1.0
+    steady = replace(bins, speed=tone, torque=tone * found.gain[:, None], level=0.0 * bins.level, bend=nothing)
+    logs = -evaluate(theta, steady).slopes / found.gain[:, None]
+    return np.asarray((logs.real * weight[:, None]).sum(axis=0), dtype=np.float64)
+
+
+def with_shapes(problem: Problem, stated: tuple[int, ...]) -> Problem:
+    """The same with the filters' structure free, but for a lag that was stated: that is a one-pole filter's."""
+    shapes = [shape for lag, shape in ((SPEED_LAG, SPEED_SHAPE), (TORQUE_LAG, TORQUE_SHAPE)) if lag not in stated]
+    return replace(problem, free=(*problem.free, *shapes))
+
+
+def best_shapes(problem: Problem, near: Fit) -> Fit:
+    """The lowest of some descents from the one-pole fit."""
+    fits = [near]
+    for shapes in _SHAPE_STARTS:
+        start = near.theta.copy()
+        for index, value in zip((SPEED_SHAPE, TORQUE_SHAPE), shapes, strict=True):
+            if index in problem.free:
+                start[index] = value
+        fits.append(minimise(problem, start))
+    return min(fits, key=lambda fit: fit.objective)
+
+
+def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) -> Estimate:
+    """Where the profile has risen by reach² on either side of ``best``; a bound, or ±inf, if it never does."""
+
+    def refit(start: FloatArray, value: float) -> Fit:
+        return minimise(problem, start, {index: value})
+
+    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2) for side in (-1.0, 1.0))
+    return Estimate(float(best.theta[index]), low, high)
+
+
+def _shares(problem: Problem, theta: FloatArray, direction: FloatArray) -> float:
+    """On how many bins the parameter rests: (Σ c)²/Σ c² of their shares in its variance."""
+    _, slopes = problem.stacked(theta)
+    count = len(problem.bins)
+    pulled = (slopes @ direction) ** 2
+    each = pulled[:count] + pulled[count : 2 * count]
+    return float(np.sum(each) ** 2 / max(float(np.sum(each**2)), 1e-300))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _SURELY = 3.0       # times the reach², friction is taken as bent; from once it, both are held possible
 _OF_REPORTS = (SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE)

@@ -4,15 +4,256 @@ A unit is taken from ``--columns``, else from a row of units below the header, e
 (``n_rpm``, ``Speed [rpm]``), else it is SI, which is told as an assumption. A file that contradicts itself is refused.
 """
 
-from collections.abc import Sequence
+import difflib
+import math
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
-from tdhil.record.csv_choice import Choice, Choices
-from tdhil.record.csv_errors import CsvMisnamed, CsvUnusable, shown
-from tdhil.record.csv_header import Header, find_header
-from tdhil.record.csv_numbers import decimal_sign, is_missing, looks_numeric, split_cells
-from tdhil.record.csv_units import QUANTITIES, SI, Unit, known_units, unit_in_name, unit_of
+from profiles import quantities
+from tdhil.errors import CsvMisnamed, CsvUnusable, UsageError, shown
+from tdhil.recording.csv.text import decimal_sign, is_missing, looks_numeric, split_cells
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Units that drives' tools write, and what each is in SI.
+#
+# A value in SI is value · factor; for shares of the rated torque the factor is of ``--rated-torque``. 1/s is a
+# revolution a second, as in data sheets; a tool that means rad/s by it has to be told so with ``--columns``.
+
+
+QUANTITIES = ("time", "speed", "torque")
+SI = {"time": "s", "speed": "rad/s", "torque": "N·m"}
+_TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
+
+    quantity: str
+    symbol: str
+    factor: float
+    of_rated: bool = False
+
+
+_TURNS = Unit("speed", "1/s", _TURN)
+_PERCENT = Unit("torque", "%", 1e-2, of_rated=True)
+_PERMILLE = Unit("torque", "‰", 1e-3, of_rated=True)
+
+# What a trace may say beyond `profiles.quantities`, which takes nothing that could mean two things.
+_ALSO = {
+    "time": {},
+    "speed": dict.fromkeys(("1/s", "s1", "hz"), _TURNS),
+    "torque": {
+        "%": _PERCENT, "pct": _PERCENT, "percent": _PERCENT, "‰": _PERMILLE, "permille": _PERMILLE,
+        "promille": _PERMILLE, "permil": _PERMILLE,
+    },
+}
+_BRACKETED = re.compile(r"^(.*?)\s*[\[(<]\s*([^\[\]()<>]*?)\s*[\])>]$")
+_IGNORED = re.compile(r"[\s·.*⋅_^⁻-]")
+
+
+def unit_of(quantity: str, text: str) -> Unit | None:
+    """The unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if none of ours."""
+    found = _BRACKETED.match(text.strip())
+    inner = found.group(2) if found is not None and not found.group(1) else text
+    # Case tells milli from mega; nobody samples in megaseconds, and mN·m and MN·m are not read at all.
+    word = _IGNORED.sub("", inner.replace("¹", "1").casefold())
+    if (also := _ALSO[quantity].get(word)) is not None:
+        return also
+    known = quantities.unit_of(inner if quantity != "time" else inner.casefold())
+    return _in_trace(known) if known is not None and known.dimension == quantity else None
+
+
+def _in_trace(unit: quantities.Unit) -> Unit:
+    return Unit(unit.dimension, unit.symbol, unit.times / unit.over)
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """``Speed [rpm]`` → (Speed, rpm); a name without brackets is itself, with no unit."""
+    found = _BRACKETED.match(name)
+    return (found.group(1), found.group(2)) if found is not None and found.group(1) else (name, "")
+
+
+def unit_in_name(quantity: str, name: str) -> Unit | None:
+    """The unit a column's name ends with: ``speed_rad_s``, ``n_rpm``, ``Torque [%]``; the longest ending counts."""
+    base, bracketed = split_name(name)
+    if bracketed:
+        return unit_of(quantity, bracketed)
+    parts = re.split(r"[_ ]", base)
+    endings = ("_".join(parts[start:]) for start in range(1, len(parts)))
+    return next((unit for ending in endings if (unit := unit_of(quantity, ending)) is not None), None)
+
+
+def known_units(quantity: str) -> tuple[str, ...]:
+    """The symbols to be offered in a message."""
+    plain = {"time": quantities.TIME, "speed": quantities.SPEED, "torque": quantities.TORQUE}[quantity]
+    return tuple(dict.fromkeys((*quantities.known(plain), *(unit.symbol for unit in _ALSO[quantity].values()))))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which column is which, as the command line says it: ``time=t_s speed=n_rpm:rpm torque=m_pct:%``.
+
+
+_WHERE = "--columns"
+_NEXT = "Such as: --columns time=t_s speed=n_rpm:rpm torque=m:Nm"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The column called ``name`` holds ``quantity``; ``unit`` None: as the file says. No name: the usual ones."""
+
+    quantity: str
+    name: str = ""
+    unit: Unit | None = None
+
+
+Choices = tuple[Choice, Choice, Choice]
+USUAL: Choices = (Choice("time"), Choice("speed"), Choice("torque"))
+
+
+def parse_columns(items: Iterable[str]) -> Choices:
+    """Time, speed and torque, in this order; one that isn't named keeps its usual name. UsageError."""
+    found: dict[str, Choice] = {}
+    for item in items:
+        quantity, equals, name = item.partition("=")
+        quantity = quantity.strip().casefold()
+        if not equals or not name.strip():
+            raise UsageError(f"{shown(item)!r} is not quantity=column", where=_WHERE, next_step=_NEXT)
+        if quantity not in QUANTITIES:
+            meant = difflib.get_close_matches(quantity, QUANTITIES, 1)
+            hint = f"; did you mean {meant[0]!r}?" if meant else f"; there are {', '.join(QUANTITIES)}"
+            raise UsageError(f"there is no quantity {shown(quantity)!r}{hint}", where=_WHERE, next_step=_NEXT)
+        if quantity in found:
+            raise UsageError(f"{quantity} is named twice", where=_WHERE)
+        found[quantity] = _choice(quantity, name.strip())
+    names = [choice.name.casefold() for choice in found.values()]
+    if len(set(names)) < len(names):
+        raise UsageError("one column can't hold two quantities", where=_WHERE, next_step=_NEXT)
+    time, speed, torque = (found.get(quantity, Choice(quantity)) for quantity in QUANTITIES)
+    return time, speed, torque
+
+
+def _choice(quantity: str, text: str) -> Choice:
+    name, colon, spelt = text.rpartition(":")
+    if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a name
+        return Choice(quantity, text)
+    unit = unit_of(quantity, spelt)
+    if unit is None or not name:
+        raise UsageError(
+            f"{shown(spelt)!r} is no unit of {quantity}; there are {', '.join(known_units(quantity))}",
+            where=_WHERE, next_step="If the colon belongs to the column's name, write the unit behind another colon",
+        )
+    return Choice(quantity, name.strip(), unit)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Where the table begins, what separates its cells, and which columns are time, speed and torque.
+#
+# The header is the first of the beginning's lines in which all three are found; what stands above it is the tool's own
+# business. Names are compared without regard to case, first as they are, then without a unit in brackets.
+
+
+HEADER_LINES = 50
+MOST_COLUMNS = 512
+_DELIMITERS = ("\t", ";", ",")
+
+
+@dataclass(frozen=True)
+class Header:
+    """``line`` counts from 1; ``columns`` are the positions of time, speed, torque in ``names``."""
+
+    line: int
+    delimiter: str
+    names: tuple[str, ...]
+    columns: tuple[int, int, int]
+
+
+def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
+    """The header in the file's first lines. CsvMisnamed if a column isn't there, CsvUnusable if there is no table."""
+    best: tuple[tuple[int, int, int], int, list[str]] | None = None
+    for number, line in enumerate(lines[:HEADER_LINES], 1):
+        for delimiter in _DELIMITERS:
+            if delimiter not in line:
+                continue
+            names = split_cells(line, delimiter)
+            if len(names) > MOST_COLUMNS:
+                raise CsvUnusable(f"more than {MOST_COLUMNS} columns", where=f"{file}:{number}")
+            found = [_positions(names, choice) for choice in choices]
+            if all(found):
+                return Header(number, delimiter, tuple(names), _one_each(found, names, choices, f"{file}:{number}"))
+            words = sum(bool(name) and not looks_numeric(name) for name in names)
+            score = (sum(map(bool, found)), words, -number)
+            if best is None or score > best[0]:
+                best = score, number, names
+    if best is None:
+        raise CsvUnusable(
+            f"there is no table: no comma, semicolon or tab in the first {HEADER_LINES} lines", where=file,
+            next_step="Export the trace as CSV, with a header above its columns",
+        )
+    (_, words, _), number, names = best
+    if words < 2:
+        raise CsvMisnamed(
+            f"no header in the first {HEADER_LINES} lines", where=file,
+            next_step="Put a line with the columns' names above them, such as time_s,speed_rad_s,torque_nm",
+        )
+    missing = next(choice for choice in choices if not _positions(names, choice))
+    raise _no_column(missing, names, f"{file}:{number}")
+
+
+def _positions(names: Sequence[str], choice: Choice) -> list[int]:
+    """The columns that answer to a choice: by the whole name, else by the name without its unit."""
+    full = [_folded(name) for name in names]
+    bare = [_folded(split_name(name)[0]) for name in names]
+    if choice.name:
+        wanted = _folded(choice.name)
+        exact = [at for at, name in enumerate(full) if name == wanted]
+        return exact or [at for at, name in enumerate(bare) if name == wanted]
+    quantity = choice.quantity
+    standard = {"time": "time_s", "speed": "speed_rad_s", "torque": "torque_nm"}[quantity]
+    exact = [at for at, name in enumerate(full) if name == standard]
+    return exact or [
+        at for at, name in enumerate(bare)
+        if name == quantity or (name.startswith(f"{quantity}_") and unit_in_name(quantity, names[at]) is not None)
+    ]
+
+
+def _folded(name: str) -> str:
+    return " ".join(name.casefold().split())
+
+
+def _one_each(
+    found: Sequence[Sequence[int]], names: Sequence[str], choices: Choices, where: str
+) -> tuple[int, int, int]:
+    for choice, positions in zip(choices, found, strict=True):
+        if len(positions) > 1:
+            several = ", ".join(repr(shown(names[at])) for at in positions[:4])
+            raise CsvMisnamed(
+                f"{len(positions)} columns could be {choice.quantity}: {several}", where=where,
+                next_step="Name one with --columns, and rename it in the file if the names are the same",
+            )
+    time, speed, torque = (positions[0] for positions in found)
+    if len({time, speed, torque}) < 3:
+        raise CsvMisnamed("one column would hold two quantities", where=where, next_step="Name all with --columns")
+    return time, speed, torque
+
+
+def _no_column(choice: Choice, names: Sequence[str], where: str) -> CsvMisnamed:
+    there = [name for name in names if name]
+    listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
+    wanted = choice.name or choice.quantity
+    folded = {_folded(form): name for name in there for form in (split_name(name)[0], name)}
+    close = difflib.get_close_matches(_folded(wanted)[:80], [form[:80] for form in folded], 1)
+    hint = f"; did you mean {shown(folded.get(close[0], close[0]))!r}?" if close else ""
+    missing = f"no column {shown(wanted)!r}" if choice.name else f"no column is called {choice.quantity}"
+    step = f"The columns are: {listed}"
+    if not choice.name:
+        step += f". Say which is which: --columns {' '.join(f'{quantity}=…' for quantity in QUANTITIES)}"
+    return CsvMisnamed(f"{missing}{hint}", where=where, next_step=step)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _BELOW = 5          # rows that may stand between the header and the numbers
 _LOOKED_AT = 5000   # rows, for the decimal sign

@@ -1,15 +1,321 @@
 """A trace and what else is known of the bench, as a Recording."""
 
 import math
+from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tdhil.record.csv_choice import USUAL, Choices
-from tdhil.record.csv_trace import read_trace
+from tdhil.errors import CsvUnusable, UsageError
 from tdhil.recording.csv.excitation import load_excitation
-from tdhil.recording.recording import FloatArray, LagPrior, Recording
+from tdhil.recording.csv.layout import USUAL, Choices, Layout, find_layout
+from tdhil.recording.csv.text import LARGEST, Block, ClockReader, blocks, encoding_of, is_missing, number, split_cells
+from tdhil.recording.recording import BoolArray, FloatArray, LagPrior, Recording
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Rows to numbers: whole blocks by numpy where every row is as expected, cell by cell where one isn't.
+#
+# What is left out is counted by its cause, with the line of the first: a ragged row may be cut or may have decimal
+# commas between commas, and its columns can't be told apart.
+
+
+LineArray = NDArray[np.int64]
+
+
+@dataclass
+class Tally:
+    """How many rows went one way, and the line of the first."""
+
+    count: int = 0
+    first: int = 0
+
+    def add(self, line: int) -> None:
+        self.count += 1
+        self.first = self.first or line
+
+
+class RowReader:
+    """Reads a file's blocks in order; as the file has them, not yet in SI, but for clock times."""
+
+    def __init__(self, layout: Layout) -> None:
+        header = layout.header
+        self._layout = layout
+        self._width = len(header.names)
+        self._delimiter, self._columns = header.delimiter, header.columns
+        self._clock = ClockReader() if layout.clock else None
+        self.ragged, self.missing, self.unreadable = Tally(), Tally(), Tally()
+        self.rows = 0              # all that weren't blank
+
+    def read(self, block: Block) -> tuple[FloatArray, LineArray]:
+        """(N, 3) time, speed, torque and (N,) line numbers of the usable rows at or below the layout's first line."""
+        skipped = max(0, self._layout.first_line - block.first)
+        lines, first = block.lines[skipped:], block.first + skipped
+        values = self._at_once(lines)
+        if values is not None:
+            self.rows += len(lines)
+            numbers = first + np.arange(len(lines), dtype=np.int64)
+            if np.all(np.isfinite(values)):
+                return values, numbers
+        else:
+            values, numbers = self._one_by_one(lines, first)
+        good = np.all(np.isfinite(values), axis=1)
+        for line in numbers[~good]:
+            self.missing.add(int(line))
+        return values[good], numbers[good]
+
+    def _at_once(self, lines: list[str]) -> FloatArray | None:
+        """All lines, if none of them needs a second look."""
+        if not lines or any('"' in line for line in lines):
+            return None
+        delimiter = self._delimiter
+        if any(line.count(delimiter) != self._width - 1 for line in lines):
+            return None
+        if self._layout.comma:
+            if delimiter == "," or any("." in line for line in lines):
+                return None
+            lines = [line.replace(",", ".") for line in lines]
+        wanted = self._columns if self._clock is None else self._columns[1:]
+        try:
+            values = np.loadtxt(lines, dtype=np.float64, delimiter=delimiter, usecols=wanted, comments=None, ndmin=2)
+        except (ValueError, OverflowError):
+            return None
+        if len(values) != len(lines):
+            return None
+        return values if self._clock is None else self._timed(lines, values)
+
+    def _timed(self, lines: list[str], values: FloatArray) -> FloatArray | None:
+        """The block's clock times beside its values; None, with the clock where it was, if one can't be read."""
+        assert self._clock is not None
+        before = copy(self._clock)
+        column, seconds = self._columns[0], self._clock.seconds
+        times = [seconds(line.split(self._delimiter, column + 1)[column].strip()) for line in lines]
+        if None in times:
+            self._clock = before
+            return None
+        return np.column_stack([np.array(times, dtype=np.float64), values])
+
+    def _one_by_one(self, lines: list[str], first: int) -> tuple[FloatArray, LineArray]:
+        found: list[tuple[float, float, float]] = []
+        numbers: list[int] = []
+        for at, line in enumerate(lines, first):
+            if not line or line.isspace():
+                continue
+            self.rows += 1
+            row = self._row(line, at)
+            if row is not None:
+                found.append(row)
+                numbers.append(at)
+        return np.array(found, dtype=np.float64).reshape(-1, 3), np.array(numbers, dtype=np.int64)
+
+    def _row(self, line: str, at: int) -> tuple[float, float, float] | None:
+        cells = split_cells(line, self._delimiter)
+        # A separator behind the last cell is a habit of some tools, a row without its last, empty cells of others.
+        if len(cells) <= max(self._columns) or any(cells[self._width :]):
+            self.ragged.add(at)
+            return None
+        wanted = [cells[column] for column in self._columns]
+        comma = self._layout.comma
+        time = number(wanted[0], comma) if self._clock is None else self._clock.seconds(wanted[0])
+        speed, torque = number(wanted[1], comma), number(wanted[2], comma)
+        if time is None or speed is None or torque is None:
+            (self.missing if any(map(is_missing, wanted)) else self.unreadable).add(at)
+            return None
+        return time, speed, torque
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Time stamps as a drive's tool left them: repeated, out of order, with gaps; what can be put right and what can't.
+
+
+LONGEST_S = 7 * 86400.0
+_MOST_DROPPED = 0.10      # of the rows; more and it isn't one record
+_GAP = 5.0                # usual intervals
+
+
+def rising(time_s: FloatArray, lines: LineArray, file: str) -> tuple[BoolArray, list[str]]:
+    """(N,) the rows to keep, and warnings. CsvUnusable if the rows are no record in order, or a week or longer."""
+    keep = np.ones(len(time_s), dtype=np.bool_)
+    if len(time_s) < 2:
+        return keep, []
+    # One stamp too high between two good ones: it is the one to go, not all that follow.
+    keep[1:-1] = ~((time_s[1:-1] > time_s[2:]) & (time_s[2:] > time_s[:-2]))
+    kept = np.flatnonzero(keep)
+    highest = np.maximum.accumulate(time_s[kept])
+    keep[kept[1:]] = time_s[kept][1:] > highest[:-1]
+    lost = np.flatnonzero(~keep)
+    warnings = []
+    if len(lost):
+        first = int(lost[0])
+        same = float(np.mean(np.isin(time_s[lost], time_s[keep]))) if len(lost) < 100_000 else _same(time_s)
+        how = "repeats itself" if same > 0.5 else "goes back"
+        if len(lost) > _MOST_DROPPED * len(time_s):
+            raise CsvUnusable(
+                f"the time {how}, here and in {len(lost) - 1} more of {len(time_s)} rows",
+                where=f"{file}:{lines[first]}",
+                next_step="Export one recording, in its order, with time stamps as fine as the samples",
+            )
+        warnings.append(f"{file}:{lines[first]}: {_row_list(len(lost))} dropped, where the time {how}")
+    steps = np.diff(time_s[keep])
+    if not len(steps):
+        return keep, warnings
+    usual, widest = float(np.median(steps)), int(np.argmax(steps))
+    line = int(lines[keep][widest + 1])
+    if float(np.sum(steps)) > LONGEST_S:
+        raise CsvUnusable(
+            f"the time spans {float(np.sum(steps)):.3g} s, more than a week", where=f"{file}:{line}",
+            next_step="Check the unit of time (--columns time=…:ms), and the widest gap, which is at this line",
+        )
+    gaps = int(np.sum(steps > _GAP * usual))
+    if gaps:
+        plural = "gap" if gaps == 1 else "gaps"
+        warnings.append(f"{file}:{line}: {gaps} {plural} in the time, the widest of {steps[widest]:.3g} s here")
+    return keep, warnings
+
+
+def _same(time_s: FloatArray) -> float:
+    falls = np.diff(time_s)
+    return float(np.mean(falls[falls <= 0.0] == 0.0)) if np.any(falls <= 0.0) else 0.0
+
+
+def _row_list(count: int) -> str:
+    return "1 row was" if count == 1 else f"{count} rows were"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A trace exported from a drive's own tool: CSV in, samples in SI out, and what had to be assumed or left out.
+
+
+MAX_ROWS = 10_000_000      # 32 bytes each while they are read
+_MOST_ODD = 0.10           # of the rows, ragged or without a number where one should be
+
+
+@dataclass(frozen=True)
+class Trace:
+    """(N,) each, SI, time rising; ``warnings`` a line each."""
+
+    time_s: FloatArray
+    speed_rad_s: FloatArray
+    torque_nm: FloatArray
+    warnings: tuple[str, ...]
+
+
+def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | None = None) -> Trace:
+    """The trace in ``path``. CsvMisnamed for columns and units, CsvUnusable for the rest, both with file and line.
+
+    UsageError if the torque is a share of the rated torque, and that isn't given.
+    """
+    file = str(path)
+    encoding = encoding_of(path)
+    source = blocks(path, encoding)
+    head = next(source, None)
+    if head is None:
+        raise CsvUnusable("the file is empty", where=file)
+    layout = find_layout(head.lines, choices, file)
+    factors = _factors(layout, rated_torque_nm, file)
+    warnings = [*layout.assumed]
+    if encoding == "cp1252":
+        warnings.insert(0, f"{file}: not UTF-8; read as Windows-1252 (Latin-1)")
+    reader = RowReader(layout)
+    columns, lines = _collect(chain([head], source), reader, warnings, file)
+    warnings += _left_out(reader, layout, file)
+    for column, factor in zip(columns, factors, strict=True):
+        np.multiply(column, factor, out=column)
+    columns, lines = _possible(columns, lines, warnings, file)
+    if layout.clock:
+        columns[0] -= columns[0][0]
+    keep, notes = rising(columns[0], lines, file)
+    if not np.all(keep):
+        columns = [column[keep] for column in columns]
+    return Trace(columns[0], columns[1], columns[2], (*warnings, *notes))
+
+
+def _factors(layout: Layout, rated_torque_nm: float | None, file: str) -> list[float]:
+    factors = []
+    for unit in layout.units:
+        if unit.of_rated and rated_torque_nm is None:
+            raise UsageError(
+                f"the torque is in {unit.symbol} of the rated torque, which is not given",
+                where=f"{file}:{layout.header.line}",
+                next_step="Add --rated-torque, in N·m, from the name plate or the drive",
+            )
+        factors.append(unit.factor * (rated_torque_nm or 1.0) if unit.of_rated else unit.factor)
+    return factors
+
+
+def _collect(
+    source: Iterator[Block], reader: RowReader, warnings: list[str], file: str
+) -> tuple[list[FloatArray], LineArray]:
+    """The three columns and the lines, at most `MAX_ROWS` of them."""
+    parts: tuple[list[FloatArray], ...] = ([], [], [])
+    numbers: list[LineArray] = []
+    room = MAX_ROWS
+    for block in source:
+        values, lines = reader.read(block)
+        over = len(lines) > room
+        if over:
+            warnings.append(f"{file}:{lines[room]}: more than {MAX_ROWS} rows; what follows is not read")
+            values, lines = values[:room], lines[:room]
+        for part, column in zip(parts, values.T, strict=True):
+            part.append(np.ascontiguousarray(column))
+        numbers.append(lines)
+        room -= len(lines)
+        if over:
+            break
+    columns = []
+    for part in parts:
+        columns.append(np.concatenate(part))
+        part.clear()      # one column at a time, so that the peak is not twice the record
+    return columns, np.concatenate(numbers)
+
+
+def _left_out(reader: RowReader, layout: Layout, file: str) -> list[str]:
+    """Warnings for what was dropped; CsvUnusable where that is so much that the rest can't be trusted."""
+    ragged, odd = reader.ragged, reader.unreadable
+    if ragged.count > _MOST_ODD * reader.rows:
+        comma = layout.header.delimiter == ","
+        raise CsvUnusable(
+            f"{_rows(ragged)} not as many cells as the header, which has {len(layout.header.names)}",
+            where=f"{file}:{ragged.first}",
+            next_step="With decimal commas the separator must be a semicolon or a tab" if comma else "Export it again",
+        )
+    if odd.count > _MOST_ODD * reader.rows:
+        raise CsvUnusable(
+            f"{_rows(odd)} something else than a number in time, speed or torque",
+            where=f"{file}:{odd.first}", next_step="Look at this line in an editor",
+        )
+    causes = ((ragged, "cells missing or too many"), (reader.missing, "no value"), (odd, "no readable number"))
+    return [
+        f"{file}:{tally.first}: {tally.count} {'row was' if tally.count == 1 else 'rows were'} dropped: {cause}"
+        for tally, cause in causes if tally.count
+    ]
+
+
+def _possible(
+    columns: list[FloatArray], lines: LineArray, warnings: list[str], file: str
+) -> tuple[list[FloatArray], LineArray]:
+    """Without the rows that no machine can have; CsvUnusable if none is left."""
+    good = np.ones(len(lines), dtype=np.bool_)
+    for column in columns:
+        good &= np.abs(column) < LARGEST
+    if not np.any(good):
+        raise CsvUnusable("no row has a time, a speed and a torque", where=file, next_step="Look at it in an editor")
+    lost = np.flatnonzero(~good)
+    if len(lost):
+        many = "1 row was" if len(lost) == 1 else f"{len(lost)} rows were"
+        warnings.append(f"{file}:{lines[lost[0]]}: {many} dropped: a number beyond every machine")
+        columns, lines = [column[good] for column in columns], lines[good]
+    return columns, lines
+
+
+def _rows(tally: Tally) -> str:
+    return "1 row has" if tally.count == 1 else f"{tally.count} rows have"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 _LOOKED_AT = 200_000     # samples, for the resolution
 _ROUNDING = 1e-9         # of the largest value: differences below it are the arithmetic's

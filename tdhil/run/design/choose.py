@@ -9,22 +9,172 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
-from tdhil.protocol.design.information import relative_sd
-from tdhil.protocol.design.noise import SPEED_LAG_S, TORQUE_LAG_S, Noise, assumed_theta
-from tdhil.protocol.design.predicted import expected_half_width
-from tdhil.protocol.design.shapes import SLOPES, highest_line_hz, phased, proposals
+import numpy as np
+
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.shafts import VISCOUS
 from tdhil.recording.recording import FloatArray, LagPrior
-from tdhil.run.excitation import (
-    LEAST_COUNTED,
-    ExcitationWish,
-    MachineLimits,
-    Plan,
-    PlanRefused,
-    RigGuess,
-    make_plan,
-    settling_periods,
-)
+from tdhil.run.design.prediction import RIGID, SPEED_LAG_S, TORQUE_LAG_S, Noise, assumed_theta, expected_half_width
+from tdhil.run.excitation import LEAST_COUNTED, ExcitationWish, Plan, PlanRefused, make_plan, settling_periods
+from tdhil.run.excitation.reference import DriveMode, MachineLimits, RigGuess
+from tdhil.run.excitation.signals import Shape, unit_peak
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A quick figure for the search: the Cramér-Rao bound of J, the structure of the lags being open.
+#
+# The lines' information about the rigid model's theta = (J, B; τ_w, ρ_w, τ_T, ρ_T, u, d), whose last six are the
+# family of `identify.reports`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are
+# bounded rather than unknown; here they count as known to about their bounds. So a high line buys little: what it
+# says of J it first has to say of the structure.
+
+
+_SKEW_SD_S = 0.3
+_AVERAGE_SHARE = 4.0       # u of an average that delays as long as the longest lag τ: (2 τ)²
+_CERTAIN = 1e-4
+
+
+def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> float:
+    """Least standard deviation of J after the plan, as a share of J; infinite where J can't be told."""
+    first = plan.segments[0]
+    period = first.reference.period_s
+    hertz = np.array(first.reference.lines_hz)
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    _, columns = RIGID.impedance_jacobian(theta, s)
+    variance = 4.0 * noise.error_density(hertz, theta) / period
+    counts = np.array([segment.periods - segment.settle_periods for segment in plan.segments], dtype=np.float64)
+    nu = float(np.sum(counts - 1.0))
+    if nu < 2.0:
+        return math.inf
+    amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
+    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(signal_filters.SPEED_LAG)]))
+    weight = 2.0 * (counts @ seen**2) / variance * (nu - 1.0) / nu
+    fisher = np.einsum("k,ki,kj->ij", weight, columns.conj(), columns).real
+    fisher[VISCOUS, VISCOUS] += _tie(plan, counts * period, float(noise.error_density(np.zeros(1), theta)[0]))
+    for index, sd in _known(theta, prior).items():
+        fisher[RIGID.at(index), RIGID.at(index)] += sd**-2.0
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    try:
+        bound = float(np.linalg.inv(fisher * np.outer(scale, scale))[0, 0])
+    except np.linalg.LinAlgError:
+        return math.inf
+    return math.sqrt(bound) * float(scale[0]) / float(theta[0]) if bound > 0.0 else math.inf
+
+
+def _tie(plan: Plan, durations: FloatArray, density: float) -> float:
+    """1/sd² of B from the mean torque at the mean speeds."""
+    speeds = np.array([segment.reference.offset_rad_s for segment in plan.segments])
+    centred = speeds - np.sum(durations * speeds) / np.sum(durations)
+    return float(np.sum(durations * centred**2) / density)
+
+
+def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
+    """Standard deviations to begin with, of the reports' parameters: stated, or about the bounds of the fit."""
+    lags = theta[[RIGID.at(signal_filters.SPEED_LAG), RIGID.at(signal_filters.TORQUE_LAG)]]
+    longest = max(float(np.max(lags)), 1e-3)
+    speed, torque = prior.speed_lag_s is not None, prior.torque_lag_s is not None
+    return {
+        signal_filters.SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else signal_filters.LAG_BOUND_S,
+        signal_filters.SPEED_SHAPE: _CERTAIN if speed else signal_filters.SHAPE_BOUND,
+        signal_filters.TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else signal_filters.LAG_BOUND_S,
+        signal_filters.TORQUE_SHAPE: _CERTAIN if torque else signal_filters.SHAPE_BOUND,
+        signal_filters.AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
+        signal_filters.SKEW: _SKEW_SD_S,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Candidate multisines: which lines, how strong, phased so that they fit the most motion into the limits.
+
+
+HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, where τ is the longest lag that must be reckoned with
+LINES_LIMIT_HZ = (0.1, 2.0)
+"""The highest line, Hz: not below the first (a rig would take an hour), not above the second (structure, backlash)."""
+
+SLOPES = (1.0, 1.5, 2.0)                               # amplitude ~ harmonic^−slope
+_HARMONICS = ((1, 2, 3, 4), (1, 2, 3, 5), (1, 2, 3, 4, 5), (1, 2, 3, 4, 6), (1, 2, 3, 4, 5, 6), (1, 3, 5, 7, 9))
+_REACHES = (0.8, 1.0)                                  # of the highest line that is allowed
+_GRID = 128
+_TURN = 2.0 * np.pi * np.arange(_GRID) / _GRID
+_POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Lowest line and harmonics, with amplitudes ~ harmonic^−slope."""
+
+    lowest_hz: float
+    harmonics: tuple[int, ...]
+    slope: float
+
+    @property
+    def amplitudes(self) -> tuple[float, ...]:
+        """Relative to the first line's."""
+        return tuple(float(harmonic) ** -self.slope for harmonic in self.harmonics)
+
+
+def highest_line_hz(longest_lag_s: float) -> float:
+    """Above a quarter of 1/τ what nobody can know of a lag τ matters too much: the notes of `identify.reports`."""
+    return float(np.clip(HIGHEST_TURN / max(longest_lag_s, 1e-3), *LINES_LIMIT_HZ))
+
+
+def proposals(highest_hz: float, slope: float) -> Iterator[Proposal]:
+    """From few lines in a short period to many in a long one, none above ``highest_hz``."""
+    for harmonics, reach in product(_HARMONICS, _REACHES):
+        yield Proposal(reach * highest_hz / harmonics[-1], harmonics, slope)
+
+
+def phased(proposal: Proposal, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> Shape:
+    """The proposal with phases that allow the greatest amplitude within speed window and torque limit, peak 1.
+
+    A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
+    """
+    fit = _Room(proposal, limits, guess, mode)
+    rng = np.random.default_rng(len(proposal.harmonics))
+    phases = rng.uniform(0.0, 2.0 * np.pi, (_POPULATION, len(proposal.harmonics)))
+    room = fit.of(phases)
+    for turn in range(_ROUNDS):
+        best = phases[np.argsort(-room, kind="stable")[:_KEPT]]
+        around = np.repeat(best, _POPULATION // _KEPT - 1, axis=0)
+        phases = np.concatenate([best, around + rng.normal(0.0, _STEP_RAD * 0.5**turn, around.shape)])
+        room = fit.of(phases)
+    chosen = phases[int(np.argmax(room))] % (2.0 * np.pi)
+    return unit_peak(Shape(proposal.harmonics, proposal.amplitudes, tuple(float(phase) for phase in chosen)))
+
+
+class _Room:
+    """How much of a proposal fits, by its phases."""
+
+    def __init__(self, proposal: Proposal, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> None:
+        harmonics, amplitudes = np.array(proposal.harmonics), np.array(proposal.amplitudes)
+        omega = 2.0 * np.pi * proposal.lowest_hz * harmonics
+        foresight = limits.foresight_s if mode == "torque" else 0.0
+        self._turns = np.exp(1j * np.outer(_TURN, harmonics))
+        self._speed = amplitudes.astype(np.complex128)
+        self._ahead = amplitudes * (1.0 + 1j * omega * foresight)
+        self._torque = amplitudes * (guess.viscous_nm_s_rad + 1j * omega * guess.inertia_kg_m2)
+        self._both_ends = mode == "speed" and guess.following is not None
+        if self._both_ends and guess.following is not None:     # what the shaft makes of the setpoint
+            gains = guess.following.shaft(proposal.lowest_hz * harmonics)
+            self._ahead, self._torque = amplitudes * gains, self._torque * gains
+        steady = max(guess.steady_torque_nm(limits.usable_low_rad_s), guess.steady_torque_nm(limits.usable_high_rad_s))
+        self._speed_room = (limits.usable_high_rad_s - limits.usable_low_rad_s) / guess.speed_swing_factor(mode)
+        self._torque_room = max(limits.usable_torque_nm - steady, 1e-9) / guess.torque_swing_factor(mode)
+
+    def of(self, phases: FloatArray) -> FloatArray:
+        """The amplitude that fits, (C,), for phases (C, K)."""
+        turned = np.exp(1j * phases.T)
+        speed, ahead, torque = (
+            (self._turns @ (weights[:, None] * turned)).real for weights in (self._speed, self._ahead, self._torque)
+        )
+        lowest = np.minimum(ahead.min(axis=0), speed.min(axis=0)) if self._both_ends else speed.min(axis=0)
+        span = np.maximum(ahead.max(axis=0), speed.max(axis=0)) - lowest
+        room: FloatArray = np.minimum(self._speed_room / span, self._torque_room / np.abs(torque).max(axis=0))
+        return room
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 OFFSET_SHARES = (0.2, 0.4)
 BETTER = 0.95         # of the usual multisine's interval: what a candidate must come down to

@@ -1,7 +1,5 @@
 """What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
 
-from tdhil.protocol.excitation.periodic import PeriodicReference
-from tdhil.protocol.excitation.transition import Transition, make_transition
 from tdhil.run.excitation.plan import (
     LEAST_COUNTED,
     ExcitationKind,
@@ -12,7 +10,15 @@ from tdhil.run.excitation.plan import (
     settling_periods,
 )
 from tdhil.run.excitation.pulses import SwingKind, SwingPlan, make_swings
-from tdhil.run.excitation.reference import DriveMode, MachineLimits, PlanRefused, RigGuess
+from tdhil.run.excitation.reference import (
+    DriveMode,
+    MachineLimits,
+    PeriodicReference,
+    PlanRefused,
+    RigGuess,
+    Transition,
+    make_transition,
+)
 from tdhil.run.excitation.signals import Shape
 from tdhil.run.excitation.speed_loop import Following, fit_following, held_back_to
 

@@ -7,11 +7,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.protocol.excitation import multisine, sine, step
-from tdhil.protocol.excitation.periodic import PeriodicReference
-from tdhil.protocol.excitation.transition import Transition, make_transition
 from tdhil.recording.recording import Segment
-from tdhil.run.excitation.reference import DriveMode, MachineLimits, PlanRefused, RigGuess
+from tdhil.run.excitation import signals
+from tdhil.run.excitation.reference import (
+    DriveMode,
+    MachineLimits,
+    PeriodicReference,
+    PlanRefused,
+    RigGuess,
+    Transition,
+    make_transition,
+)
 from tdhil.run.excitation.signals import Shape, begun_at_rest
 
 ExcitationKind = Literal["multisine", "sine", "step"]
@@ -246,9 +252,9 @@ class _Fit:
 
 def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
     shapes = {
-        "multisine": (multisine.multisine_shape, multisine.DEFAULT_FREQUENCY_HZ),
-        "sine": (sine.sine_shape, sine.DEFAULT_FREQUENCY_HZ),
-        "step": (step.step_shape, step.DEFAULT_FREQUENCY_HZ),
+        "multisine": (signals.multisine_shape, signals.MULTISINE_FREQUENCY_HZ),
+        "sine": (signals.sine_shape, signals.SINE_FREQUENCY_HZ),
+        "step": (signals.step_shape, signals.STEP_FREQUENCY_HZ),
     }
     if wish.kind not in shapes:
         raise PlanRefused(f"unknown excitation {wish.kind!r}; there are {', '.join(shapes)}")
@@ -276,7 +282,7 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
     if wish.kind == "sine":
         return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))
     # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
-    counted = (multisine.DEFAULT_PERIODS - 1) / multisine.DEFAULT_FREQUENCY_HZ
+    counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
     return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
 
 

@@ -1,7 +1,7 @@
 """What an excitation must stay within, and what is known of the rig when it is planned."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from tdhil.run.excitation.speed_loop import Following
@@ -102,3 +102,115 @@ class RigGuess:
     def torque_swing_factor(self, mode: DriveMode) -> float:
         """Real swing of torque over the planned one, at worst: in speed mode a heavier shaft needs more."""
         return 1.0 if mode == "torque" else 1.0 / (1.0 - self.inertia_rel_error)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The reference of one segment, evaluated once a cycle.
+
+
+@dataclass(frozen=True)
+class PeriodicReference:
+    """Speed and feed-forward torque about one mean speed, from the segment's start.
+
+    speed(t)  = offset + Σ a_k cos(ω_k t + φ_k)
+    torque(t) = T_c + B·offset + Re Σ (J jω_k + B) a_k e^(j(ω_k t + φ_k))
+              = T_c + B·offset + Σ (B a_k cos(ω_k t + φ_k) − J ω_k a_k sin(ω_k t + φ_k))
+    """
+
+    offset_rad_s: float
+    period_s: float
+    lines_hz: tuple[float, ...]
+    amplitudes_rad_s: tuple[float, ...]
+    phases_rad: tuple[float, ...]
+    guess: RigGuess
+    _lines: tuple[tuple[float, float, float, float, float], ...] = field(init=False, repr=False, compare=False)
+    _mean_torque_nm: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        lines = []
+        for hertz, amplitude, phase in zip(self.lines_hz, self.amplitudes_rad_s, self.phases_rad, strict=True):
+            omega = 2.0 * math.pi * hertz
+            lines.append(
+                (
+                    omega,
+                    phase,
+                    amplitude,
+                    self.guess.viscous_nm_s_rad * amplitude,
+                    self.guess.inertia_kg_m2 * omega * amplitude,
+                )
+            )
+        object.__setattr__(self, "_lines", tuple(lines))
+        object.__setattr__(self, "_mean_torque_nm", self.guess.steady_torque_nm(self.offset_rad_s))
+
+    @property
+    def mean_torque_nm(self) -> float:
+        """Feed-forward torque that holds the mean speed, N·m."""
+        return self._mean_torque_nm
+
+    @property
+    def start_speed_rad_s(self) -> float:
+        """Speed at t = 0, where a transition must have brought the shaft."""
+        return self.reference(0.0)[0]
+
+    def reference(self, t_s: float) -> tuple[float, float]:
+        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` seconds after the segment's start."""
+        speed = self.offset_rad_s
+        torque = self._mean_torque_nm
+        for omega, phase, amplitude, in_phase, quadrature in self._lines:
+            argument = omega * t_s + phase
+            cosine = math.cos(argument)
+            speed += amplitude * cosine
+            torque += in_phase * cosine - quadrature * math.sin(argument)
+        return speed, torque
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From one speed to another without a step of acceleration, with its feed-forward torque.
+
+
+_SHORTEST_S = 2.0
+_TORQUE_SHARE = 0.5   # of what the limit leaves above friction: a transition is in no hurry
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Half a cosine: v(t) = v0 + (v1 − v0)(1 − cos(π t / D)) / 2, and T = J v̇ + B v + T_c."""
+
+    from_rad_s: float
+    to_rad_s: float
+    duration_s: float
+    guess: RigGuess
+
+    @property
+    def peak_acceleration_rad_s2(self) -> float:
+        return math.pi * abs(self.to_rad_s - self.from_rad_s) / (2.0 * self.duration_s)
+
+    def reference(self, t_s: float) -> tuple[float, float]:
+        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the end's steady values afterwards."""
+        if t_s >= self.duration_s:
+            return self.to_rad_s, self.guess.steady_torque_nm(self.to_rad_s)
+        rate = math.pi / self.duration_s
+        half = 0.5 * (self.to_rad_s - self.from_rad_s)
+        t = max(t_s, 0.0)
+        speed = self.from_rad_s + half * (1.0 - math.cos(rate * t))
+        acceleration = half * rate * math.sin(rate * t)
+        return speed, self.guess.inertia_kg_m2 * acceleration + self.guess.steady_torque_nm(speed)
+
+
+def make_transition(
+    from_rad_s: float, to_rad_s: float, limits: MachineLimits, guess: RigGuess, mode: DriveMode = "torque"
+) -> Transition:
+    """The quickest calm transition: at most half of the torque that friction leaves, and never under 2 s.
+
+    Raises PlanRefused if friction alone takes the torque.
+    """
+    friction = max(abs(guess.steady_torque_nm(from_rad_s)), abs(guess.steady_torque_nm(to_rad_s)))
+    room = _TORQUE_SHARE * (limits.usable_torque_nm - friction) / guess.torque_swing_factor(mode)
+    if room <= 0.0:
+        raise PlanRefused(
+            f"torque limit: friction takes {friction:g} N·m of the {limits.usable_torque_nm:g} N·m that a plan may use"
+        )
+    needed = math.pi * abs(to_rad_s - from_rad_s) * guess.inertia_kg_m2 / (2.0 * room)
+    if mode == "speed":
+        needed = max(needed, math.pi * abs(to_rad_s - from_rad_s) / (2.0 * limits.acceleration_rad_s2))
+    return Transition(from_rad_s, to_rad_s, max(_SHORTEST_S, needed), guess)

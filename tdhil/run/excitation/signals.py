@@ -1,5 +1,6 @@
 """A periodic motion before it is scaled: lines with relative amplitudes and phases, and the peaks they add up to."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,3 +78,76 @@ def begun_at_rest(shape: Shape, period_s: float, inertia_kg_m2: float, viscous_n
     torque = shape.torque_deviation(period_s, inertia_kg_m2, viscous_nm_s_rad)
     start = int(np.argmin(np.abs(torque)))
     return shape.shifted(start / _GRID)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Multisine: four lines in one period, phased for a low crest of speed and of torque.
+#
+# Why these lines (notes of the design; figures for the field-like rig, J 104 kg·m², lags 0.40 s and 0.15 s):
+#
+# - G(jω) = (J s + B)(1 + τ_w s)/(1 + τ_T s) e^(−d s) is J s (1 + s(τ_w − τ_T − d) + O(s²)) at low frequency: its
+# phase tells the lags' difference, its magnitude J and, at order ω², what the lags add to it. J is the limit of |G|/ω
+# towards zero, so the strongest lines belong low; the weaker, higher ones tell the slope that has to be taken out. -
+# Lines above 0.4 to 0.5 Hz make the filters' *structure* matter: were the speed filtered by a moving average and not
+# by a first-order lag, lines up to 0.5 Hz would bias J by 1.2 %, lines up to 0.4 Hz by 0.8 %, and three lines up to
+# 0.3 Hz by 0.4 % at a third more scatter. - A period of 10 s with lines from 0.1 Hz gives twice the periods of 20 s
+# with lines from 0.05 Hz, hence weights that are better known (degrees of freedom) and half the time lost to
+# settling, at the same Cramér-Rao bound.
+#
+# The phases minimise (crest of speed + crest of torque), found by a search over 60 starts with growing p-norms; the
+# crest of torque is 1.31 (a single sine: 1.41), speed spans 3.13 times its rms from peak to peak (a sine: 2.83).
+
+
+MULTISINE_FREQUENCY_HZ = 0.1   # of the lowest line
+DEFAULT_PERIODS = 11         # at each mean speed, the first of them for settling
+
+
+def multisine_shape() -> Shape:
+    """Harmonics 1 to 4, peak deviation 1."""
+    return unit_peak(
+        Shape(
+            harmonics=(1, 2, 3, 4),
+            amplitudes=(1.58, 0.85, 0.24, 0.24),
+            phases_rad=(5.38116627, 1.33755537, 0.43554371, 5.81670456),
+        )
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Sine: the paper's equation 8, ω₁(t) = A sin(2π f t) + B, one line about one offset.
+#
+# One line is two equations for inertia, friction, two lags and a skew: it tells the inertia only where the lags are
+# known.
+
+
+SINE_FREQUENCY_HZ = 0.1   # lowest tone of the paper's field test (section 5.2)
+
+
+def sine_shape() -> Shape:
+    """One line, amplitude 1; a sine is a cosine that is a quarter late."""
+    return Shape(harmonics=(1,), amplitudes=(1.0,), phases_rad=(1.5 * math.pi,))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Step: the paper's equation 9, A₀ before and A₁ after, repeated as a square wave about the offset.
+#
+# A true step of speed needs unbounded torque and saturates the drive, and a saturated drive identifies nothing. So
+# the square wave is band-limited: its odd harmonics 1 … 9, each (4/πm) sin(2π m f t), tapered by Lanczos' σ factors
+# sin(x)/x, x = π m / 11, which keep the overshoot of the truncated series (Gibbs) at about 1 %. It reaches the new
+# speed in about a tenth of a period.
+
+
+STEP_FREQUENCY_HZ = 0.05   # of the square wave: each level lasts 10 s
+_HARMONICS = (1, 3, 5, 7, 9)
+
+
+def step_shape() -> Shape:
+    """Odd harmonics of a square wave, peak deviation 1 (half of A₁ − A₀)."""
+    taper = [math.pi * m / (_HARMONICS[-1] + 2) for m in _HARMONICS]
+    return unit_peak(
+        Shape(
+            harmonics=_HARMONICS,
+            amplitudes=tuple(4.0 / (math.pi * m) * math.sin(x) / x for m, x in zip(_HARMONICS, taper, strict=True)),
+            phases_rad=(1.5 * math.pi,) * len(_HARMONICS),
+        )
+    )

@@ -6,17 +6,48 @@ in speed mode the reference goes to the drive's own loop.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from drivers.drive import Command, Mode, Sample
-from tdhil.protocol.control import MeanSpeedControl
-from tdhil.protocol.dither import dither, dither_peak
 from tdhil.recording.recording import Excitation, Segment
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import Bench
-from tdhil.run.excitation import Plan, PlannedSegment
-from tdhil.run.settings import MachineLimits
+from tdhil.run.excitation import Plan, PlannedSegment, RigGuess
+from tdhil.run.excitation.pulses import CALM_S, SwingPlan, Way
+from tdhil.run.settings import ControlAssumptions, MachineLimits
+from tdhil.run.stages.hold import MeanSpeedControl
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A slow small motion beside the excitation of speed mode, where the drive reports speed in coarse steps. Pure.
+#
+# Under speed control one period repeats the last, and so does the rounding of its reports to whole rpm, say: a
+# pattern that adds up on the excited lines instead of averaging out, and that no scatter between periods shows. A
+# triangle of a count or two, whose period has no whole ratio to the excitation's, makes every period round elsewhere.
+
+
+COUNTS = 2.0              # peak of the triangle, in counts of the reported speed
+COARSE_SHARE = 0.002      # of the window: finer counts than this need none
+MOST_SHARE = 0.015        # of the window: half of the margin that a plan keeps free at either end
+PERIODS = (math.sqrt(5.0) - 1.0) / 2.0
+"""Of the excitation's period: the golden ratio is the farthest from every whole ratio."""
+
+
+def dither_peak(resolution_rad_s: float, window_rad_s: float) -> float:
+    """Peak of the triangle, rad/s; 0 where the reported speed is fine enough."""
+    if resolution_rad_s < COARSE_SHARE * window_rad_s:
+        return 0.0
+    return min(COUNTS * resolution_rad_s, MOST_SHARE * window_rad_s)
+
+
+def dither(time_s: float, period_s: float, peak_rad_s: float) -> float:
+    """What is added to the speed setpoint, rad/s; begins at zero."""
+    turn = (time_s / (PERIODS * period_s) + 0.25) % 1.0
+    return peak_rad_s * (1.0 - 4.0 * abs(turn - 0.5))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 Reference = Callable[[float], tuple[float, float]]
 Announce = Callable[[Excitation], None]
@@ -172,3 +203,54 @@ class _Course:
     def _recorded(self) -> Segment:
         # The last period is whole when its last sample is there: the one before the cycle that would begin the next.
         return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._bench.period_s)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Stage 5 with torque pulses or coast-down: every way of the plan, and the calm behind each.
+#
+# A powered way follows its reference like any other motion. Coasting is zero torque until the shaft, by what the
+# reports may be late, is about to reach its lower speed; time alone would have to trust the rough friction.
+
+
+_LONGEST = 2.0            # times the planned coasting, at most: friction may have been taken too high
+
+
+def run_swings(
+    bench: Bench,
+    limits: MachineLimits,
+    plan: SwingPlan,
+    control: MeanSpeedControl | None,
+    assumptions: ControlAssumptions,
+    announce: Announce,
+) -> AcquireResult:
+    """All of it. Raises what the bench raises. The slow loop stands still while the shaft coasts."""
+    excitation = Excitation(plan.kind, plan.mode)
+    announce(excitation)
+    follower = Follower(bench, limits, Mode(plan.mode), control)
+    follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
+    for way in plan.ways:
+        if way.coasting:
+            _coast(bench, way, follower, assumptions)
+            follower.follow(_calm(way.to_rad_s, plan.guess), CALM_S)
+        else:
+            follower.follow(way.reference, way.duration_s + CALM_S)
+    return AcquireResult(excitation)
+
+
+def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float, float]]:
+    steady = speed_rad_s, guess.steady_torque_nm(speed_rad_s)
+    return lambda _: steady
+
+
+def _coast(bench: Bench, way: Way, follower: Follower, assumptions: ControlAssumptions) -> None:
+    """Zero torque down to the lower speed."""
+    command = Command(Mode.TORQUE, way.to_rad_s, 0.0)
+    # The report comes late, so that the shaft is slower already: by half of the longest plausible lag, say.
+    late_s = 0.5 * assumptions.largest_speed_lag_s + bench.period_s
+    stop_at = way.to_rad_s + late_s * way.guess.steady_torque_nm(way.to_rad_s) / way.guess.inertia_kg_m2
+    end_s = follower.time_s + _LONGEST * way.duration_s
+    while follower.time_s < end_s:
+        sample = bench.cycle(command)
+        follower.saw(sample, way.to_rad_s)
+        if sample.fresh and sample.speed_rad_s <= stop_at:
+            return

@@ -2,13 +2,202 @@
 
 from __future__ import annotations
 
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
 import numpy as np
 
-from tdhil.recording.recording import Excitation, Recording
+from tdhil.estimation.identify import identify
+from tdhil.estimation.result import Options
+from tdhil.recording.recording import Excitation, Recording, Segment
+from tdhil.run.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
-from tdhil.study.coverage_motion import Motion, motion, rough_guess
-from tdhil.study.coverage_shaft import Shaft, coloured, lag_weights, turn
+from tdhil.studies.coverage.workers import results
 
+# ---------------------------------------------------------------------------------------------------------------------
+# What the shaft is asked to do: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
+
+
+ROUGH_ERROR = 0.15        # the rough inertia is wrong by up to this share, uniformly, either way
+_FRICTION_ERROR = 0.03    # so is the rough friction: the steady holds of stages 2 to 4 tell it well
+_LEAD_S = 1.0             # steady speed before the excitation
+_TAIL_S = 1.0             # the excitation goes on after its last whole period, for what is read late
+
+
+@dataclass(frozen=True)
+class Motion:
+    """``target`` (steps, runs) rad/s and ``feed`` (steps, runs) N·m; ``segments`` per run, ``rough`` (runs,) kg·m²."""
+
+    target: FloatArray
+    feed: FloatArray
+    segments: tuple[tuple[Segment, ...], ...]
+    rough: FloatArray
+    step_s: float
+
+
+def rough_guess(plant: CoveragePlant, shares: FloatArray) -> RigGuess:
+    """What stages 1 to 4 would have left behind; ``shares`` (2,) in [−1, 1]: how wrong inertia and friction are."""
+    friction = 1.0 + _FRICTION_ERROR * float(shares[1])
+    return RigGuess(
+        plant.inertia_kg_m2 * (1.0 + ROUGH_ERROR * float(shares[0])),
+        plant.viscous_nm_s_rad * friction,
+        plant.coulomb_nm * friction,
+    )
+
+
+def plan_for(plant: CoveragePlant, guess: RigGuess, periods: int) -> Plan:
+    """The default multisine about two mean speeds: so many periods that count at each, after 10 s of settling."""
+    limits = MachineLimits(*plant.window_rad_s, plant.torque_limit_nm)
+    settle = max(1, math.ceil(10.0 * plant.lowest_hz - 1e-9))
+    return make_plan(limits, guess, ExcitationWish(frequency_hz=plant.lowest_hz, periods=settle + periods))
+
+
+def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> Motion:
+    """Every run's reference on the same grid, which depends on the plant only, not on which runs there are."""
+    plans = [plan_for(plant, guess, periods) for guess in guesses]
+    join = _join_s(plant, periods)
+    length = plans[0].segments[0].duration_s
+    starts = (_LEAD_S, _LEAD_S + length + join)
+    steps = round((starts[1] + length + _TAIL_S) / plant.step_s)
+    time: FloatArray = np.arange(steps, dtype=np.float64) * plant.step_s
+    target, feed = np.empty((len(time), len(plans))), np.empty((len(time), len(plans)))
+    for run, plan in enumerate(plans):
+        target[:, run], rate = _one(plan, time, starts, length, join)
+        guess = plan.guess
+        feed[:, run] = guess.inertia_kg_m2 * rate + guess.viscous_nm_s_rad * target[:, run] + guess.coulomb_nm
+    segments = tuple(
+        tuple(segment.recorded(start) for segment, start in zip(plan.segments, starts, strict=True)) for plan in plans
+    )
+    return Motion(target, feed, segments, np.array([guess.inertia_kg_m2 for guess in guesses]), plant.step_s)
+
+
+def _join_s(plant: CoveragePlant, periods: int) -> float:
+    """Duration of the transition, s: the longest that the most wrong rough guesses ask for, and a tenth more."""
+    longest = 0.0
+    for corner in ((-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)):
+        plan = plan_for(plant, rough_guess(plant, np.array(corner)), periods)
+        longest = max(longest, plan.transition(plan.segments[0].reference.start_speed_rad_s, 1).duration_s)
+    return math.ceil(11.0 * longest) / 10.0
+
+
+def _one(
+    plan: Plan, time: FloatArray, starts: tuple[float, float], length: float, join: float
+) -> tuple[FloatArray, FloatArray]:
+    """Speed and acceleration: steady, first segment, half a cosine, second segment."""
+    speed, rate = np.empty_like(time), np.zeros_like(time)
+    ends = [segment.reference.start_speed_rad_s for segment in plan.segments]
+    lead = time < starts[0] - 1e-9
+    speed[lead] = ends[0]
+    between = (time >= starts[0] + length - 1e-9) & (time < starts[1] - 1e-9)
+    turn = np.pi * (time[between] - starts[0] - length) / join
+    half = 0.5 * (ends[1] - ends[0])
+    speed[between], rate[between] = ends[0] + half * (1.0 - np.cos(turn)), half * np.pi / join * np.sin(turn)
+    insides = (~lead & (time < starts[0] + length - 1e-9), time >= starts[1] - 1e-9)
+    for segment, start, inside in zip(plan.segments, starts, insides, strict=True):
+        reference = segment.reference
+        omega = 2.0 * np.pi * np.asarray(reference.lines_hz)
+        angle = np.outer(time[inside] - start, omega) + np.asarray(reference.phases_rad)
+        amplitudes = np.asarray(reference.amplitudes_rad_s)
+        speed[inside] = reference.offset_rad_s + np.cos(angle) @ amplitudes
+        rate[inside] = -np.sin(angle) @ (omega * amplitudes)
+    return speed, rate
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The shaft of the benchmark, many runs at once, in fine steps.
+#
+# Between two steps every input is taken as a straight line; for that, a first-order lag y' = (u − y)/τ has the exact
+# recursion, with h = step/τ and a = e^(−h),
+#
+#     y₁ = a y₀ + g₀ u₀ + g₁ u₁,   g₀ = (1 − a)/h − a,   g₁ = 1 − (1 − a)/h.
+#
+# The shaft is such a lag of u = (T + load − T_c)/B with τ = J/B (positive speed, so that T_c is constant). A bend of
+# friction is part of u: known at the step's beginning, and at its end from the last two speeds by a straight line.
+# The motor follows its command through a short lag. The command is feed-forward from the rough inertia plus a slow PI
+# on the mean speed, K_p = Ĵ ω_b, K_i = K_p ω_b/4, ω_b = 0.2/0.4 s, on a speed that is as late as the report's delay;
+# it is renewed once a host cycle and held between.
+
+
+_BANDWIDTH_RAD_S = 0.2 / 0.4
+_LEAST_DELAY_S = 0.005
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """What truly happened, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
+
+    speed: FloatArray
+    torque: FloatArray
+    step_s: float
+
+
+def lag_weights(step_s: float, lag_s: float) -> tuple[float, float, float]:
+    """a, g₀, g₁ of the recursion above."""
+    h = step_s / lag_s
+    a, gone = float(np.exp(-h)), float(-np.expm1(-h))
+    return a, gone / h - a, 1.0 - gone / h
+
+
+def coloured(white: FloatArray, step_s: float, time_s: float) -> FloatArray:
+    """Unit variance, correlation e^(−|t|/time_s), stationary from the first row; ``white`` (steps, runs)."""
+    from scipy.signal import lfilter
+
+    keep = float(np.exp(-step_s / time_s))
+    drive = white * np.sqrt(1.0 - keep * keep)
+    drive[0] = white[0]
+    found: FloatArray = lfilter([1.0], [1.0, -keep], drive, axis=0)
+    return found
+
+
+def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatArray) -> Shaft:
+    """Step the shaft; ``load`` and ``ripple`` (steps, runs), N·m. Raises ValueError if the speed reaches zero."""
+    step = motion.step_s
+    keep, early, late = lag_weights(step, plant.inertia_kg_m2 / plant.viscous_nm_s_rad)
+    early, late = early / plant.viscous_nm_s_rad, late / plant.viscous_nm_s_rad
+    stay = float(np.exp(-step / plant.motor_lag_s))
+    seen_stay = float(np.exp(-step / max(plant.speed_report.total_delay_s, _LEAST_DELAY_S)))
+    held = max(1, round(plant.reading.command_s / step))
+    proportional = motion.rough * _BANDWIDTH_RAD_S
+    integral_step = proportional * (_BANDWIDTH_RAD_S / 4.0) * held * step
+    steps, runs = motion.target.shape
+    speed, torque = np.empty((steps, runs)), ripple
+    # from here on ``torque`` takes the ripple's place, and ``push`` the load's: nothing is stored twice
+    push = load
+    push -= plant.coulomb_nm
+    omega, motor = motion.target[0].copy(), motion.feed[0].copy()
+    seen, integral, command = omega.copy(), np.zeros(runs), motor.copy()
+    torque[0] += motor
+    push[0] += torque[0]
+    if plant.bend is not None:
+        push[0] -= plant.bend.torque(omega)
+    speed[0] = omega
+    limit = plant.torque_limit_nm
+    for n in range(steps - 1):
+        if n % held == 0:
+            error = motion.target[n] - seen
+            integral += integral_step * error
+            command = np.clip(motion.feed[n] + proportional * error + integral, -limit, limit)
+            pulled = (1.0 - stay) * command
+        seen *= seen_stay
+        seen += (1.0 - seen_stay) * omega
+        motor *= stay
+        motor += pulled
+        torque[n + 1] += motor
+        push[n + 1] += torque[n + 1]
+        if plant.bend is not None:
+            push[n + 1] -= plant.bend.torque(omega + (omega - speed[n - 1] if n else 0.0))
+        omega = keep * omega
+        omega += early * push[n]
+        omega += late * push[n + 1]
+        speed[n + 1] = omega
+    if speed.min() <= 0.0:
+        raise ValueError(f"{plant.name}: the speed reaches zero, where Coulomb friction is not constant")
+    return Shaft(speed, torque, step)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -> list[Recording]:
     """One recording per seed (a tuple of whole numbers, none of them negative)."""
@@ -98,3 +287,79 @@ def read(plant: CoveragePlant, asked: Motion, run: int, shaft: Shaft, stream: np
 
 def _rounded(signal: FloatArray, quantum: float) -> FloatArray:
     return np.round(signal / quantum) * quantum if quantum > 0.0 else signal
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The runs of the benchmark: simulated, identified, kept as a line each; over several processes where wanted.
+#
+# A run is named by (base seed, plant, number) and draws from its own stream, so the totals depend neither on the
+# number of processes nor on how runs are grouped.
+
+
+GROUP = 20     # runs simulated together: some 200 MB
+
+
+@dataclass(frozen=True)
+class Run:
+    """What identification said of one run; ``value``, ``low``, ``high`` in kg·m², None where it gave no number."""
+
+    plant: str
+    number: int
+    seconds: float
+    verdict: str
+    reason: str
+    value: float | None = None
+    low: float | None = None
+    high: float | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """Runs ``first`` … ``first + count − 1`` of one plant."""
+
+    plant: CoveragePlant
+    first: int
+    count: int
+    base_seed: int
+    periods: int
+    confidence: float
+
+
+def tasks(
+    plants: Iterable[CoveragePlant], seeds: int, base_seed: int, periods: int, confidence: float
+) -> list[Task]:
+    """Every plant's runs in groups."""
+    return [
+        Task(plant, first, min(GROUP, seeds - first), base_seed, periods, confidence)
+        for plant in plants
+        for first in range(0, seeds, GROUP)
+    ]
+
+
+def run_task(task: Task) -> tuple[Run, ...]:
+    """Simulate and identify one group."""
+    own = zlib.crc32(task.plant.name.encode())      # by name: a plant's runs don't depend on which others there are
+    numbers = range(task.first, task.first + task.count)
+    recordings = simulate(task.plant, [(task.base_seed, own, number) for number in numbers], task.periods)
+    options = Options(confidence=task.confidence)
+    found = []
+    for number, recording in zip(numbers, recordings, strict=True):
+        said = identify(recording, options)
+        seconds = float(recording.time_s[-1] - recording.time_s[0])
+        run = Run(task.plant.name, number, seconds, said.verdict.value, said.reason)
+        if said.inertia is not None:
+            inertia = said.inertia
+            run = Run(*_head(run), float(inertia.value), float(inertia.low), float(inertia.high))
+        found.append(run)
+    return tuple(found)
+
+
+def _head(run: Run) -> tuple[str, int, float, str, str]:
+    return run.plant, run.number, run.seconds, run.verdict, run.reason
+
+
+def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[Run, ...]]:
+    """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
+    if processes <= 1:
+        return map(run_task, wanted)
+    return results(run_task, wanted, processes)

@@ -7,24 +7,312 @@ inertia. Counted are the intervals that miss; bias and scatter are held against 
 from __future__ import annotations
 
 import time
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from profiles.model import DataModel, Finding, refuse_if
 from tdhil.studies.coverage.bound import cramer_rao
-from tdhil.studies.coverage.plants import CoveragePlant
-from tdhil.studies.study import Progress, Study, StudyOutcome
-from tdhil.study.coverage_draw import draw_coverage
-from tdhil.study.coverage_figures import PlantFigures, figures_of
-from tdhil.study.coverage_fleet import FLEET
-from tdhil.study.coverage_runs import Run, run_all, tasks
-from tdhil.study.coverage_said import about_table, plant_table, refusal_table, said
+from tdhil.studies.coverage.plants import FLEET, CoveragePlant
+from tdhil.studies.coverage.simulate import Run, run_all, tasks
+from tdhil.studies.field.tone import tidy
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One plant's figures from its runs, and the bounds of the proof held against them.
+
+
+ONE_SIDED = 0.99          # confidence of each bound of the miss rate
+MOST_REFUSED = 0.02
+_BIAS_FLOOR = 0.002
+_BIAS_ERRORS = 3.0
+_OVER_BOUND = 1.2
+_LEAST_MISSES = 0.4       # of the nominal miss rate: 2 % of 5 %
+
+
+@dataclass(frozen=True)
+class PlantFigures:
+    """Shares of the true inertia, but for rates, ratios and counts. None where no run gave a number or nothing applies.
+
+    ``miss_rate`` is over the runs that gave a number; a refusal is counted apart, as neither hit nor miss.
+    """
+
+    plant: CoveragePlant
+    runs: int
+    refused: int
+    misses: int
+    miss_rate: float | None
+    miss_low: float
+    miss_high: float
+    bias: float | None
+    bias_error: float | None
+    rmse: float | None
+    half_width: float | None
+    bound: float | None             # root of the Cramér-Rao bound
+    reasons: tuple[tuple[str, int], ...]
+    run_seconds: float
+
+    @property
+    def answered(self) -> int:
+        return self.runs - self.refused
+
+    @property
+    def over_bound(self) -> float | None:
+        """RMSE over the root of the Cramér-Rao bound, where the model is the truth and not degenerate."""
+        return self.rmse / self.bound if self.rmse is not None and self.bound and self.plant.bound_applies else None
+
+    def width_over_bound(self, quantile: float) -> float | None:
+        """Mean half-width over that of an estimator at the bound which knows structure and noise."""
+        return self.half_width / (quantile * self.bound) if self.half_width is not None and self.bound else None
+
+
+def clopper_pearson(hits: int, tries: int, one_sided: float = ONE_SIDED) -> tuple[float, float]:
+    """Bounds of a share, each exceeded with probability 1 − one_sided: quantiles of the beta distribution."""
+    from scipy.stats import beta
+
+    low = float(beta.ppf(1.0 - one_sided, hits, tries - hits + 1)) if hits > 0 else 0.0
+    high = float(beta.ppf(one_sided, hits + 1, tries - hits)) if hits < tries else 1.0
+    return low, high
+
+
+def figures_of(plant: CoveragePlant, runs: Sequence[Run], bound_kg_m2: float | None) -> PlantFigures:
+    """Added up in the order of the runs' numbers, so that the same runs give the same bits."""
+    ordered = sorted(runs, key=lambda run: run.number)
+    told = [
+        (run.value, run.low, run.high)
+        for run in ordered
+        if run.value is not None and run.low is not None and run.high is not None
+    ]
+    truth = plant.inertia_kg_m2
+    misses = sum(not low <= truth <= high for _, low, high in told)
+    low, high = clopper_pearson(misses, len(told))
+    error = np.array([value / truth - 1.0 for value, _, _ in told])
+    reasons = Counter(f"{run.verdict}: {run.reason}" for run in ordered if run.value is None)
+    return PlantFigures(
+        plant=plant,
+        runs=len(ordered),
+        refused=len(ordered) - len(told),
+        misses=misses,
+        miss_rate=misses / len(told) if told else None,
+        miss_low=low,
+        miss_high=high,
+        bias=float(error.mean()) if told else None,
+        bias_error=float(error.std(ddof=1) / np.sqrt(len(told))) if len(told) > 1 else None,
+        rmse=float(np.sqrt(np.mean(error**2))) if told else None,
+        half_width=float(np.mean([0.5 * (top - bottom) / truth for _, bottom, top in told])) if told else None,
+        bound=bound_kg_m2 / truth if bound_kg_m2 is not None else None,
+        reasons=tuple(reasons.most_common()),
+        run_seconds=float(np.mean([run.seconds for run in ordered])) if ordered else 0.0,
+    )
+
+
+def covers(found: PlantFigures, nominal: float) -> bool | None:
+    """Is the lower bound of the miss rate at most the nominal rate?"""
+    return None if found.miss_rate is None else found.miss_low <= nominal
+
+
+def not_too_wide(found: PlantFigures, nominal: float) -> bool | None:
+    """Could the miss rate be 2 % or more (of a nominal 5 %)? Only where the model is the truth."""
+    if found.miss_rate is None or not found.plant.model_true:
+        return None
+    return found.miss_high >= _LEAST_MISSES * nominal
+
+
+def answers(found: PlantFigures) -> bool | None:
+    """Is a number refused in 2 % of the runs at most (lower 99 % bound)? Only where the model is the truth."""
+    if not found.plant.model_true or found.runs == 0:
+        return None
+    return clopper_pearson(found.refused, found.runs)[0] <= MOST_REFUSED
+
+
+def unbiased(found: PlantFigures) -> bool | None:
+    """|bias| ≤ max(0.2 %, 3 Monte-Carlo standard errors)."""
+    if found.bias is None or found.bias_error is None:
+        return None
+    return abs(found.bias) <= max(_BIAS_FLOOR, _BIAS_ERRORS * found.bias_error)
+
+
+def efficient(found: PlantFigures) -> bool | None:
+    """RMSE ≤ 1.2 × the Cramér-Rao bound."""
+    return None if found.over_bound is None else found.over_bound <= _OVER_BOUND
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The benchmark in one picture: miss rate with its bounds, and how close the scatter comes to the least possible.
+
+
+_GOOD, _BAD, _LIMIT = "#1f5fa8", "#c0392b", "#555555"
+
+
+def draw_coverage(figure: Figure, found: Sequence[PlantFigures], nominal: float) -> None:
+    """Plants from top to bottom in both panels; what breaks a bound is red."""
+    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]})
+    names = [one.plant.name + ("" if one.plant.model_true else " *") for one in found]
+    _misses(left, found, nominal)
+    _ratios(right, found)
+    left.set_yticks(range(len(found)), names)
+    left.set_ylim(len(found) - 0.4, -0.6)
+    figure.text(0.01, 0.01, "* the lags' structure is not the model's", fontsize=8, color=_LIMIT)
+    figure.tight_layout(rect=(0.0, 0.03, 1.0, 1.0))
+
+
+def _misses(axes: Axes, found: Sequence[PlantFigures], nominal: float) -> None:
+    highest = 2.0 * nominal
+    for row, one in enumerate(found):
+        if one.miss_rate is None:
+            continue
+        fine = covers(one, nominal) is True and not_too_wide(one, nominal) is not False
+        colour = _GOOD if fine else _BAD
+        axes.plot([100.0 * one.miss_low, 100.0 * one.miss_high], [row, row], color=colour, linewidth=2.0)
+        axes.plot(100.0 * one.miss_rate, row, "o", color=colour, markersize=6)
+        highest = max(highest, one.miss_high)
+    axes.axvline(100.0 * nominal, color=_LIMIT, linestyle="--", linewidth=1.0)
+    axes.axvspan(40.0 * nominal, 100.0 * nominal, color="#e8eef5", zorder=0)
+    axes.set_xlim(0.0, min(100.0, 105.0 * highest))
+    tidy(axes, "intervals that miss the truth, % (99 % bounds)", "", f"Miss rate; nominal {nominal:.0%}")
+
+
+def _ratios(axes: Axes, found: Sequence[PlantFigures]) -> None:
+    highest = 1.5
+    for row, one in enumerate(found):
+        if one.over_bound is None:
+            axes.text(0.03, row, "no bound", va="center", fontsize=8, color=_LIMIT)
+            continue
+        colour = _GOOD if efficient(one) else _BAD
+        axes.barh(row, one.over_bound, height=0.55, color=colour)
+        axes.text(one.over_bound + 0.03, row, f"{one.over_bound:.2f}", va="center", fontsize=8)
+        highest = max(highest, one.over_bound + 0.35)
+    axes.axvline(1.0, color=_LIMIT, linewidth=1.0)
+    axes.axvline(1.2, color=_LIMIT, linestyle="--", linewidth=1.0)
+    axes.set_xlim(0.0, highest)
+    axes.tick_params(axis="y", labelleft=False)
+    tidy(axes, "RMSE / Cramér-Rao bound", "", "Scatter; limit 1.2")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The benchmark in tables and statements.
+
+
+def normal_quantile(confidence: float) -> float:
+    """Two-sided quantile of the normal distribution."""
+    from scipy.stats import norm
+
+    return float(norm.ppf(0.5 + 0.5 * confidence))
+
+
+def plant_table(found: Sequence[PlantFigures], confidence: float) -> ResultTable:
+    """One row a plant. Shares in percent of the true inertia; rates in percent of the runs that gave a number."""
+    quantile = normal_quantile(confidence)
+    columns = (
+        "plant", "inertia_kg_m2", "model_true", "runs", "refused_percent", "miss_percent", "miss_low99_percent",
+        "miss_high99_percent", "bias_percent", "bias_standard_error_percent", "rmse_percent", "half_width_percent",
+        "bound_percent", "rmse_over_bound", "width_over_best",
+    )
+    return ResultTable("coverage", columns, tuple(_row(one, quantile) for one in found))
+
+
+def _row(one: PlantFigures, quantile: float) -> tuple[Cell, ...]:
+    return (
+        one.plant.name,
+        one.plant.inertia_kg_m2,
+        ("degenerate" if one.plant.degenerate else "yes") if one.plant.model_true else "no",
+        one.runs,
+        _percent(one.refused / one.runs),
+        _percent(one.miss_rate),
+        _percent(one.miss_low),
+        _percent(one.miss_high),
+        _percent(one.bias),
+        _percent(one.bias_error),
+        _percent(one.rmse),
+        _percent(one.half_width),
+        _percent(one.bound),
+        _figures(one.over_bound),
+        _figures(one.width_over_bound(quantile)),
+    )
+
+
+def about_table(found: Sequence[PlantFigures]) -> ResultTable:
+    """What each plant is."""
+    columns = ("plant", "about", "speed_delay_s", "torque_delay_s", "skew_s", "rate_hz", "run_s")
+    rows = tuple(
+        (
+            one.plant.name, one.plant.about, one.plant.speed_report.total_delay_s,
+            one.plant.torque_report.total_delay_s, round(one.plant.skew_s, 6), one.plant.reading.rate_hz,
+            round(one.run_seconds, 1),
+        )
+        for one in found
+    )
+    return ResultTable("plants", columns, rows)
+
+
+def refusal_table(found: Sequence[PlantFigures]) -> ResultTable:
+    """Why runs gave no number, the most frequent reasons first."""
+    rows = tuple((one.plant.name, count, reason) for one in found for reason, count in one.reasons[:5])
+    return ResultTable("refusals", ("plant", "runs", "reason"), rows)
+
+
+def said(found: Sequence[PlantFigures], confidence: float) -> tuple[Statement, ...]:
+    """The four bounds, plant by plant."""
+    return tuple(statement for one in found for statement in _said_of(one, 1.0 - confidence))
+
+
+def _said_of(one: PlantFigures, nominal: float) -> list[Statement]:
+    name = one.plant.name
+    told = f"{one.misses} of {one.answered} missed"
+    statements = [
+        Statement(
+            f"{name}: lower 99 % bound of the miss rate",
+            f"≤ {nominal:.3g}",
+            f"{one.miss_low:.3f} ({told})",
+            covers(one, nominal),
+        )
+    ]
+    if one.plant.model_true:
+        statements.append(
+            Statement(
+                f"{name}: the miss rate is not below {0.4 * nominal:.3g} (upper 99 % bound)",
+                f"≥ {0.4 * nominal:.3g}",
+                f"{one.miss_high:.3f} ({told})",
+                not_too_wide(one, nominal),
+            )
+        )
+        statements.append(
+            Statement(
+                f"{name}: runs refused though the model is the truth", f"≤ {MOST_REFUSED:.0%} (lower 99 % bound)",
+                f"{one.refused} of {one.runs}", answers(one),
+            )
+        )
+    bias = "no run gave a number"
+    if one.bias is not None and one.bias_error is not None:
+        bias = f"{one.bias:+.3%} ± {one.bias_error:.3%}"
+    statements.append(
+        Statement(f"{name}: |bias|", "≤ max(0.2 %, 3 Monte-Carlo standard errors)", bias, unbiased(one))
+    )
+    if one.over_bound is not None:
+        statements.append(
+            Statement(f"{name}: RMSE over the Cramér-Rao bound", "≤ 1.2", f"{one.over_bound:.3f}", efficient(one))
+        )
+    return statements
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else round(100.0 * share, 4)
+
+
+def _figures(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class CoverageSettings(DataModel):
     """How many runs, of which plants, how long, at what confidence."""

@@ -12,14 +12,188 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tdhil.recording.recording import FloatArray
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
-from tdhil.studies.field.settings import LoopPair, ScatterSettings
-from tdhil.studies.field.tone import Scatter, periods_for, scatter
+from tdhil.studies.field.settings import LoopPair, ScatterSettings, SimulatedRig, ToneSweepSettings
+from tdhil.studies.field.tone import (
+    PUBLISHED_STYLE,
+    Amplitudes,
+    Scatter,
+    amplitudes,
+    colour,
+    periods_for,
+    scatter,
+    tidy,
+)
 from tdhil.studies.study import Progress, ResultTable, Statement, StudyOutcome
-from tdhil.study.field_draw import colour, tidy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The drive's speed loop as a linear one: what amplitudes theory expects, to set beside those from the bus.
+#
+# ::
+#
+#     reference ──►(+)──► K_p + K_i/s ──► 1/(1 + t s) ──► 1/(J s + B) ──┬──► speed ──► 1/(1 + τ_w s) ──► reported
+#                   ▲(−)                                                │
+#                   └────────────── 1/(1 + τ_f s) ◄─────────────────────┘
+#
+#     speed/reference = C P / (1 + C P F),    C = (K_p + K_i/s)/(1 + t s),  P = 1/(J s + B),  F = 1/(1 + τ_f s)
+#
+# Coulomb friction is constant while the shaft turns one way, and drops out. K_p in N·m·s/rad, K_i in N·m/rad. Written
+# here and not taken from the simulator: two derivations that agree are worth more than one.
+
+
+def gain(
+    rig: SimulatedRig, hertz: FloatArray | float, kp: FloatArray | float, ki: FloatArray | float, *, reported: bool
+) -> FloatArray:
+    """Output amplitude over input amplitude, broadcast over the arguments; of the shaft, or of what is reported."""
+    s = 2j * np.pi * np.asarray(hertz, dtype=np.float64)
+    control = (np.asarray(kp) + np.asarray(ki) / s) / (1.0 + rig.loop_torque_lag_s * s)
+    forward = control / (rig.inertia_kg_m2 * s + rig.viscous_nm_s_rad)
+    closed = forward / (1.0 + forward / (1.0 + rig.loop_filter_s * s))
+    if reported:
+        closed = closed / (1.0 + rig.speed_lag_s * s)
+    size: FloatArray = np.abs(np.asarray(closed, dtype=np.complex128))
+    return size
+
+
+def tones_with_steady_rise(rig: SimulatedRig, kp: float, ki_values: tuple[float, ...]) -> tuple[int, int]:
+    """At how many of how many tones from 0.05 to 1 Hz |gain − 1| rises throughout ``ki_values`` (figure 21)."""
+    tones = np.linspace(0.05, 1.0, 96)
+    grid = np.linspace(min(ki_values), max(ki_values), 60)
+    away = np.abs(gain(rig, tones[:, None], kp, grid[None, :], reported=True) - 1.0)
+    return int(np.sum(np.all(np.diff(away, axis=1) > 0.0, axis=1))), len(tones)
+
+
+def best_kp(rig: SimulatedRig, hertz: float, ki: float, low: float, high: float) -> float:
+    """The P between ``low`` and ``high`` at which |gain − 1| of the reported speed is least; an edge if it is there."""
+    grid = np.geomspace(low, high, 400)
+    return float(grid[int(np.argmin(np.abs(gain(rig, hertz, grid, ki, reported=True) - 1.0)))])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Figure 23: amplitude of the speed, in and out, over the tone: a low-pass.
+
+
+PUBLISHED_OUTPUT = {0.1: 1.3492, 1.0: 0.0992}
+"""Tone, Hz: output amplitude, rad/s."""
+PUBLISHED_DIFFERENCE = {1.0: 0.8414}
+
+
+@dataclass
+class ToneSweep:
+    """`tdhil study figure23`."""
+
+    bench: FieldBench
+    name: str = "figure23"
+    title: str = "Field rig: input and output amplitude over the tone"
+
+    @property
+    def settings_model(self) -> type[ToneSweepSettings]:
+        return ToneSweepSettings
+
+    def run(self, settings: ToneSweepSettings, progress: Progress) -> StudyOutcome:
+        """One run a tone."""
+        tones = sorted(settings.frequencies_hz)
+        found, simulated_s = [], 0.0
+        for index, hertz in enumerate(tones):
+            wish = FieldRun(
+                settings.rig, hertz, settings.kp_nm_s_rad, settings.ki_nm_rad, settings.seed + index,
+                amplitude_rad_s=settings.amplitude_rad_s, offset_rad_s=settings.offset_rad_s,
+                periods=periods_for(hertz, settings.measured_s), rate_hz=settings.rate_hz,
+                torque_limit_nm=settings.torque_limit_nm,
+            )
+            recording = self.bench.run(wish, part_of(progress, index, len(tones), f"{hertz:g} Hz"))
+            found.append(amplitudes(recording))
+            simulated_s += float(recording.time_s[-1] - recording.time_s[0])
+        columns = (
+            "frequency_hz", "input_rad_s", "output_rad_s", "difference_rad_s", "output_sd_rad_s",
+            "linear_loop_output_rad_s", "published_output_rad_s", "published_difference_rad_s", "share_at_limit",
+        )
+        rows = tuple(
+            (hertz, a.input_rad_s, a.output_rad_s, a.difference_rad_s, a.sd_rad_s,
+             a.input_rad_s * float(gain(settings.rig, hertz, settings.kp_nm_s_rad, settings.ki_nm_rad, reported=True)),
+             PUBLISHED_OUTPUT.get(round(hertz, 6)), PUBLISHED_DIFFERENCE.get(round(hertz, 6)), a.limited)
+            for hertz, a in zip(tones, found, strict=True)
+        )
+        return StudyOutcome(
+            self.name, self.title, (ResultTable("amplitudes", columns, rows),), _tone_texts(settings, tones, found),
+            document={"runs": [dict(zip(columns, row, strict=True)) for row in rows]},
+            simulated_s=simulated_s,
+            draw=lambda figure: _draw_tones(figure, settings, tones, found),
+            figure_size_in=(11.0, 4.8),
+        )
+
+
+def closest_loop(settings: ToneSweepSettings) -> tuple[float, float, float, float]:
+    """P and I within the published sweeps that come closest to the two published outputs with one input amplitude.
+
+    Returns P, I and the outputs at 0.1 and 1 Hz, rad/s. Closest: least greater error of the two logarithms.
+    """
+    kp, ki = np.meshgrid(np.geomspace(150.0, 1500.0, 120), np.geomspace(200.0, 2500.0, 120), indexing="ij")
+    low, high = (settings.amplitude_rad_s * gain(settings.rig, hertz, kp, ki, reported=True) for hertz in (0.1, 1.0))
+    error = np.maximum(np.abs(np.log(low / PUBLISHED_OUTPUT[0.1])), np.abs(np.log(high / PUBLISHED_OUTPUT[1.0])))
+    best = np.unravel_index(int(np.argmin(error)), error.shape)
+    return float(kp[best]), float(ki[best]), float(low[best]), float(high[best])
+
+
+def _tone_texts(settings: ToneSweepSettings, tones: list[float], found: list[Amplitudes]) -> tuple[Statement, ...]:
+    output = np.array([one.output_rad_s for one in found])
+    difference = np.array([one.difference_rad_s for one in found])
+    ratio = output / np.array([one.input_rad_s for one in found])
+    kp, ki, low, high = closest_loop(settings)
+    ends = f"from {tones[0]:g} to {tones[-1]:g} Hz"
+    return (
+        Statement(
+            "the output falls steadily with the tone", "1.3492 to 0.0992 rad/s from 0.1 to 1 Hz",
+            f"{output[0]:.4f} to {output[-1]:.4f} rad/s {ends}", bool(np.all(np.diff(output) < 0.0)),
+        ),
+        Statement(
+            "input minus output grows with the tone", "small at low tones, 0.8414 rad/s at 1 Hz",
+            f"{difference[0]:.4f} to {difference[-1]:.4f} rad/s {ends}; below zero where the loop overshoots",
+            bool(np.all(np.diff(difference) > 0.0)),
+        ),
+        Statement(
+            "it is a low-pass", "'consistent with a low-pass system'",
+            f"gain {ratio[0]:.3f} at {tones[0]:g} Hz, {ratio[-1]:.3f} at {tones[-1]:g} Hz",
+            bool(ratio[0] > 0.9 and ratio[-1] < 0.5 * ratio[0]),
+        ),
+        Statement(
+            "output 1.3492 rad/s at 0.1 Hz and 0.0992 at 1 Hz", "input at 1 Hz: 0.0992 + 0.8414 = 0.9406 rad/s",
+            f"{low:.3f} and {high:.4f} at best (P {kp:.0f}, I {ki:.0f}, linear loop): no loop with P and I in the "
+            "published sweeps meets both; the input at 0.1 Hz must have been another, and is not given",
+            None,
+        ),
+    )
+
+
+def _draw_tones(figure: Figure, settings: ToneSweepSettings, tones: list[float], found: list[Amplitudes]) -> None:
+    left, right = figure.subplots(1, 2)
+    grid = np.geomspace(min(tones), max(tones), 300)
+    loop = settings.amplitude_rad_s * gain(settings.rig, grid, settings.kp_nm_s_rad, settings.ki_nm_rad, reported=True)
+    left.plot(tones, [one.input_rad_s for one in found], "s-", color="#444444", markersize=4, label="input (commanded)")
+    left.plot(tones, [one.output_rad_s for one in found], "o", color=colour(0), label="output (reported), on the bus")
+    left.plot(grid, loop, color=colour(0), linewidth=1.2, label="linear loop")
+    left.plot(list(PUBLISHED_OUTPUT), list(PUBLISHED_OUTPUT.values()), label="published output", **PUBLISHED_STYLE)
+    right.plot(tones, [one.difference_rad_s for one in found], "o", color=colour(1), label="on the bus")
+    right.plot(grid, settings.amplitude_rad_s - loop, color=colour(1), linewidth=1.2, label="linear loop")
+    right.plot(
+        list(PUBLISHED_DIFFERENCE), list(PUBLISHED_DIFFERENCE.values()), label="published difference", **PUBLISHED_STYLE
+    )
+    right.axhline(0.0, color="#888888", linewidth=0.8)
+    title = f"P {settings.kp_nm_s_rad:g}, I {settings.ki_nm_rad:g}: input and output"
+    tidy(left, "tone, Hz", "amplitude, rad/s", title)
+    tidy(right, "tone, Hz", "input − output, rad/s", "Difference of the amplitudes")
+    left.set_ylim(bottom=0.0)
+    for axes in (left, right):
+        axes.legend(fontsize=8)
+    figure.tight_layout()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 OUTSIDE = 3.0
 """Slopes differ if they are further apart than so many times the spread of repeats."""

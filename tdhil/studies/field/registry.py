@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from tdhil.studies.field.bench import FieldBench
 from tdhil.studies.field.gains import KiSweep, KpSweep
-from tdhil.studies.field.loops import LoopScatter
+from tdhil.studies.field.loops import LoopScatter, ToneSweep
 from tdhil.studies.field.slopes import FieldSlopes
 from tdhil.studies.study import Study
-from tdhil.study.field_tones import ToneSweep
 
 
 def field_studies(bench: FieldBench) -> tuple[Study, ...]:

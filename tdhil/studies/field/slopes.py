@@ -2,28 +2,373 @@
 
 Published are T = 105.379 α + 73.216, 116.557 α + 70.467, 135.622 α + 70.598 and 185.757 α + 73.212 at 0.1, 0.3, 0.5 and
 1 Hz. The same method gives about the same four numbers on the simulated rig, whose one inertia does not change: what
-changes with the tone is what the reporting lags do to the slope (`tdhil.studies.joint`).
+changes with the tone is what the reporting lags do to the slope (`tdhil.studies.field.slopes`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from tdhil.estimation.identify import identify
-from tdhil.estimation.result import Identification
-from tdhil.identify.options import Options
-from tdhil.recording.recording import FloatArray
+from tdhil.estimation import Estimate, Identification, Options, identify
+from tdhil.recording.recording import Excitation, FloatArray, LagPrior, Recording, Segment
+from tdhil.studies.coverage.study import normal_quantile
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.settings import SlopeSettings
-from tdhil.studies.field.tone import excited, line_slope, scatter
-from tdhil.studies.study import Progress, ResultTable, StudyOutcome
-from tdhil.study.field_draw_slopes import SlopePicture, draw_slopes
-from tdhil.study.field_singly import Alone, alone_statements, alone_table, each_alone
-from tdhil.study.field_slopes_said import Record, percent, said_of_slopes
-from tdhil.study.joint import joined, slope_of
+from tdhil.studies.field.tone import PUBLISHED_STYLE, Scatter, colour, excited, line_slope, scatter, tidy
+from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One tone at a time: not identifiable with nothing known of the lags, and with the joint fit's lags one J for all.
+
+
+SPREAD = 0.01
+"""How far apart the tones' inertias may be, as a share of their mean; the paper's slopes are 76 % apart."""
+
+
+@dataclass(frozen=True)
+class Alone:
+    """A tone by itself: with nothing known of the lags, and with them stated."""
+
+    hertz: float
+    unknown: Identification
+    stated: Identification
+
+
+def stated_lags(joint: Identification, confidence: float) -> LagPrior | None:
+    """The joint fit's lags as a drive would state them; None where it has none."""
+    if joint.speed_lag_s is None or joint.torque_lag_s is None:
+        return None
+    speed, torque = joint.speed_lag_s, joint.torque_lag_s
+    return LagPrior(
+        speed.value, _sd(speed, confidence), torque.value, _sd(torque, confidence), "the joint fit of all tones"
+    )
+
+
+def _sd(one: Estimate, confidence: float) -> float:
+    return 0.5 * (one.high - one.low) / normal_quantile(confidence)
+
+
+def each_alone(recordings: Sequence[Recording], joint: Identification, confidence: float) -> tuple[Alone, ...]:
+    """Every recording identified by itself, twice; () without a joint fit."""
+    prior = stated_lags(joint, confidence)
+    if prior is None:
+        return ()
+    found = []
+    for recording in recordings:
+        if recording.excitation is None:
+            continue
+        hertz = recording.excitation.segments[0].lines_hz[0]
+        options = Options(confidence=confidence)
+        found.append(Alone(hertz, identify(recording, options), identify(replace(recording, lag_prior=prior), options)))
+    return tuple(found)
+
+
+def alone_table(found: Sequence[Alone]) -> ResultTable:
+    """One row a tone."""
+    rows: list[tuple[Cell, ...]] = []
+    for one in found:
+        inertia = one.stated.inertia
+        values = (None, None, None) if inertia is None else (inertia.value, inertia.low, inertia.high)
+        rows.append((one.hertz, one.unknown.verdict.value, one.stated.verdict.value, *values))
+    columns = ("frequency_hz", "verdict_nothing_known", "verdict_lags_stated", "inertia_kg_m2", "low", "high")
+    return ResultTable("one_tone_alone", columns, tuple(rows))
+
+
+def alone_statements(found: Sequence[Alone], true_inertia: float) -> list[Statement]:
+    """Refused where nothing is known; one J where the lags are."""
+    if not found:
+        return []
+    refused = [one.unknown.inertia is None for one in found]
+    inertias = [one.stated.inertia for one in found if one.stated.inertia is not None]
+    values = np.array([inertia.value for inertia in inertias])
+    spread = float(np.ptp(values) / values.mean()) if len(values) else float("nan")
+    covered = sum(inertia.low <= true_inertia <= inertia.high for inertia in inertias)
+    return [
+        Statement(
+            "one tone with nothing known of the lags identifies no inertia", "a number for each of four tones",
+            f"{sum(refused)} of {len(found)} refused", all(refused),
+        ),
+        Statement(
+            f"each tone alone, the joint fit's lags stated: one inertia, within {SPREAD:.0%}",
+            "76 % from the lowest tone to the highest",
+            f"{', '.join(f'{value:.2f}' for value in values)} kg·m²: {spread:.2%} apart; {covered} of {len(found)} "
+            "intervals cover the rig's",
+            len(inertias) == len(found) and spread <= SPREAD and covered == len(found),
+        ),
+    ]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What figure 22 claims, whether it holds here, and where it contradicts itself.
+
+
+PUBLISHED = {0.1: (105.379, 73.216), 0.3: (116.557, 70.467), 0.5: (135.622, 70.598), 1.0: (185.757, 73.212)}
+"""Tone, Hz: slope, kg·m², and intercept, N·m (figure 22)."""
+
+CLOSE = 0.03
+"""How close to the published slopes ours shall be."""
+
+CURVE_CLOSE = 0.01
+"""How close the joint fit's curve shall be to our own slopes at the tones, where noise in α takes nothing off them."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One tone as recorded and as the paper's method reads it."""
+
+    hertz: float
+    mode: str
+    points: Scatter
+    at_the_tone: float                 # kg·m²; the slope without what noise in α takes off it
+    mean_speed_rad_s: float
+
+    @property
+    def published(self) -> tuple[float | None, float | None]:
+        return PUBLISHED.get(round(self.hertz, 6), (None, None))
+
+
+def said_of_slopes(
+    settings: SlopeSettings, records: list[Record], joint: Identification, curve: FloatArray | None
+) -> tuple[Statement, ...]:
+    """Slopes tone by tone, the one inertia behind them, and what stays open. ``curve``: the joint fit at the tones."""
+    return (*_slope_statements(records), *_joint_statements(settings, joint, records, curve), *_open(records))
+
+
+def percent(ours: float, published: float | None) -> float | None:
+    """How far ours is off, in percent; None where nothing was published."""
+    return None if published is None else 100.0 * (ours / published - 1.0)
+
+
+def _slope_statements(records: list[Record]) -> list[Statement]:
+    found = []
+    for record in records:
+        ours, published = record.points.fit.inertia_kg_m2, record.published[0]
+        if published is not None:
+            text = f"the paper's method gives the published slope at {record.hertz:g} Hz, within {CLOSE:.0%}"
+            found.append(Statement(
+                text, f"{published:g} kg·m²", f"{ours:.3f} kg·m² ({percent(ours, published):+.2f} %)",
+                abs(ours / published - 1.0) <= CLOSE,
+            ))
+    ordered = [record.points.fit.inertia_kg_m2 for record in sorted(records, key=lambda record: record.hertz)]
+    growth = ordered[-1] / ordered[0] - 1.0
+    found.append(Statement(
+        "the fitted slope grows with the tone", "by 76 % from 0.1 to 1 Hz, on one rig", f"by {growth:.0%}, on one rig",
+        bool(np.all(np.diff(ordered) > 0.0)),
+    ))
+    return found
+
+
+def _joint_statements(
+    settings: SlopeSettings, joint: Identification, records: list[Record], curve: FloatArray | None
+) -> list[Statement]:
+    true = settings.rig.inertia_kg_m2
+    found = joint.inertia
+    text = "one inertia behind all records: the joint fit's interval covers the rig's"
+    if found is None or curve is None:
+        return [Statement(text, "none given", f"no number: {joint.reason}", False)]
+    value = f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f}) kg·m² for {true:g}"
+    off = float(np.max(np.abs(curve / np.array([record.at_the_tone for record in records]) - 1.0)))
+    noise = max(1.0 - record.points.fit.inertia_kg_m2 / record.at_the_tone for record in records)
+    return [
+        Statement(text, "no reference inertia is published", value, found.low <= true <= found.high),
+        Statement(
+            "one line, with that inertia and the reporting lags, passes through all slopes",
+            "J 103.75, lags 0.403 and 0.151 s: 0.10 kg·m² RMS from the four",
+            f"within {off:.1%} of ours, lags {_value(joint.speed_lag_s)} and {_value(joint.torque_lag_s)} s; noise in "
+            f"α takes up to {noise:.1%} more off the fitted slopes",
+            off <= CURVE_CLOSE,
+        ),
+    ]
+
+
+def _open(records: list[Record]) -> list[Statement]:
+    """Where the paper contradicts itself, or leaves out what would decide."""
+    lowest = min(records, key=lambda record: record.hertz)
+    level = f"{lowest.points.fit.intercept_nm:.1f} N·m at a mean of {lowest.mean_speed_rad_s:.2f} rad/s"
+    return [
+        Statement(
+            "a lower tone identifies the inertia better",
+            "section 5.2 says so; Table 6 shows the reverse (885.6 at 0.1 Hz, 895.3 at 1 Hz, of 900)",
+            "both are right: lags bend the field slopes at high tones, the start from rest the simulated ones at low",
+            None,
+        ),
+        Statement(
+            "the intercept is the damping", "70.5 to 73.2 N·m",
+            f"it is Coulomb friction + B · mean speed, {level}; the paper's mean speed is not given", None,
+        ),
+        Statement(
+            "tones of the field test", "0.05, 0.1, 0.5, 1 Hz in the text; the fits are at 0.1, 0.3, 0.5, 1 Hz",
+            "those of the fits are used", None,
+        ),
+    ]
+
+
+def _value(estimate: object) -> str:
+    value = getattr(estimate, "value", None)
+    return "-" if value is None else f"{value:.3f}"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Four records of one rig, one tone each: every one alone leaves the inertia open, together they tell it.
+#
+# A tone is two equations for the five unknowns J, B, τ_w, τ_T and skew. The records are laid end to end in time as one
+# Recording with a segment each, and identified as any other: the same likelihood, on the lines of all four, with the
+# levels of their mean speeds for the friction.
+
+
+_BETWEEN_S = 10.0      # of nothing, between two records
+_AROUND_S = 1.0        # kept before and after a record's segments
+
+
+def joined(recordings: Sequence[Recording]) -> Recording:
+    """One Recording of all: times shifted, each torque less its own offset; levels and ramps are left out."""
+    times, speeds, torques, fresh, limited = [], [], [], [], []
+    segments: list[Segment] = []
+    begin_s = 0.0
+    for recording in recordings:
+        if recording.excitation is None or not recording.excitation.segments:
+            raise ValueError("a record without excitation can't be joined to others")
+        own = recording.excitation.segments
+        first_s, last_s = own[0].start_s - _AROUND_S, own[-1].end_s + _AROUND_S
+        keep = (recording.time_s >= first_s) & (recording.time_s <= last_s)
+        shift_s = begin_s - first_s
+        times.append(recording.time_s[keep] + shift_s)
+        speeds.append(recording.speed_rad_s[keep])
+        torques.append(recording.torque_nm[keep] - recording.torque_offset_nm)
+        fresh.append(recording.fresh[keep])
+        limited.append(recording.limited[keep])
+        segments += [replace(part, start_s=part.start_s + shift_s, end_s=part.end_s + shift_s) for part in own]
+        begin_s += last_s - first_s + _BETWEEN_S
+    kinds = {recording.excitation.kind for recording in recordings if recording.excitation is not None}
+    modes = {recording.excitation.mode for recording in recordings if recording.excitation is not None}
+    return replace(
+        recordings[0],
+        time_s=np.concatenate(times),
+        speed_rad_s=np.concatenate(speeds),
+        torque_nm=np.concatenate(torques),
+        fresh=np.concatenate(fresh),
+        limited=np.concatenate(limited),
+        excitation=Excitation(kinds.pop() if len(kinds) == 1 else "mixed", "+".join(sorted(modes)), tuple(segments)),
+        levels=(),
+        ramps=(),
+        stages=(),
+        torque_offset_nm=0.0,
+    )
+
+
+def expected_slope(
+    hertz: FloatArray, inertia: float, viscous: float, speed_lag_s: float, torque_lag_s: float, skew_s: float
+) -> FloatArray:
+    """The slope T = slope·α + b that least squares finds on a tone, kg·m², (K,).
+
+    Of T cos-like and α = dω/dt, both as reported, the slope is Re(T α*)/|α|² = Re(G(s)/s) at s = jω; without skew
+
+        J (1 + ω² τ_w τ_T)/(1 + ω² τ_T²) + B (τ_w − τ_T)/(1 + ω² τ_T²).
+
+    Averaging both over the same 0.1 s changes nothing in it.
+    """
+    s = (2j * np.pi * np.asarray(hertz, dtype=np.float64)).astype(np.complex128)
+    seen = (inertia * s + viscous) * (1.0 + speed_lag_s * s) / (1.0 + torque_lag_s * s) * np.exp(-skew_s * s)
+    slope: FloatArray = (seen / s).real
+    return slope
+
+
+def slope_of(identification: Identification, hertz: FloatArray) -> FloatArray | None:
+    """The same for a joint fit; None where it gave no number."""
+    found = identification
+    parts = (found.viscous_nm_s_rad, found.speed_lag_s, found.torque_lag_s, found.skew_s)
+    if found.inertia is None or any(part is None for part in parts):
+        return None
+    viscous, speed_lag, torque_lag, skew = (part.value for part in parts if part is not None)
+    return expected_slope(hertz, found.inertia.value, viscous, speed_lag, torque_lag, skew)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The picture of figure 22: left as in the paper, right what the four slopes have in common.
+
+
+class DrawnRecord(Protocol):
+    """What is drawn of one tone."""
+
+    @property
+    def hertz(self) -> float: ...
+
+    @property
+    def points(self) -> Scatter: ...
+
+    @property
+    def published(self) -> tuple[float | None, float | None]: ...
+
+
+@dataclass(frozen=True)
+class SlopePicture:
+    """All that is drawn; ``true_inertia`` is the simulated rig's, kg·m²."""
+
+    records: Sequence[DrawnRecord]
+    joint: Identification
+    true_inertia: float
+
+
+def draw_slopes(figure: Figure, picture: SlopePicture) -> None:
+    """Scatter with its fitted lines; slope over tone with the curve of the joint fit."""
+    left, right = figure.subplots(1, 2)
+    _scatter(left, picture)
+    _slopes(right, picture)
+    figure.tight_layout()
+
+
+def _scatter(axes: Axes, picture: SlopePicture) -> None:
+    for index, record in enumerate(picture.records):
+        alpha, fit = record.points.acceleration_rad_s2, record.points.fit
+        axes.plot(alpha, record.points.torque_nm, ".", color=colour(index), markersize=2.5, alpha=0.35, rasterized=True)
+    for index, record in enumerate(picture.records):
+        alpha, fit = record.points.acceleration_rad_s2, record.points.fit
+        ends = np.array([alpha.min(), alpha.max()])
+        label = f"{record.hertz:g} Hz: T = {fit.inertia_kg_m2:.1f} α + {fit.intercept_nm:.1f}"
+        axes.plot(ends, fit.inertia_kg_m2 * ends + fit.intercept_nm, color=colour(index), linewidth=1.8, label=label)
+    axes.legend(fontsize=8, loc="upper left", framealpha=0.9)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.28 * (high - low))
+    tidy(axes, "reported acceleration α, rad/s²", "reported torque T, N·m", "The paper's method, tone by tone")
+
+
+def _slopes(axes: Axes, picture: SlopePicture) -> None:
+    records, joint = picture.records, picture.joint
+    known = [(record.hertz, record.published[0]) for record in records if record.published[0] is not None]
+    highest = max(record.hertz for record in records)
+    tones = np.linspace(0.02, 1.08 * highest, 300)
+    curve = slope_of(joint, tones)
+    if curve is not None and joint.inertia is not None:
+        lags = ""
+        if joint.speed_lag_s is not None and joint.torque_lag_s is not None:
+            lags = f", lags {joint.speed_lag_s.value:.2f} and {joint.torque_lag_s.value:.2f} s"
+        axes.plot(tones, curve, color="#444444", linewidth=1.6, label=f"joint fit of all records: one J{lags}")
+        found = joint.inertia
+        axes.axhspan(found.low, found.high, color="#2e8b57", alpha=0.35, linewidth=0)
+        label = f"its J: {found.value:.1f} ({found.low:.1f} to {found.high:.1f}) kg·m²"
+        axes.axhline(found.value, color="#2e8b57", linewidth=1.2, label=label)
+    axes.axhline(picture.true_inertia, color="black", linewidth=0.8, linestyle=":",
+                 label=f"the simulated rig's J: {picture.true_inertia:g} kg·m²")
+    for index, record in enumerate(records):
+        label = "slope of the paper's method, ours" if index == 0 else ""
+        axes.plot(record.hertz, record.points.fit.inertia_kg_m2, "o", color=colour(index), markersize=7, label=label)
+    if known:
+        axes.plot(*zip(*known, strict=True), label="published slope", **PUBLISHED_STYLE)
+    axes.set_xlim(0.0, 1.1 * highest)
+    axes.legend(fontsize=8, loc="upper left")
+    tidy(axes, "tone, Hz", "slope, kg·m²", "One inertia, seen through two reporting lags")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 @dataclass
 class FieldSlopes:

@@ -2,12 +2,151 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
 
 from profiles.model import DataModel, Finding, refuse_if
-from tdhil.study.design_arrays import Rows, fault_of, shipped_arrays
-from tdhil.study.settings import FACTORS, SYMBOLS, LoopSettings, changed, full_name
+from profiles.yaml_loader import parse_model
+from tdhil.studies.paper.loop import FACTORS, SYMBOLS, LoopSettings, changed, full_name
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Orthogonal arrays: those that ship, and the check that any other has to pass.
+#
+# An array is orthogonal (of strength two) if in every pair of columns every pair of levels stands equally often. Then
+# the level means of one factor are free of all others' additive effects, which is all that range analysis asks.
+
+
+Rows = tuple[tuple[int, ...], ...]
+
+MAX_RUNS = 512
+
+
+class NamedArray(DataModel):
+    """An array that ships with the program."""
+
+    name: str
+    rows: Rows
+
+
+class _Arrays(DataModel):
+    arrays: tuple[NamedArray, ...]
+
+
+@cache
+def shipped_arrays() -> dict[str, Rows]:
+    """L9, L16."""
+    name = "design_arrays.yaml"
+    text = files("tdhil.studies.paper").joinpath(name).read_text(encoding="utf-8")
+    return {array.name: array.rows for array in parse_model(text, name, _Arrays).arrays}
+
+
+def fault_of(rows: Sequence[Sequence[int]]) -> str | None:
+    """What keeps ``rows`` from being an orthogonal array, in words; None if nothing does."""
+    if not rows or not rows[0]:
+        return "the array is empty"
+    if len(rows) > MAX_RUNS:
+        return f"the array has {len(rows)} runs; {MAX_RUNS} are possible"
+    for number, row in enumerate(rows, start=1):
+        if len(row) != len(rows[0]):
+            return f"run {number} has {len(row)} columns where run 1 has {len(rows[0])}"
+    columns = list(zip(*rows, strict=True))
+    for number, column in enumerate(columns, start=1):
+        counts = Counter(column)
+        if sorted(counts) != list(range(1, len(counts) + 1)) or len(counts) < 2:
+            return f"column {number}: levels must be numbered 1, 2, … without a gap, and be two at least"
+        if len(set(counts.values())) > 1:
+            return f"not orthogonal: column {number} has {_uneven(counts)}"
+    for (first, one), (second, other) in combinations(enumerate(columns, start=1), 2):
+        counts = Counter(dict.fromkeys(_pairs(one, other), 0))
+        counts.update(zip(one, other, strict=True))
+        if len(set(counts.values())) > 1:
+            return f"not orthogonal: columns {first} and {second} have {_uneven(counts)}"
+    return None
+
+
+def _pairs(one: Sequence[int], other: Sequence[int]) -> list[tuple[int, int]]:
+    return [(left, right) for left in sorted(set(one)) for right in sorted(set(other))]
+
+
+def _uneven(counts: Counter[int] | Counter[tuple[int, int]]) -> str:
+    (most, often), (least, seldom) = counts.most_common()[0], counts.most_common()[-1]
+    kind = "levels" if isinstance(most, tuple) else "level"
+    return f"{kind} {most} {_times(often)} and {least} {_times(seldom)}"
+
+
+def _times(count: int) -> str:
+    return {0: "never", 1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Range analysis (equation 17): how much the mean response moves when one factor of an orthogonal array moves.
+#
+# Over the runs of one level of a factor, every other factor takes each of its levels equally often; if effects add up,
+# level means differ by that factor alone. R = largest level mean less smallest.
+
+
+FloatArray = NDArray[np.float64]
+RangeRows = Sequence[Sequence[int]]
+
+
+@dataclass(frozen=True)
+class LevelMeans:
+    """One factor's means, level 1 first."""
+
+    means: tuple[float, ...]
+
+    @property
+    def range(self) -> float:
+        """R of equation 17."""
+        return max(self.means) - min(self.means)
+
+
+def main_effects(rows: RangeRows, responses: Sequence[float] | FloatArray) -> tuple[LevelMeans, ...]:
+    """For each column of the array, the mean response at each of its levels."""
+    levels, found = np.asarray(rows), np.asarray(responses, dtype=np.float64)
+    return tuple(
+        LevelMeans(tuple(float(found[column == level].mean()) for level in np.unique(column))) for column in levels.T
+    )
+
+
+def ranking(ranges: Sequence[float]) -> tuple[int, ...]:
+    """The rank of each factor, 1 for the largest range; equal ranges rank in their order."""
+    order = sorted(range(len(ranges)), key=lambda index: -ranges[index])
+    ranks = [0] * len(ranges)
+    for rank, index in enumerate(order, start=1):
+        ranks[index] = rank
+    return tuple(ranks)
+
+
+def is_saturated(rows: RangeRows) -> bool:
+    """Whether the level means fix every run: 1 + Σ(levels − 1) = runs."""
+    levels = np.asarray(rows)
+    return 1 + sum(len(np.unique(column)) - 1 for column in levels.T) == len(levels)
+
+
+def runs_from_means(rows: RangeRows, means: Sequence[Sequence[float]]) -> tuple[float, ...]:
+    """The responses whose level means are ``means``: J_run = m + Σ over factors of (mean of its level − m).
+
+    With a saturated array effects use up all degrees of freedom, so the sum is no model but the data themselves;
+    m is the grand mean (of the factors' own grand means, which rounding of printed figures lets differ).
+    """
+    if not is_saturated(rows):
+        raise ValueError("the array isn't saturated: its level means don't fix the runs")
+    grand = float(np.mean([np.mean(of_factor) for of_factor in means]))
+    return tuple(
+        grand + sum(of_factor[level - 1] - grand for of_factor, level in zip(means, row, strict=True)) for row in rows
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Factor(DataModel):
     """One thing that is varied: a field of the settings, or its symbol, and a value for each level of its column."""

@@ -7,9 +7,7 @@ from importlib.resources import files
 
 from profiles.model import DataModel
 from profiles.yaml_loader import parse_model
-from tdhil.studies.paper.orthogonal_design import Factor
-from tdhil.study.design_arrays import shipped_arrays
-from tdhil.study.ranges import runs_from_means
+from tdhil.studies.paper.orthogonal_design import Factor, runs_from_means, shipped_arrays
 
 
 class PublishedFactor(DataModel):

@@ -6,10 +6,9 @@ from itertools import pairwise
 from math import sqrt
 
 from tdhil.studies.paper.design_runs import DesignResult, DesignRun
-from tdhil.studies.paper.orthogonal_design import DesignSettings
+from tdhil.studies.paper.orthogonal_design import DesignSettings, ranking
 from tdhil.studies.paper.published import PublishedDesign
 from tdhil.studies.study import Statement
-from tdhil.study.ranges import ranking
 
 BOUNDS_KG_M2 = {"table6": 1.1, "table7": 0.5}
 """What the RMS over the recovered runs may be at most."""

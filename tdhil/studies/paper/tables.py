@@ -7,20 +7,45 @@ open are inferred from those runs: many neighbouring ones do about as well.
 from __future__ import annotations
 
 from math import pi, sqrt
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from tdhil.studies.paper.design_runs import DesignResult, DesignRun, run_design
-from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor
+from tdhil.studies.paper.loop import LABELS, NonNegative, Positive, SamplePeriod
+from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor, Rows, ranking
 from tdhil.studies.paper.published import PublishedDesign, published
 from tdhil.studies.paper.table_statements import design_statements, tdhil_inertia
 from tdhil.studies.study import Cell, Progress, ResultTable, StudyOutcome
-from tdhil.study.design_arrays import Rows
-from tdhil.study.ranges import ranking
-from tdhil.study.settings import NonNegative, Positive, SamplePeriod
-from tdhil.study.tables_draw import draw_runs
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The picture of a design: J of every run, as the paper identifies it and otherwise.
+
+
+def draw_runs(figure: Figure, result: DesignResult, paper: PublishedDesign | None) -> None:
+    """J of every run: as the paper identifies it, published, in closed form, and without the start-up."""
+    axes = figure.add_subplot()
+    numbers = list(range(1, len(result.runs) + 1))
+    if paper:
+        label = "published, recovered from level means"
+        axes.plot(numbers, paper.runs_kg_m2, "s", color="0.15", ms=9, mfc="none", label=label)
+    axes.plot(numbers, result.inertias, "o-", color="C0", ms=5, lw=1, label="here, all samples")
+    closed = [run.closed_form_kg_m2 or float("nan") for run in result.runs]
+    axes.plot(numbers, closed, "_", color="C1", ms=14, mew=2, label="closed form")
+    settled = [run.settled.inertia_kg_m2 if run.settled else float("nan") for run in result.runs]
+    axes.plot(numbers, settled, "^", color="C2", ms=6, label="here, start-up dropped")
+    axes.plot(numbers, [run.settings.inertia_kg_m2 for run in result.runs], "--", color="0.5", lw=1, label="true")
+    axes.set(xlabel="run", ylabel="identified " + LABELS["inertia_kg_m2"], xticks=numbers)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=9)
+    figure.tight_layout()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class Table6Settings(DesignSettings):
     """L16 over the system parameters. B, F_c, σ and the duration (the paper: 10/f in 3.4.2) are inferred."""

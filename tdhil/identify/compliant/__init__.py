@@ -1,1 +1,0 @@
-"""A shaft that swings: two masses on a spring, or a string."""
