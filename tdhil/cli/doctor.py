@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.finding import Finding, bad, note, ok
-from tdhil.cli.real_time import HOW, allowed
+from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
     from tdhil.cli.buses.modbus_doctor import RegisterSeen
-    from tdhil.cli.connection import Connection
     from tdhil.config.options import RunOptions
     from tdhil.config.rig import Rig
+    from tdhil.session.connection import Connection
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ def findings(
 ) -> Iterator[Finding]:
     """From the computer to the drive; ``registers`` is filled with those of a Modbus drive."""
     from drivers.errors import DataFileError
-    from tdhil.cli.connection import connection_of
     from tdhil.cli.finding import note, of_error
+    from tdhil.session.connection import connection_of
 
     yield from host_findings(Path(options.log))
     yield from _left(Path(options.log).parent)
@@ -221,7 +221,8 @@ def _left(folder: Path) -> Iterator[Finding]:
 
 def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
     from tdhil.cli.finding import note, ok
-    from tdhil.cli.profile_text import doubtful, is_accepted, sure_text
+    from tdhil.cli.profile_text import sure_text
+    from tdhil.session.consent import doubtful, is_accepted
 
     profile = connection.profile
     yield ok("profile", f"{profile.name} ({options.source('profile')}): {sure_text(profile)}")
@@ -246,11 +247,12 @@ def _limits(rig: Rig | None) -> Iterator[Finding]:
 def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
     from drivers.errors import TdhilError
     from profiles.canopen import CanopenProfile
-    from tdhil.cli.buses import can_bus, canopen_doctor
-    from tdhil.cli.buses.canopen import open_can, rated_torque_nm
+    from tdhil.cli.buses import canopen_doctor
     from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.cli.open_drive import plan_peer
     from tdhil.config.rig import DriveData
+    from tdhil.session.buses import can_bus
+    from tdhil.session.buses.canopen import open_can, rated_torque_nm
+    from tdhil.session.open_drive import plan_peer
 
     profile, bus = connection.profile, connection.bus
     assert isinstance(profile, CanopenProfile)
@@ -278,10 +280,10 @@ def _modbus(
     from drivers.clock import Clock, MonotonicClock, SteppedClock
     from drivers.errors import TdhilError
     from tdhil.cli.buses import modbus_doctor
-    from tdhil.cli.buses.modbus import open_line
     from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.cli.open_drive import plan_peer
     from tdhil.config.rig import DriveData
+    from tdhil.session.buses.modbus import open_line
+    from tdhil.session.open_drive import plan_peer
 
     plan = plan_peer(options, connection)
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()

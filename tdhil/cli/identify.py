@@ -3,361 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import io
 import json
-import math
-import os
-import queue
-import signal
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, replace
-from datetime import datetime
-from functools import partial
+from contextlib import nullcontext
 from pathlib import Path
-from types import FrameType
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from drivers.drive import Preflight
-from drivers.errors import PreflightRefused
-from drivers.preflight import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
-from profiles.quantities import RPM
-from profiles.visible import visible
-from tdhil import __version__
-from tdhil.cli.connection import PeerPlan
-from tdhil.errors import UsageError
-from tdhil.report.card import minutes
-from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.run.task import Idle, Task
+from tdhil.session.connection import PeerPlan
 
 if TYPE_CHECKING:
-    from drivers.drive import Identity
-    from profiles.library import Profile
-    from tdhil.cli.connection import Connection
     from tdhil.config.options import RunOptions
     from tdhil.config.rig import Rig
-    from tdhil.recording.run_log import RunLog
     from tdhil.run.task import RunOutcome
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The typed confirmation before a real shaft moves. While it waits, the drive's watchdog is fed.
-
-
-WORD = "MOVE"
-SPEED_FLAG = "--accept-speed-unit"
-_UNWATCHED = "  [ ] somebody stands at that stop for the whole run: nothing else stops the shaft if this host fails\n"
-
-_SHARED = (
-    "  [ ] every other client of this drive is switched off (PLC, panel, historian, gateway), and somebody stands at\n"
-    "      that stop for the whole run\n"
-)
-
-
-def confirm_motion(
-    task: Task,
-    preflight: Preflight,
-    idle: Idle,
-    *,
-    yes: bool,
-    console: Console,
-    pause_display: Callable[[], None],
-    unverified: Sequence[str] = (),
-) -> None:
-    """Return if the shaft may be moved; raises PreflightRefused (exit 4) if not.
-
-    A simulated peer needs no confirmation. ``--yes`` replaces the prompt, not the limits.
-    """
-    if preflight.identity.simulated:
-        return
-    pause_display()
-    console.print(summary(preflight, task.limits, task.request, unverified), markup=False)
-    if yes:
-        console.print("Confirmed by --yes.")
-        return
-    if sys.stdin is None or not sys.stdin.isatty():
-        raise PreflightRefused(
-            "nobody is there to confirm that the shaft may move",
-            where="no terminal",
-            next_step="Run it at a terminal, or pass --yes if somebody stands at the hard-wired stop",
-        )
-    console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
-    if _ask(idle).strip() != WORD:
-        raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
-
-
-def confirm_speed(
-    speed_rad_s: float,
-    why: str,
-    idle: Idle,
-    *,
-    console: Console,
-    pause_display: Callable[[], None],
-    gear_ratio: float = 1.0,
-) -> None:
-    """Return if the operator sees the shaft turn as fast as the drive reports; PreflightRefused (exit 4) if not.
-
-    Asked while the shaft turns, one cycle after the other; ``--yes`` is no answer to it.
-    """
-    turning = turns_text(speed_rad_s)
-    pause_display()
-    if sys.stdin is None or not sys.stdin.isatty():
-        raise PreflightRefused(
-            f"nobody is there to see whether the shaft turns {turning}, as the drive reports ({why})",
-            where="no terminal",
-            next_step="Run it at a terminal, where somebody sees the shaft; say in the profile where the drive tells"
-            f" its angle (position); or take the unit of speed by name: {SPEED_FLAG}",
-        )
-    main = f" (the main shaft, behind the gear, {turns_text(speed_rad_s / gear_ratio)})" if gear_ratio != 1.0 else ""
-    console.print(
-        f"\nThe shaft turns, and {why}.\n"
-        f"The drive reports {speed_rad_s:.3g} rad/s: watch a mark on the motor's shaft for some turns.",
-        markup=False,
-    )
-    console.print(
-        f"Is it turning {turning}{main}? Type yes and Enter; anything else stops it: ", end="", markup=False
-    )
-    answer = _ask(idle).strip().lower()
-    if answer not in ("y", "yes"):
-        raise PreflightRefused(
-            f"the shaft was not seen to turn {turning}, as the drive reports: its unit of speed is not what the profile"
-            " says",
-            where="prompt",
-            next_step="Check the speed scaling in the profile: how long one turn really takes, against what was asked,"
-            " is the factor",
-        )
-
-
-def turns_text(speed_rad_s: float) -> str:
-    """A speed as somebody with a watch sees it."""
-    way = "forward" if speed_rad_s >= 0.0 else "backwards"
-    turn_s = 2.0 * math.pi / max(abs(speed_rad_s), 1e-9)
-    if turn_s >= 2.0:
-        return f"{way} once every {turn_s:.3g} s"
-    return f"{way} {10.0 / turn_s:.3g} times in 10 s"
-
-
-def summary(
-    preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
-) -> str:
-    """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
-    silent = f"{preflight.watchdog_s:g} s in the drive, then {preflight.safe_action.replace('_', ' ')}"
-    watchdog, seen_to = (silent, "") if preflight.watched else (f"NONE, {ACCEPTED_BY}: {NOTHING_STOPS_IT}", _UNWATCHED)
-    if preflight.watched and preflight.fed_by_any_client:
-        watchdog, seen_to = f"{silent}; but {ANY_CLIENT}", _SHARED
-    return (
-        f"\nThis run will move {visible(preflight.identity.name)}:\n"
-        f"  sign probe      torque up to {limits.probe_torque_nm:g} N·m, at most {limits.probe_travel_rad:g} rad\n"
-        f"  speed window    {limits.speed_min_rad_s:.4g} to {limits.speed_max_rad_s:.4g} rad/s "
-        f"({RPM.of_si(limits.speed_min_rad_s):.4g} to {RPM.of_si(limits.speed_max_rad_s):.4g} rpm)\n"
-        f"  peak torque     {limits.torque_nm:g} N·m\n"
-        f"  excitation      {request.kind}\n"
-        f"  duration        at most {minutes(limits.time_s)}\n"
-        f"  watchdog        {watchdog}\n"
-        f"{_taken(unverified)}"
-        "Before you confirm:\n"
-        "  [ ] brake released\n"
-        "  [ ] pipe handler and people clear of the shaft\n"
-        "  [ ] hard-wired emergency stop tested and within reach (Ctrl-C stops, but is no emergency stop)\n"
-        f"{seen_to}"
-    )
-
-
-def _taken(unverified: Sequence[str]) -> str:
-    if not unverified:
-        return ""
-    lines = "".join(f"  {visible(one)}\n" for one in unverified)
-    return f"Taken as the profile has it, although nobody verified it:\n{lines}"
-
-
-def _ask(idle: Idle) -> str:
-    """A line from the terminal, with a cycle of nothing again and again until it is there."""
-    answers: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=lambda: answers.put(sys.stdin.readline()), name="prompt", daemon=True).start()
-    while True:
-        idle()
-        try:
-            return answers.get_nowait()
-        except queue.Empty:
-            continue
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Where a run's files go: never over an older log, never into a live one, never over a file that isn't theirs.
-
-
-_LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
-
-
-class LogPlace:
-    """The file of one run. ``open`` takes it; ``settle`` gives it its last name once it is closed.
-
-    A log that another run is writing is left alone, and this one gets a name of its own. What a run that ended before
-    anything moved leaves behind goes beside the last good log, which keeps its name.
-    """
-
-    def __init__(self, wanted: Path) -> None:
-        self.wanted = wanted
-        self.path = wanted
-        self.older: Path | None = None         # where an older log was moved to
-        self.live = False                      # somebody else is writing ``wanted``
-        self.motion = False                    # set by whoever lets the shaft move
-
-    def open(self, wanted: Path) -> IO[bytes]:
-        """The file, held against other runs for as long as it is open. OSError, or UsageError for a foreign file."""
-        with _held(wanted.parent):
-            if wanted.exists() and not wanted.is_file():
-                return wanted.open("wb", buffering=0)      # a device
-            check_log_path(wanted)
-            self.live = wanted.is_file() and is_live(wanted)
-            if self.live:
-                self.path = _dated(wanted, time.time())
-            else:
-                self.older = make_room(wanted)
-            file = self.path.open("xb", buffering=0)
-            _lock(file.fileno())
-            return file
-
-    def name(self, *, stub: bool) -> Path:
-        """What the file will be called in the end. ``stub``: nothing moved in this run."""
-        if stub and self.older is not None and not _is_stub(self.older):
-            return self.wanted.with_name(f"{self.wanted.stem}.refused{self.wanted.suffix}")
-        return self.path
-
-    def settle(self, *, stub: bool) -> None:
-        """Once the file is closed: a stub makes room for the older log again."""
-        final = self.name(stub=stub)
-        if final != self.path and self.older is not None:
-            with suppress(OSError), _held(self.wanted.parent):      # nothing is lost under the names as they are
-                self.path.replace(final)
-                self.older.rename(self.path)
-                self.path = final
-
-
-def check_log_path(path: Path, where: str = "--log") -> None:
-    """UsageError for a file that is no log: it would be moved aside by mistake."""
-    from tdhil.recording.mcap_container import MAGIC
-
-    if not path.is_file() or path.suffix == ".mcap":
-        return
-    with suppress(OSError), path.open("rb") as file:
-        if file.read(5) in (b"", MAGIC[:5]):
-            return
-    raise UsageError("is no log; it is left as it is", where=f"{where} {path}", next_step="Name another, as run.mcap")
-
-
-def check_names(paths: Mapping[str, Path | None]) -> None:
-    """UsageError where two of the files that a run reads or writes are the same one; by option."""
-    seen: dict[Path, str] = {}
-    for option, path in paths.items():
-        if path is None:
-            continue
-        real = path.resolve()
-        if real in seen:
-            raise UsageError(f"is the file of {seen[real]} too", where=f"{option} {path}", next_step="Name another")
-        seen[real] = option
-
-
-def make_room(path: Path) -> Path | None:
-    """Move an older log at ``path`` aside, named by the time it was last written; its new place, if there was one."""
-    if not path.is_file():
-        return None
-    older = _dated(path, path.stat().st_mtime)
-    path.rename(older)
-    return older
-
-
-def is_live(path: Path) -> bool:
-    """Is some process writing this log now? False where the system can't tell."""
-    try:
-        import fcntl
-    except ImportError:
-        try:
-            path.rename(path)      # Windows renames nothing that is open
-        except OSError:
-            return True
-        return False
-    with suppress(OSError), path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
-def _dated(path: Path, time_s: float) -> Path:
-    stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(time_s))
-    dated = path.with_name(f"{path.stem}-{stamp}{path.suffix}")
-    number = 1
-    while dated.exists():
-        number += 1
-        dated = path.with_name(f"{path.stem}-{stamp}-{number}{path.suffix}")
-    return dated
-
-
-def _is_stub(path: Path) -> bool:
-    """Does an older log hold no motion either?"""
-    from tdhil.errors import LogError
-    from tdhil.recording.log_reader import read_run
-
-    with suppress(OSError, LogError):
-        return path.stat().st_size < _LARGEST_STUB and not any(
-            stage.name != "setup" for stage in read_run(path).stages
-        )
-    return True
-
-
-@contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """No other run chooses a name in this folder meanwhile; where the system has no such lock, nothing is held."""
-    descriptor = None
-    try:
-        import fcntl
-
-        with suppress(OSError):
-            descriptor = os.open(folder, os.O_RDONLY)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except ImportError:
-        pass
-    try:
-        yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
-
-
-def _lock(descriptor: int) -> None:
-    with suppress(ImportError, OSError):
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# `tdhil identify --simulate --fault …`: what the embedded drive shall do wrong, and when.
-
-
-def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> PeerPlan:
-    """The plan with these faults. UsageError where the peer isn't ours to spoil."""
-    if not texts:
-        return plan
-    if not plan.embedded:
-        raise UsageError(
-            "faults can be scripted in the embedded simulator only", where="--fault",
-            next_step="Add --simulate, or give --fault to tdhil simulate",
-        )
-    if drive == "modbus":
-        from sim_bus.modbus.faults import parse_all as parse_modbus
-
-        return replace(plan, faults=parse_modbus(texts, "embedded"))
-    from sim_bus.canopen.faults import parse_all
-
-    return replace(plan, faults=parse_all(texts))
+    from tdhil.session.connection import Connection
+    from tdhil.session.run_session import RunRequest
 
 
 def list_faults() -> int:
@@ -367,34 +28,6 @@ def list_faults() -> int:
 
     print(f"--drive canopen\n\n{listing()}\n\n--drive modbus\n\n{listing_of_modbus()}")  # noqa: T201
     return 0
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# How a run was set up: what is printed of it, and what its log keeps.
-
-
-def configuration(options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None) -> dict[str, Any]:
-    """For the log: everything that identification needs.
-
-    And the whole profile, so that a later decoder can start again from the raw frames.
-    """
-    return {
-        "tdhil": __version__,
-        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "rig_file": None if rig is None or not rig.file else rig.file,
-        "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
-        "drive": connection.drive,
-        "bus": {name: {"value": value, "source": source} for name, value, source in connection.rows()},
-        "profile": connection.profile.model_dump(mode="json", by_alias=True),
-        "embedded_simulator": peer.embedded,
-        "stepped": peer.stepped,
-        "seed": peer.seed,
-        "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
-        "faults": [fault.text for fault in peer.faults],
-        "identify": {"confidence": options.confidence, "tolerance": options.tolerance, "model": options.model},
-        "converted": [list(row) for row in rig.conversions] if rig is not None else [],
-        "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
-    }
 
 
 def show_settings(
@@ -419,30 +52,6 @@ def show_settings(
 
 
 _PREFIX = {"canopen": "bus", "modbus": "line"}
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Ctrl-C, SIGQUIT, SIGTERM and SIGHUP become a wish to stop, which the control loop sees in its next cycle.
-
-
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")  # the last three don't exist everywhere
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
-    """Handlers that only note the wish; the former ones come back afterwards. A second Ctrl-C changes nothing."""
-    request = StopRequest()
-
-    def handler(signum: int, frame: FrameType | None) -> None:
-        request.ask(signum)
-
-    known = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    former = {number: signal.signal(number, handler) for number in known}
-    try:
-        yield request
-    finally:
-        for number, before in former.items():
-            signal.signal(number, before)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -510,14 +119,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
-    from tdhil.cli.connection import can_torque, connection_of
-    from tdhil.cli.dry_run import dry_run, refuse_hopeless
-    from tdhil.cli.open_drive import plan_peer
-    from tdhil.cli.profile_text import check_names
-    from tdhil.cli.task import suited
+    from tdhil.cli.dry_run import dry_run
     from tdhil.config.options import resolve
     from tdhil.config.rig import load_rig
     from tdhil.report.live import stderr_console
+    from tdhil.session.connection import can_torque, connection_of
+    from tdhil.session.consent import check_names
+    from tdhil.session.open_drive import plan_peer, with_faults
+    from tdhil.session.plan_ahead import refuse_hopeless
+    from tdhil.session.run_session import Consent, RunRequest
+    from tdhil.session.task import suited
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -541,11 +152,23 @@ def run(namespace: argparse.Namespace) -> int:
     show_settings(console, options, connection, peer, rig)
     bench = suited(rig, peer.plant)
     refuse_hopeless(options, bench, can_torque(connection.profile))
-    return _run(namespace, options, connection, peer, bench, console)
+    consent = Consent(
+        no_watchdog=namespace.accept_no_watchdog,
+        shared_watchdog=namespace.accept_shared_watchdog,
+        wider_limits=tuple(namespace.accept_wider_limit or ()),
+        speed_unit=namespace.accept_speed_unit,
+        reset_fault=namespace.reset_fault,
+    )
+    request = RunRequest(
+        options, connection, peer, bench, consent, namespace.operator, namespace.note, namespace.real_time_priority
+    )
+    return _run(request, console, namespace.report)
 
 
 def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
     """Before anything is opened: no file of this run is another's. UsageError names the option."""
+    from tdhil.session.log_place import check_log_path, check_names
+
     log, trace = Path(options.log), options.trace
     profile = options.profile
     check_names({
@@ -563,169 +186,43 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
         check_trace_path(Path(trace), "--trace")
 
 
-def _load_the_end(report: bool) -> None:
-    """What stop, result and messages need, before anything moves: later there may be no descriptor left to read it."""
-    import traceback  # noqa: F401
-
-    import scipy.optimize
-    import scipy.signal
-    import scipy.special
-    import scipy.stats  # noqa: F401
-    from rich.console import Console
-
-    from tdhil.cli import conclude  # noqa: F401
-    from tdhil.estimation import identify  # noqa: F401
-    from tdhil.estimation.result import Verdict  # noqa: F401
-    from tdhil.report import card, document, html  # noqa: F401
-    from tdhil.run import preconditions, runner, stop  # noqa: F401
-
-    with Console(file=io.StringIO()).status(""):
-        pass      # rich loads its spinners when it needs them
-    if report:
-        from tdhil.report import page, plots  # noqa: F401
-
-
-def _run(
-    namespace: argparse.Namespace,
-    options: RunOptions,
-    connection: Connection,
-    peer: PeerPlan,
-    rig: Rig | None,
-    console: Console,
-) -> int:
-    from tdhil.cli.conclude import print_result, save_report
-    from tdhil.cli.open_drive import open_drive
-    from tdhil.cli.profile_text import accepted_lines
-    from tdhil.cli.real_time import real_time_priority
+def _run(request: RunRequest, console: Console, report: Path | None) -> int:
+    from tdhil.cli.results import print_result, save_report
     from tdhil.errors import LogError, exit_code
-    from tdhil.recording.log_writer import RunWriter
-    from tdhil.recording.run_log import RunLog
-    from tdhil.report.live import LiveDisplay
-    from tdhil.run.runner import Runner
+    from tdhil.session.confirm import TerminalAttendant
+    from tdhil.session.run_session import RunSession
 
-    _load_the_end(namespace.report is not None)
-    place = LogPlace(Path(options.log))
-    writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
-                       modbus=connection.drive == "modbus")
-    writer.path = place.path
-    if place.live:
-        console.print(f"another run is writing {place.wanted}: this one's log is {place.path}", style="yellow",
-                      markup=False, soft_wrap=True)
-    elif place.older is not None:
-        console.print(f"an older {place.wanted} was kept as {place.older}", style="dim", markup=False)
-    outcome = None
-
-    def stub() -> bool:
-        stopped = outcome is not None and outcome.stop is not None
-        return not (place.motion or stopped)
-
-    def confirm(task: Task, preflight: Preflight, idle: Idle) -> None:
-        confirm_motion(
-            task, preflight, idle, yes=options.yes, console=console, pause_display=display.pause,
-            unverified=accepted_lines(connection.profile, options.accept_unverified),
-        )
-        place.motion = True
-
-    said = {"operator": namespace.operator, "note": namespace.note}
-    log = RunLog(writer, configuration(options, connection, peer, rig) | said)
-    data = rig.drive_data if rig is not None else None
-    trace = None if options.trace is None else Path(options.trace)
-    say = partial(console.print, style="dim", markup=False, highlight=False)
+    options = request.options
+    attendant = TerminalAttendant(
+        console, yes=options.yes, gear_ratio=1.0 if request.rig is None else request.rig.gear.ratio
+    )
+    session = RunSession(request, attendant, report=report is not None)
     try:
-        with stop_on_signals() as stop_request, open_drive(
-            peer, options, connection, data, log.frame, trace
-        ) as drive, LiveDisplay(console, show_preflight=False) as display, real_time_priority(
-            namespace.real_time_priority, stepped=peer.stepped
-        ) as raised:
-            if raised.said:
-                log.configure(real_time_priority=raised.plain())
-                display.say(raised.said)
-            outcome = Runner(
-                drive,
-                partial(_task, options, connection.profile, rig, log, say, namespace),
-                log,
-                stop_request,
-                display,
-                confirm,
-                reset_fault=namespace.reset_fault,
-                say=display.say,
-                confirm_speed=partial(
-                    confirm_speed, console=console, pause_display=display.pause,
-                    gear_ratio=1.0 if rig is None else rig.gear.ratio,
-                ),
-            ).run()
-        for fault in peer.never_came:
-            with suppress(LogError):
-                log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
-            console.print(f"tdhil: --fault {fault} never came: this run did not reach its moment", style="yellow",
-                          markup=False, soft_wrap=True)
-        code, document = _finish(outcome, log, str(place.name(stub=stub())), options.json, console)
+        outcome = session.move()
+        document: dict[str, Any] | None = None
+        if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
+            code = _failed(outcome, str(session.path), options.json, console)
+        else:
+            with console.status("identifying …") if console.is_terminal else nullcontext():
+                found = session.conclude()
+            document, code = found.document, int(found.exit_code)
     except BaseException:
-        with suppress(LogError):  # the first cause stays the cause
-            log.close()
-        place.settle(stub=stub())
+        session.abandon()
         raise
     try:
         if document is not None:
             print_result(document, options.json)
     finally:            # whoever should have read stdout may be gone: log and report are finished all the same
         try:
-            log.close()
+            session.close()
         except LogError as error:
             # Stdout has its one document already; and where the log was what ended the run, all is said.
             if not isinstance(outcome.cause, LogError):
                 console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
-        place.settle(stub=stub())
         if document is not None:
-            save_report(document, log.recording(complete=True), namespace.report)      # it names the log's SHA-256
+            save_report(document, session.log.recording(complete=True), report)      # it names the log's SHA-256
     return code
-
-
-def _task(
-    options: RunOptions,
-    profile: Profile,
-    rig: Rig | None,
-    log: RunLog,
-    say: Callable[[str], None],
-    accepted: argparse.Namespace,
-    identity: Identity,
-) -> Task:
-    from tdhil.cli.profile_text import accepted_lines, note, require_accepted
-    from tdhil.cli.task import bench_of, excitation_request, facts, machine_limits
-    from tdhil.run.task import Task
-
-    bench = bench_of(identity, rig)
-    log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
-    if not identity.simulated:
-        require_accepted(profile, options.accept_unverified)
-        log.configure(unverified=list(accepted_lines(profile, options.accept_unverified)))
-    elif text := note(profile):
-        say(text)
-    limits = machine_limits(
-        bench,
-        accept_no_watchdog=accepted.accept_no_watchdog,
-        accept_shared_watchdog=accepted.accept_shared_watchdog,
-        accept_wider=tuple(accepted.accept_wider_limit or ()),
-        accept_speed_unit=accepted.accept_speed_unit,
-    )
-    return Task(limits, excitation_request(options), facts(bench))
-
-
-def _finish(
-    outcome: RunOutcome, log: RunLog, path: str, as_json: bool, console: Console
-) -> tuple[int, dict[str, Any] | None]:
-    """Identify, or say what ended the run; the exit code, and the result, still to be printed, if there is one."""
-    from tdhil.cli.conclude import conclude
-    from tdhil.errors import LogError
-
-    if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
-        return _failed(outcome, path, as_json, console), None
-    with console.status("identifying …") if console.is_terminal else nullcontext():
-        document, code = conclude(log.recording(complete=True), log.run, path)
-    with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
-        log.result(document)
-    return int(code), document
 
 
 def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> int:
@@ -767,5 +264,3 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
         print(json.dumps(document, ensure_ascii=False, indent=2))  # noqa: T201
     return int(code)
 
-
-__all__ = ["LogPlace", "add_arguments", "check_log_path", "check_names", "is_live", "make_room", "run"]

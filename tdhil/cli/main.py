@@ -9,8 +9,8 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 
-from tdhil import __version__
 from tdhil.cli.streams import sheltered
+from tdhil.version import __version__
 
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",

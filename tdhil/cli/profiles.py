@@ -13,17 +13,16 @@ from profiles.library import Profile
 from profiles.modbus import ModbusProfile
 from profiles.modbus import Parameter as ModbusParameter
 from tdhil.cli.profile_text import (
-    UNVERIFIED_FLAG,
-    doubtful,
     facts_of,
     modes_text,
-    rated_torque_is_told_by_hand,
     register_uses,
     required_text,
     sure_text,
     unit_text,
     watchdog_text,
 )
+from tdhil.session.connection import rated_torque_is_told_by_hand
+from tdhil.session.consent import UNVERIFIED_FLAG, doubtful
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -247,7 +246,7 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
 
 def _show(name: str, as_json: bool) -> int:
     from profiles.library import load_profile, matching_names
-    from tdhil.cli.profile_text import doubtful
+    from tdhil.session.consent import doubtful
 
     meant = matching_names(name)
     if len(meant) > 1:
@@ -299,7 +298,8 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
     from profiles.eds_import import begin_profile
     from profiles.eds_reader import read_eds
     from profiles.errors import DataFileError, Problem
-    from tdhil.cli.profile_text import doubtful, row, sure_text
+    from tdhil.cli.profile_text import row, sure_text
+    from tdhil.session.consent import doubtful
 
     source = Path(file)
     target = Path(output) if output is not None else Path(f"{source.stem}.yaml")

@@ -26,9 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: nothing is missing; 3: some of it is; 10 (`NothingRecoverable`): nothing can be read."""
-    from tdhil.cli.identify import check_log_path, make_room
     from tdhil.recording.salvage import examine, write_copy
     from tdhil.report.live import stderr_console
+    from tdhil.session.log_place import check_log_path, make_room
 
     path, target = namespace.log, namespace.output
     if not path.is_file():

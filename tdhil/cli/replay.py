@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
 from tdhil.cli.arguments import MODELS, amount, share
-from tdhil.cli.conclude import conclude, print_result, save_report
-from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
+from tdhil.cli.results import print_result, save_report
+from tdhil.errors import ExitCode, UsageError
+from tdhil.session.recorded import is_log, read, stated_lags
 
 if TYPE_CHECKING:
-    from tdhil.recording.log_reader import Run
-    from tdhil.recording.run_log import Ended
+    from tdhil.session.recorded import RunRecord
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
     "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd",
 )
-
-_REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
-"""Exit codes of a run that tell of the run; the others tell of the process that it was."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of replay. None as a default: not given."""
@@ -71,95 +65,41 @@ def run(namespace: argparse.Namespace) -> int:
         from tdhil.report.html import check_report_path
 
         check_report_path(namespace.report, path)
-    return _run_log(namespace, path) if _is_log(path) else _run_trace(namespace, path)
+    trace: dict[str, Any] = {}
+    if is_log(path):
+        for name in _TRACE_ONLY:
+            if getattr(namespace, name) is not None:
+                raise UsageError("is for a trace in CSV; this log brings its own", where=f"--{name.replace('_', '-')}")
+    else:
+        trace = {
+            "columns": namespace.columns, "excitation": namespace.excitation,
+            "rated_torque_nm": namespace.rated_torque, "torque_limit_nm": namespace.torque_limit,
+            "gear_ratio": namespace.gear, "torque_scale_rel_sd": namespace.torque_scale_sd,
+            "lags": stated_lags(
+                namespace.speed_lag, namespace.speed_lag_sd, namespace.torque_lag, namespace.torque_lag_sd,
+                "the command line",
+            ),
+        }
+    return _identify(namespace, read(path, **trace).with_said(_said(namespace)))
 
 
-def _run_log(namespace: argparse.Namespace, path: Path) -> int:
-    from tdhil.recording.log_reader import read_run
-    from tdhil.recording.recording import aborted_stage
-    from tdhil.recording.run_log import find_ended
+def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
+    """Identify and print; the exit code is that of the result, or says that only a part of the run was used."""
+    from tdhil.api import identify
     from tdhil.report.live import stderr_console
 
-    for name in _TRACE_ONLY:
-        if getattr(namespace, name) is not None:
-            raise UsageError("is for a trace in CSV; this log brings its own", where=f"--{name.replace('_', '-')}")
-    try:
-        found = read_run(path)
-    except LogError as error:
-        raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
-    ended = find_ended(found.configuration, found.events)
-    _refuse_empty(found, ended, path)
-    configuration: dict[str, Any] = found.configuration | ({} if ended is None else {"ended": asdict(ended)})
-    configuration |= _said(namespace)
-    if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
-        began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
-        configuration["started"] = began.isoformat(timespec="seconds")
-    asked = _asked(namespace)
-    if asked:
-        configuration = configuration | {"identify": {**configuration.get("identify", {}), **asked}}
-    document, code = conclude(found.recording, configuration, str(path))
-    console = stderr_console()
-    for problem in found.problems:
-        console.print(f"tdhil: {path}: {problem}", style="yellow", markup=False)
-    try:
-        print_result(document, namespace.json)
-    finally:
-        save_report(document, found.recording, namespace.report)
-    whole = found.recording.complete and aborted_stage(found.recording) is None
-    return int(code if whole or code is not ExitCode.OK else ExitCode.PARTIAL)
-
-
-def _refuse_empty(found: Run, ended: Ended | None, path: Path) -> None:
-    """A run that was refused, or ended in setup, holds nothing to identify from: what ended it is all to be said.
-
-    Raises NothingRecorded with that run's own exit code, but for one that tells of a process and not of a run.
-    """
-    from tdhil.errors import NothingRecorded
-
-    if len(found.recording.time_s) and any(stage.name != "setup" for stage in found.stages):
-        return
-    if ended is not None:
-        in_stage = f"in stage {found.stages[-1].name}" if found.stages else "before its first stage"
-        raise NothingRecorded(
-            f"the run in this log ended {in_stage}, with nothing to identify from: {ended.message}",
-            ended.exit_code if ended.exit_code in _REPEATED else ExitCode.PARTIAL,
-            where=str(path), next_step=ended.next_step,
-        )
-
-
-def _run_trace(namespace: argparse.Namespace, path: Path) -> int:
-    from tdhil.cli.task import ASSUMED_TORQUE_SCALE_REL_SD
-    from tdhil.recording.csv.layout import USUAL, parse_columns
-    from tdhil.recording.csv.reader import Bench, read_recording
-
-    scale = namespace.torque_scale_sd
-    bench = Bench(
-        rated_torque_nm=namespace.rated_torque,
-        torque_limit_nm=namespace.torque_limit,
-        torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
-        gear_ratio=1.0 if namespace.gear is None else namespace.gear,
-        lag_prior=_lag_prior(namespace),
+    result = identify(
+        recorded, model=namespace.model, confidence=namespace.confidence, tolerance=namespace.tolerance
     )
-    choices = USUAL if namespace.columns is None else parse_columns(namespace.columns)
-    recording, warnings = read_recording(path, choices, namespace.excitation, bench)
-    if scale is None:
-        warnings = (*warnings, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
-    asked = {"tolerance": 0.05, "confidence": 0.95} | _asked(namespace)
-    document, code = conclude(recording, {"identify": asked} | _said(namespace), str(path), warnings)
-    print_result(document, namespace.json)
-    save_report(document, recording, namespace.report)
-    return int(code)
-
-
-def _lag_prior(namespace: argparse.Namespace) -> Any:
-    from tdhil.cli.task import UNKNOWN_LAG_SD_SHARE
-    from tdhil.recording.recording import LagPrior
-
-    sds = []
-    for lag, sd in ((namespace.speed_lag, namespace.speed_lag_sd), (namespace.torque_lag, namespace.torque_lag_sd)):
-        sds.append((lag or 0.0) * UNKNOWN_LAG_SD_SHARE if sd is None else sd)
-    known = namespace.speed_lag is not None or namespace.torque_lag is not None
-    return LagPrior(namespace.speed_lag, sds[0], namespace.torque_lag, sds[1], "the command line" if known else "")
+    console = stderr_console()
+    for problem in recorded.problems:
+        console.print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
+    try:
+        print_result(result.document, namespace.json)
+    finally:
+        save_report(result.document, recorded.recording, namespace.report)
+    part = recorded.assumed is None and not recorded.whole
+    return int(ExitCode.PARTIAL if part and result.exit_code is ExitCode.OK else result.exit_code)
 
 
 def _log(namespace: argparse.Namespace) -> Path:
@@ -171,25 +111,8 @@ def _log(namespace: argparse.Namespace) -> Path:
     return log
 
 
-def _is_log(path: Path) -> bool:
-    """MCAP by its first bytes, also if there are no more than some of them."""
-    from tdhil.recording.mcap_container import MAGIC
-
-    try:
-        with path.open("rb") as file:
-            head = file.read(len(MAGIC))
-    except OSError as error:
-        raise NothingRecoverable(f"can't be read ({error.strerror or error})", where=str(path)) from error
-    return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
-
-
 def _said(namespace: argparse.Namespace) -> dict[str, str]:
     return {name: getattr(namespace, name) for name in ("operator", "note") if getattr(namespace, name) is not None}
-
-
-def _asked(namespace: argparse.Namespace) -> dict[str, float | str]:
-    names = ("confidence", "tolerance", "model")
-    return {name: getattr(namespace, name) for name in names if getattr(namespace, name) is not None}
 
 
 def _check(namespace: argparse.Namespace) -> None:

@@ -18,12 +18,14 @@ from profiles.library import Profile
 from profiles.modbus import ModbusProfile
 from profiles.visible import visible
 from tdhil.cli.found_drive import FoundDrive
-from tdhil.cli.profile_text import doubtful, rated_torque_is_told_by_hand, required_text
+from tdhil.cli.profile_text import required_text
 from tdhil.config.rig import Limits, Rig
+from tdhil.session.connection import rated_torque_is_told_by_hand
+from tdhil.session.consent import doubtful
 
 if TYPE_CHECKING:
-    from tdhil.cli.connection import Connection, PeerPlan
     from tdhil.config.options import RunOptions
+    from tdhil.session.connection import Connection, PeerPlan
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -207,11 +209,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """0 if anybody answered. Raises CommunicationLost (exit 5) if nobody did, with the likely causes."""
-    from tdhil.cli.connection import connection_of
-    from tdhil.cli.open_drive import plan_peer
     from tdhil.config.options import resolve
     from tdhil.config.rig import load_rig
     from tdhil.errors import UsageError
+    from tdhil.session.connection import connection_of
+    from tdhil.session.open_drive import plan_peer
 
     if namespace.write is not None:
         _check_free(namespace.write)
@@ -238,8 +240,8 @@ def _canopen(
 ) -> tuple[tuple[FoundDrive, ...], list[str]]:
     from drivers.errors import CommunicationLost
     from profiles.canopen import CanopenProfile
-    from tdhil.cli.buses.canopen import open_can
     from tdhil.cli.buses.canopen_scan import ask_all, identify_all
+    from tdhil.session.buses.canopen import open_can
 
     profile = connection.profile
     assert isinstance(profile, CanopenProfile)

@@ -14,8 +14,8 @@ from tdhil.errors import ExitCode, UsageError, exit_code
 if TYPE_CHECKING:
     from drivers.clock import Clock
     from drivers.quick_stop import BareStopReport, Target
-    from tdhil.cli.connection import Connection
     from tdhil.config.options import RunOptions
+    from tdhil.session.connection import Connection
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
@@ -42,9 +42,9 @@ def run(namespace: argparse.Namespace) -> int:
     """
     from drivers.clock import MonotonicClock
     from drivers.quick_stop import bare_stop
-    from tdhil.cli.connection import connection_of
     from tdhil.config.options import resolve
     from tdhil.config.rig import load_rig
+    from tdhil.session.connection import connection_of
 
     rig = load_rig(namespace.rig) if namespace.rig else None
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
@@ -94,7 +94,7 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
     profile = connection.profile
     if isinstance(profile, ModbusProfile):
         from drivers.modbus.quick_stop import ModbusTarget
-        from tdhil.cli.buses.modbus import open_wire
+        from tdhil.session.buses.modbus import open_wire
 
         link = open_wire(connection.modbus, clock)
         try:
@@ -103,7 +103,7 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
             link.close()
         return
     from drivers.canopen.quick_stop import Cia402Target
-    from tdhil.cli.buses.can_bus import open_bus
+    from tdhil.session.buses.can_bus import open_bus
 
     bus = open_bus(connection.bus)
     node = options.node if options.node is not None else profile.node

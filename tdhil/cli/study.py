@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil import __version__
+from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from drivers.drive import Command, Identity, Preflight, Sample
@@ -44,13 +44,13 @@ class SimulatedFieldBench:
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
         """The Recording; raises what ended the run before its end."""
-        from tdhil.cli.connection import PeerPlan, simulated_canopen
-        from tdhil.cli.identify import stop_on_signals
-        from tdhil.cli.open_drive import open_drive
         from tdhil.config.options import resolve
         from tdhil.recording.log_writer import RunWriter
         from tdhil.recording.run_log import RunLog
         from tdhil.run.runner import Runner
+        from tdhil.session.connection import PeerPlan, simulated_canopen
+        from tdhil.session.open_drive import open_drive
+        from tdhil.session.stop_signals import stop_on_signals
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -116,8 +116,8 @@ def _asked(wish: FieldRun) -> dict[str, object]:
 
 
 def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
-    from tdhil.cli.task import bench_of, excitation_request, facts, machine_limits
     from tdhil.run.task import Task
+    from tdhil.session.task import bench_of, excitation_request, facts, machine_limits
 
     bench = bench_of(identity, rig)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))

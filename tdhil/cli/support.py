@@ -18,8 +18,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from tdhil import __version__
 from tdhil.errors import ExitCode, LogError, UsageError
+from tdhil.version import __version__
 
 LIBRARIES = (
     "numpy", "scipy", "python-can", "canopen", "pymodbus", "pyserial", "mcap", "protobuf", "pydantic", "rich", "PyYAML",

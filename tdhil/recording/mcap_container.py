@@ -25,8 +25,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Schema, Statistics, SummaryOffset
 
-from tdhil import __version__
 from tdhil.recording.log_format import CHANNELS, CLASSES, PACKAGE, schema_name
+from tdhil.version import __version__
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 LIBRARY: Final = f"{PACKAGE} {__version__}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -224,3 +226,22 @@ def _sentence(text: str) -> str:
 def print_card(document: Mapping[str, Any], console: Console) -> None:
     """The card, on a console."""
     console.print(result_card(document))
+
+
+def card_text(document: Mapping[str, Any], width: int = 80) -> str:
+    """The card as plain text."""
+    console = PlainConsole(io.StringIO())
+    console.width = width
+    console.print(result_card(document))
+    return console.file.getvalue()      # type: ignore[attr-defined, no-any-return]
+
+
+def card_html(document: Mapping[str, Any], width: int = 100) -> str:
+    """The card as a piece of HTML that brings its own colours: what a notebook shows."""
+    console = PlainConsole(io.StringIO(), record=True)
+    console.width = width
+    console.print(result_card(document))
+    return console.export_html(inline_styles=True, code_format=_HTML)
+
+
+_HTML = '<pre style="font-family:monospace;line-height:normal;white-space:pre;overflow-x:auto">{code}</pre>'

@@ -14,8 +14,8 @@ from profiles.visible import visible
 class PlainConsole(Console):
     """No markup in plain strings (a drive may be called ``[/]``), and no control character but rich's own."""
 
-    def __init__(self, file: TextIO | None = None) -> None:
-        super().__init__(file=file, highlight=False, markup=False)
+    def __init__(self, file: TextIO | None = None, *, record: bool = False) -> None:
+        super().__init__(file=file, highlight=False, markup=False, record=record)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         for segment in super().render(renderable, options):

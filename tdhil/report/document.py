@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from tdhil import __version__
 from tdhil.estimation.result import Identification, InertiaEstimate, LineFit
 from tdhil.recording.recording import Recording
+from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"
 

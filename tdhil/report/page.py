@@ -12,7 +12,6 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import tdhil
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
@@ -43,7 +42,7 @@ def install_command() -> str:
     This package stands in no index, so its own name would find nothing.
     """
     python = shlex.quote(sys.executable or "python")
-    clone = Path(tdhil.__file__).resolve().parent.parent
+    clone = Path(__file__).resolve().parents[2]
     if (clone / "pyproject.toml").is_file():
         return f"{python} -m pip install -e {shlex.quote(f'{clone}[report]')}"
     try:

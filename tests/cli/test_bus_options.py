@@ -14,10 +14,10 @@ import can.util
 import pytest
 
 from drivers.errors import CommunicationLost, DataFileError, PreflightRefused
-from tdhil.cli.buses import can_bus
-from tdhil.cli.buses.can_bus import BusConfig, bus_config, check_link, open_bus, parse_link
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
+from tdhil.session.buses import can_bus
+from tdhil.session.buses.can_bus import BusConfig, bus_config, check_link, open_bus, parse_link
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from drivers.errors import PreflightRefused
-from tdhil.cli.identify import confirm_speed, turns_text
 from tdhil.config.rig import Run
+from tdhil.session.confirm import confirm_speed, turns_text
 
 
 class Terminal(io.StringIO):

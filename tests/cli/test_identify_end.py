@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
-from tdhil.cli.identify import stop_on_signals
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, Interrupted, LogBroken
 from tdhil.recording.mcap_container import Container
@@ -16,6 +15,7 @@ from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
 from tdhil.run.stop import StopReport
 from tdhil.run.task import RunOutcome
+from tdhil.session.stop_signals import stop_on_signals
 
 REST = StopReport(True, 12.25, True)
 TURNING = StopReport(False, None, False, ("no feedback from the drive any more",))
@@ -44,8 +44,8 @@ def ends(monkeypatch, tmp_path, capsys):
             return {"verdict": "as the test has it"}, verdict
 
         monkeypatch.setattr("tdhil.run.runner.Runner", Fake)
-        monkeypatch.setattr("tdhil.cli.conclude.conclude", conclude)
-        monkeypatch.setattr("tdhil.cli.conclude.print_result", lambda document, _: print(json.dumps(document)))
+        monkeypatch.setattr("tdhil.cli.results.conclude", conclude)
+        monkeypatch.setattr("tdhil.cli.results.print_result", lambda document, _: print(json.dumps(document)))
         code = main(["identify", "--simulate", "--seed", "1", *arguments])
         said = capsys.readouterr()
         return code, said.out, " ".join(said.err.split())

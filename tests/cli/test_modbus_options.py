@@ -9,11 +9,11 @@ import pytest
 
 from drivers.errors import DataFileError
 from profiles.library import load_modbus_profile
-from tdhil.cli.buses.modbus_line import modbus_config
-from tdhil.cli.connection import connection_of
 from tdhil.config.options import resolve
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
+from tdhil.session.buses.modbus_line import modbus_config
+from tdhil.session.connection import connection_of
 
 PROFILE = load_modbus_profile("generic/modbus")
 

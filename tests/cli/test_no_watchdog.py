@@ -8,12 +8,12 @@ import pytest
 
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import CommunicationLost, DriveFault
-from tdhil.cli.identify import summary
-from tdhil.cli.task import machine_limits
 from tdhil.config.rig import load_rig, simulated_default_rig
 from tdhil.errors import exit_code
 from tdhil.run import preconditions
 from tdhil.run.settings import ExcitationRequest, MachineLimits
+from tdhil.session.confirm import summary
+from tdhil.session.task import machine_limits
 
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
 ACTS = "Check the cable; the drive's own watchdog stops the shaft"

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DataFileError, PreflightRefused
-from tdhil.cli.identify import confirm_motion
 from tdhil.cli.main import main
 from tdhil.config.options import OPTIONS, resolve
 from tdhil.config.rig import load_rig
+from tdhil.session.confirm import confirm_motion
 
 LIMITS = """\
 limits:
@@ -82,7 +82,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
     from tdhil.run.settings import ExcitationRequest, MachineLimits
 
     monkeypatch.setattr("sys.stdin", None)
-    monkeypatch.setattr("tdhil.cli.identify.summary", lambda *_: "")
+    monkeypatch.setattr("tdhil.session.confirm.summary", lambda *_: "")
     task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
     preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
     with pytest.raises(PreflightRefused, match="nobody is there"):

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from tdhil.cli import real_time
 from tdhil.cli.doctor import priority_finding
-from tdhil.cli.real_time import HOW, real_time_priority
+from tdhil.session import real_time
+from tdhil.session.real_time import HOW, real_time_priority
 
 linux = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux alone has it")
 

@@ -13,8 +13,8 @@ from profiles.entry import Confidence
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from tdhil.cli.main import main
-from tdhil.cli.profile_text import accepted_lines, check_names, doubtful, note, require_accepted
 from tdhil.errors import UsageError
+from tdhil.session.consent import accepted_lines, check_names, doubtful, note, require_accepted
 
 PLAIN = load_modbus_profile("generic/modbus")
 NAMES = [name for name, _ in PLAIN.entries()]

@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DataFileError
-from tdhil.cli.connection import connection_of
 from tdhil.config.options import resolve
 from tdhil.config.rig import load_rig
+from tdhil.session.connection import connection_of
 
 LIMITS = {
     "speed_min_rad_s": "0.5", "speed_max_rad_s": "10", "torque_nm": "400", "time_s": "900", "quick_stop_rad_s2": "2",

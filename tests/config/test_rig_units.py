@@ -115,7 +115,7 @@ def test_bit_rates_that_can_does_not_have(bit_s):
 
 
 def test_the_command_line_and_the_environment_know_the_same_rates(monkeypatch, tmp_path, capsys):
-    from tdhil.cli.buses.can_bus import bus_config
+    from tdhil.session.buses.can_bus import bus_config
 
     monkeypatch.setenv("HOME", str(tmp_path))
     with pytest.raises(UsageError, match="500 bit/s is none of CAN's"):

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from tdhil.cli.identify import LogPlace, is_live
+from tdhil.session.log_place import LogPlace, is_live
 
 _SCRIPT = """
 import importlib, os, pkgutil, select, signal, socket, sys
@@ -91,7 +91,7 @@ def test_a_simulated_serial_line_says_that_there_is_none(no_posix):
 def test_signals_that_the_system_lacks_are_left_out(monkeypatch):
     import signal
 
-    from tdhil.cli.identify import stop_on_signals
+    from tdhil.session.stop_signals import stop_on_signals
 
     for name in ("SIGHUP", "SIGQUIT"):
         monkeypatch.delattr(signal, name, raising=False)

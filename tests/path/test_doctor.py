@@ -10,9 +10,9 @@ from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus import embedded
 from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
-from tdhil.cli.buses import can_bus
 from tdhil.cli.buses.canopen_doctor import link_findings
 from tdhil.cli.doctor import disk_finding, jitter_finding, library_findings, naps, timer_finding
+from tdhil.session.buses import can_bus
 from tests.path.path_runs import tdhil
 from tests.path.watched_bus import WatchedBus
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from sim_bus.trace import HEADER, NotATrace, Trace
-from tdhil.cli.identify import LogPlace, is_live
 from tdhil.errors import UsageError
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.recording import Stage
+from tdhil.session.log_place import LogPlace, is_live
 from tests.path.path_runs import identify, tdhil
 
 REFUSED = ("--simulate", "--seed", 1, "--fault", "wrong-identity", "--profile", "maxon/epos4")

@@ -2,9 +2,9 @@
 
 import pytest
 
-from tdhil.cli.dry_run import refuse_hopeless
 from tdhil.config.options import resolve
 from tdhil.config.rig import load_rig
+from tdhil.session.plan_ahead import refuse_hopeless
 from tests.path.path_runs import tdhil
 
 QUICK = ("--seed", 1)

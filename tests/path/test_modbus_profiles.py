@@ -6,7 +6,7 @@ One seed here; twenty, and how often the interval covers: `benchmarks/every_prof
 import pytest
 
 from profiles.library import load_profile, profile_names
-from tdhil.cli.connection import can_torque
+from tdhil.session.connection import can_torque
 from tests.path.path_runs import Shaft, identify
 
 TRUE_KG_M2 = 104.0

@@ -5,7 +5,7 @@ import pytest
 from drivers.errors import PreflightRefused
 from profiles.library import load_profile, profile_names, profile_path
 from profiles.modbus import ModbusProfile
-from tdhil.cli.profile_text import require_accepted
+from tdhil.session.consent import require_accepted
 from tests.path.path_runs import tdhil
 
 

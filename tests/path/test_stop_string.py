@@ -50,8 +50,8 @@ def test_a_string_is_at_rest_and_let_go_before_the_drive_is_disabled(tmp_path, p
 def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
     from sim_bus.params import RigParams
     from sim_bus.params import load_rig as load_plant
-    from tdhil.cli.task import suited
     from tdhil.config.rig import Rig, load_rig
+    from tdhil.session.task import suited
 
     bench = suited(None, load_plant(EXAMPLES / "plant_string.yaml"))
     assert (bench.load, bench.limits.torque_nm, bench.make_up_torque_nm) == ("string", 4000.0, 8000.0)

@@ -13,11 +13,11 @@ from rich.table import Table
 from drivers.drive import Check, Identity, Outcome, Preflight
 from drivers.errors import PreflightRefused
 from profiles.visible import visible
-from tdhil.cli.identify import summary
 from tdhil.cli.main import main
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table
 from tdhil.run.settings import ExcitationRequest
+from tdhil.session.confirm import summary
 
 EVIL = "\x1b[2J\x1b]0;x\x07A\x9b31m[/][red]\u202egnirts\u2066\x00\r\nDrive: safe\u2028 \x7f"
 ROOT = Path(__file__).parents[2]

@@ -20,16 +20,16 @@ from drivers.preflight import Table
 from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile, Register
 from profiles.visible import visible
-from tdhil.cli.buses.modbus import SettingsRefused, open_line
-from tdhil.cli.buses.modbus_line import ModbusConfig
-from tdhil.cli.connection import Connection
 from tdhil.cli.found_drive import FoundDrive
 from tdhil.cli.profile_text import register_uses
 from tdhil.config.options import Origin, Setting
 from tdhil.config.rig import DriveData
+from tdhil.session.buses.modbus import SettingsRefused, open_line
+from tdhil.session.buses.modbus_line import ModbusConfig
+from tdhil.session.connection import Connection
 
 if TYPE_CHECKING:
-    from tdhil.cli.connection import PeerPlan
+    from tdhil.session.connection import PeerPlan
 
 
 # ---------------------------------------------------------------------------------------------------------------------

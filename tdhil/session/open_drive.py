@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tdhil.errors import UsageError
+from tdhil.session.connection import PeerPlan
+
+if TYPE_CHECKING:
+    from tdhil.config.options import RunOptions
+    from tdhil.session.connection import Connection
 
 from drivers.clock import Clock, MonotonicClock, SteppedClock
 from drivers.drive import Drive, FrameTap
-from tdhil.cli.connection import Connection, PeerPlan
 from tdhil.config.options import RunOptions
 from tdhil.config.rig import DriveData
-from tdhil.errors import UsageError
+from tdhil.session.connection import Connection
 
 
 def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
@@ -47,12 +55,30 @@ def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
     if connection.drive == "modbus":
-        from tdhil.cli.buses.modbus import open_modbus
+        from tdhil.session.buses.modbus import open_modbus
 
         with open_modbus(plan, options, connection, data, clock, tap, trace) as modbus:
             yield modbus
     else:
-        from tdhil.cli.buses.canopen import open_canopen
+        from tdhil.session.buses.canopen import open_canopen
 
         with open_canopen(plan, options, connection, data, clock, tap, trace) as canopen:
             yield canopen
+
+
+def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> PeerPlan:
+    """The plan with these faults. UsageError where the peer isn't ours to spoil."""
+    if not texts:
+        return plan
+    if not plan.embedded:
+        raise UsageError(
+            "faults can be scripted in the embedded simulator only", where="--fault",
+            next_step="Add --simulate, or give --fault to tdhil simulate",
+        )
+    if drive == "modbus":
+        from sim_bus.modbus.faults import parse_all as parse_modbus
+
+        return replace(plan, faults=parse_modbus(texts, "embedded"))
+    from sim_bus.canopen.faults import parse_all
+
+    return replace(plan, faults=parse_all(texts))

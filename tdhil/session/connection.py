@@ -9,12 +9,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from drivers.errors import DataFileError, Problem
-from profiles.library import load_canopen_profile, load_modbus_profile, load_profile
+from profiles.library import Profile, load_canopen_profile, load_modbus_profile, load_profile
 from profiles.modbus import ModbusProfile
-from tdhil.cli.buses.can_bus import BusConfig, bus_config
-from tdhil.cli.buses.modbus_line import ModbusConfig, asked_for, modbus_config
 from tdhil.config.options import Origin, RunOptions, Setting
 from tdhil.errors import UsageError
+from tdhil.session.buses.can_bus import BusConfig, bus_config
+from tdhil.session.buses.modbus_line import ModbusConfig, asked_for, modbus_config
 
 if TYPE_CHECKING:
     from profiles.library import Profile
@@ -142,3 +142,10 @@ class PeerPlan:
     def epoch_ns(self) -> int:
         """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
         return time.time_ns()
+
+
+def rated_torque_is_told_by_hand(profile: Profile) -> bool:
+    """Does rig.yaml have to say what 100 % torque is?"""
+    if isinstance(profile, ModbusProfile):
+        return profile.rated_torque is None
+    return profile.torque.rated_torque_nm_per_lsb is None

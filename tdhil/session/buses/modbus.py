@@ -13,14 +13,14 @@ from drivers.drive import FrameTap
 from drivers.errors import PreflightRefused, TdhilError
 from drivers.modbus.drive import ModbusDrive
 from profiles.modbus import ModbusProfile
-from tdhil.cli.buses.modbus_line import ModbusConfig
-from tdhil.cli.connection import Connection
 from tdhil.config.options import RunOptions
 from tdhil.config.rig import DriveData
+from tdhil.session.buses.modbus_line import ModbusConfig
+from tdhil.session.connection import Connection
 
 if TYPE_CHECKING:
     from drivers.modbus.link import Link
-    from tdhil.cli.connection import PeerPlan
+    from tdhil.session.connection import PeerPlan
 
 
 class SettingsRefused(PreflightRefused):

@@ -1,21 +1,14 @@
-"""From a Recording to the printed result: the same road for a live run and for its replay."""
+"""From a Recording to the result document: the same road for a live run and for its replay."""
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
-from tdhil.cli.streams import OutputLost
 from tdhil.errors import ExitCode, UsageError
 from tdhil.estimation.result import Identification, Verdict
 from tdhil.recording.recording import Recording
-
-# ---------------------------------------------------------------------------------------------------------------------
-# What a stopping rule means for the result: intervals a little wider, so that they cover as asked after looking.
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
@@ -47,12 +40,19 @@ def after_looks(found: Identification, run: Mapping[str, Any], confidence: float
     return found
 
 
-# ---------------------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class Conclusion:
+    """What was identified, as it is printed and kept, and how a process ends with it."""
+
+    identification: Identification
+    document: dict[str, Any]
+    exit_code: ExitCode
+
 
 def conclude(
     recording: Recording, run: Mapping[str, Any], log: str, warnings: Sequence[str] | None = None
-) -> tuple[dict[str, Any], ExitCode]:
-    """The result document and the exit code it means. ``run`` is the log's configuration.
+) -> Conclusion:
+    """The identification, its document, and the exit code it means. ``run`` is the log's configuration.
 
     ``warnings``: what was assumed in reading a foreign trace; None for a run of ours.
     """
@@ -76,7 +76,8 @@ def conclude(
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
     stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
-    return result_document(identification, recording, run, log), ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
+    document = result_document(identification, recording, run, log)
+    return Conclusion(identification, document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
 
 
 def _stop_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
@@ -84,30 +85,3 @@ def _stop_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
     stop = run.get("stop")
     unseen = isinstance(stop, Mapping) and stop.get("confirmed") is False
     return ("at the end of this run the shaft was NOT seen at rest: the stop was not confirmed",) if unseen else ()
-
-
-def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:
-    """Where one was asked for, the page as a file. Raises UsageError if it can't be written."""
-    if path is not None:
-        from tdhil.report.html import write_report
-
-        written = write_report(document, recording, path)
-        if written != path:
-            print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
-
-
-def print_result(document: Mapping[str, Any], as_json: bool) -> None:
-    """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
-    from tdhil.report.card import print_card
-    from tdhil.report.console import PlainConsole
-
-    try:
-        if as_json:
-            json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-            sys.stdout.write("\n")
-        else:
-            print_card(document, PlainConsole())
-        sys.stdout.flush()
-    except (BrokenPipeError, OutputLost):
-        print_card(document, PlainConsole(sys.stderr))
-        raise

@@ -12,16 +12,15 @@ from drivers.clock import Clock
 from drivers.drive import FrameTap
 from drivers.left_behind import LeftBehind
 from profiles.canopen import CanopenProfile
-from tdhil.cli.connection import Connection
-from tdhil.cli.profile_text import rated_torque_is_told_by_hand
 from tdhil.config.options import RunOptions
 from tdhil.config.rig import DriveData
+from tdhil.session.connection import Connection, rated_torque_is_told_by_hand
 
 if TYPE_CHECKING:
     import can
 
     from sim_bus.canopen.simulator import Simulator
-    from tdhil.cli.connection import PeerPlan
+    from tdhil.session.connection import PeerPlan
 
 PLAIN = "generic/cia402"
 """What the simulator is when it wears no profile."""
@@ -63,7 +62,7 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
             # Before the simulator runs out by itself: what comes then is no part of the run.
             stack.callback(lambda: plan.never_came.extend(simulator.faults_waiting))
         else:
-            from tdhil.cli.buses.can_bus import open_bus
+            from tdhil.session.buses.can_bus import open_bus
 
             channel = open_bus(connection.bus)
         stack.callback(channel.shutdown)

@@ -1,0 +1,306 @@
+"""What `import tdhil` offers: read, identify, open_drive, simulate, run. The command line goes the same ways.
+
+::
+
+    recording = tdhil.read("run.mcap")
+    result = tdhil.identify(recording)
+    result.inertia.value, result.to_dict()
+
+    with tdhil.simulate(seed=7) as drive:
+        recording = tdhil.run(drive, tdhil.Multisine())
+
+Everything here raises `tdhil.TdhilError` and its kind, each with what happened, where, and what to do next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from tdhil.errors import ExitCode, UsageError
+from tdhil.session.recorded import RunRecord, read
+
+if TYPE_CHECKING:
+    from tdhil.config.rig import Rig
+    from tdhil.estimation import Identification, InertiaEstimate, Verdict
+    from tdhil.session.run_session import Attendant, Consent, RunRequest
+
+__all__ = [
+    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify",
+    "open_drive", "read", "run", "simulate",
+]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Motions of stage 5
+
+
+@dataclass(frozen=True)
+class Multisine:
+    """Several tones at once, of a low crest factor: the default. None: chosen to fit the rig.
+
+    ``frequency_hz``: the lowest line; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
+    ``periods``: at each mean speed, those that settle included.
+    """
+
+    kind: ClassVar[str] = "multisine"
+    frequency_hz: float | None = None
+    amplitude_rad_s: float | None = None
+    offset_rad_s: float | None = None
+    periods: int | None = None
+
+
+@dataclass(frozen=True)
+class Sine(Multisine):
+    """One tone (equation 8 of the paper)."""
+
+    kind: ClassVar[str] = "sine"
+
+
+@dataclass(frozen=True)
+class Step(Multisine):
+    """A square wave of speed (equation 9 of the paper)."""
+
+    kind: ClassVar[str] = "step"
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """Torque pulses between steady speeds: no line, no period."""
+
+    kind: ClassVar[str] = "pulses"
+    amplitude_rad_s: float | None = None
+    offset_rad_s: float | None = None
+    periods: int | None = None
+
+
+@dataclass(frozen=True)
+class CoastDown(Pulses):
+    """Without torque from one speed to another, and back up under power. Never with a drill string."""
+
+    kind: ClassVar[str] = "coast-down"
+
+
+Motion = Multisine | Pulses
+"""What stage 5 can be asked for."""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Identifying
+
+
+@dataclass(frozen=True)
+class Result:
+    """What was identified from one recording. Shows itself as the card: in a terminal, and in a notebook."""
+
+    identification: Identification
+    document: Mapping[str, Any]
+    record: RunRecord = field(repr=False)
+
+    @property
+    def inertia(self) -> InertiaEstimate | None:
+        """At the motor shaft, kg·m², with both intervals; None where it can't be known, and `reason` says why."""
+        return self.identification.inertia
+
+    @property
+    def verdict(self) -> Verdict:
+        return self.identification.verdict
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """How ``tdhil replay`` would end: 0 where there is a number to quote, 9 where not."""
+        from tdhil.estimation.result import Verdict
+
+        stands = self.identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
+        return ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
+
+    @property
+    def reason(self) -> str:
+        return self.identification.reason
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON document of ``tdhil identify --json``, exactly."""
+        return dict(self.document)
+
+    def save_report(self, path: str | Path) -> Path:
+        """Write the report, HTML or PDF by its name, and say where it went. Raises UsageError (extra `report`)."""
+        from tdhil.report.html import check_report_path, write_report
+
+        check_report_path(Path(path), Path(self.record.log), "save_report")
+        return write_report(self.document, self.record.recording, Path(path))
+
+    def __str__(self) -> str:
+        from tdhil.report.card import card_text
+
+        return card_text(self.document)
+
+    def _repr_html_(self) -> str:
+        from tdhil.report.card import card_html
+
+        return card_html(self.document)
+
+
+def identify(
+    recorded: RunRecord,
+    *,
+    model: str | None = None,
+    confidence: float | None = None,
+    tolerance: float | None = None,
+) -> Result:
+    """Identify J and all that comes with it from a recording; the same as ``tdhil replay``, digit for digit.
+
+    ``model``: auto, rigid, two-mass, string or paper; ``confidence`` of the intervals; ``tolerance``: the relative
+    half-width that is enough for `valid`. None: as the run had it. Raises UsageError for values that can't be, and
+    NothingRecorded where the run in a log ended before anything moved.
+    """
+    from tdhil.session.conclude import conclude
+
+    recorded.require_motion()
+    asked = {"model": model, "confidence": confidence, "tolerance": tolerance}
+    configuration = recorded.asked({name: value for name, value in asked.items() if value is not None})
+    found = conclude(recorded.recording, configuration, recorded.log, recorded.assumed)
+    return Result(found.identification, found.document, recorded)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Moving
+
+
+@dataclass(frozen=True)
+class DriveHandle:
+    """Which drive, on which bus, with which rig. Nothing is open: each `run` opens it, and closes it at rest."""
+
+    rig: Rig | None
+    options: Mapping[str, Any]
+    faults: tuple[str, ...] = ()
+
+
+@contextmanager
+def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
+    """The drive of a rig.yaml. ``options``: those of the command line by their names in rig.yaml, such as
+    ``interface``, ``channel``, ``node``, ``host``, ``unit``, ``profile``, ``rate_hz``.
+
+    Raises DataFileError with every problem and its line, and UsageError for options that can't be.
+    """
+    from tdhil.config.rig import load_rig
+
+    handle = DriveHandle(load_rig(Path(rig)), dict(options))
+    _request(handle, Multisine(), {})
+    yield handle
+
+
+@contextmanager
+def simulate(
+    *,
+    seed: int | None = None,
+    plant: str | Path | None = None,
+    drive: Literal["canopen", "modbus"] = "canopen",
+    profile: str | None = None,
+    rig: str | Path | None = None,
+    faults: Sequence[str] = (),
+    real_time: bool = False,
+) -> Iterator[DriveHandle]:
+    """The embedded simulated drive and rig, in stepped time; ``plant``: a plant.yaml; ``faults`` as of ``--fault``."""
+    from tdhil.config.rig import load_rig
+
+    asked = {
+        "simulate": True, "seed": seed, "plant": None if plant is None else str(plant), "drive": drive,
+        "profile": profile, "real_time": real_time or None,
+    }
+    given = {name: value for name, value in asked.items() if value is not None}
+    handle = DriveHandle(None if rig is None else load_rig(Path(rig)), given, tuple(faults))
+    _request(handle, Multisine(), {})
+    yield handle
+
+
+def run(
+    drive: DriveHandle,
+    motion: Motion | None = None,
+    *,
+    confirm: Callable[[str], bool] | None = None,
+    log: str | Path = "run.mcap",
+    mode: Literal["torque", "speed"] | None = None,
+    tolerance: float | None = None,
+    max_time_s: float | None = None,
+    operator: str | None = None,
+    note: str | None = None,
+    **consent: Any,
+) -> RunRecord:
+    """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
+
+    ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
+    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``consent``: fields of
+    `tdhil.session.Consent`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread.
+
+    Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
+    where it was not seen at rest: use the hard-wired stop then.
+    """
+    from tdhil.run.stop import not_confirmed
+    from tdhil.session.run_session import Consent, RunSession
+
+    unknown = set(consent) - {one.name for one in fields(Consent)}
+    if unknown:
+        raise UsageError(f"no such consent: {', '.join(sorted(unknown))}", where="tdhil.run")
+    asked = {"log": str(log), "mode": mode, "tolerance": tolerance, "max_time_s": max_time_s}
+    request = _request(drive, motion or Multisine(), {name: one for name, one in asked.items() if one is not None},
+                       Consent(**consent), operator, note)
+    session = RunSession(request, _attendant(request, confirm))
+    try:
+        outcome = session.move()
+    except BaseException:
+        session.abandon()
+        raise
+    recording, configuration = session.log.recording(complete=True), session.log.run
+    cause = outcome.cause
+    if cause is not None:
+        cause.add_note(f"log: {session.path}")
+        session.abandon()
+    else:
+        session.close()
+    if outcome.stop is not None and not outcome.stop.confirmed:
+        raise not_confirmed(outcome.stop) from cause       # the loudest there is, whatever came first
+    if cause is not None:
+        raise cause
+    return RunRecord(recording, configuration, str(session.path))
+
+
+def _request(
+    drive: DriveHandle,
+    motion: Motion,
+    asked: Mapping[str, Any],
+    consent: Consent | None = None,
+    operator: str | None = None,
+    note: str | None = None,
+) -> RunRequest:
+    """The same checks, in the same order, as the command line's. Raises UsageError, DataFileError, PreflightRefused."""
+    from tdhil.config.options import resolve
+    from tdhil.session.connection import can_torque, connection_of
+    from tdhil.session.consent import check_names
+    from tdhil.session.log_place import check_log_path
+    from tdhil.session.open_drive import plan_peer, with_faults
+    from tdhil.session.plan_ahead import refuse_hopeless
+    from tdhil.session.run_session import Consent, RunRequest
+    from tdhil.session.task import suited
+
+    given = {name: value for name, value in asdict(motion).items() if value is not None}
+    cli = {**drive.options, **asked, "excitation": motion.kind, **given}
+    options, connection = connection_of(cli, drive.rig, resolve(cli, drive.rig))
+    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_log_path(Path(options.log), "log")
+    peer = with_faults(plan_peer(options, connection), drive.faults, connection.drive)
+    bench = suited(drive.rig, peer.plant)
+    refuse_hopeless(options, bench, can_torque(connection.profile))
+    return RunRequest(options, connection, peer, bench, consent or Consent(), operator, note)
+
+
+def _attendant(request: RunRequest, confirm: Callable[[str], bool] | None) -> Attendant:
+    from tdhil.report.live import stderr_console
+    from tdhil.session.confirm import AskingAttendant, TerminalAttendant
+
+    gear_ratio = 1.0 if request.rig is None else request.rig.gear.ratio
+    if confirm is None:
+        return TerminalAttendant(stderr_console(), gear_ratio=gear_ratio)
+    return AskingAttendant(stderr_console(), confirm, gear_ratio=gear_ratio)

@@ -1,0 +1,39 @@
+"""The result on stdout, as a card or as one JSON document, and as a report where one was asked for."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from tdhil.cli.streams import OutputLost
+from tdhil.recording.recording import Recording
+
+
+def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:
+    """Where one was asked for, the page as a file. Raises UsageError if it can't be written."""
+    if path is not None:
+        from tdhil.report.html import write_report
+
+        written = write_report(document, recording, path)
+        if written != path:
+            print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
+
+
+def print_result(document: Mapping[str, Any], as_json: bool) -> None:
+    """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
+    from tdhil.report.card import print_card
+    from tdhil.report.console import PlainConsole
+
+    try:
+        if as_json:
+            json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+            sys.stdout.write("\n")
+        else:
+            print_card(document, PlainConsole())
+        sys.stdout.flush()
+    except (BrokenPipeError, OutputLost):
+        print_card(document, PlainConsole(sys.stderr))
+        raise

@@ -1,0 +1,162 @@
+"""Where a run's files go: never over an older log, never into a live one, never over a file that isn't theirs."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    pass
+
+
+_LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
+
+
+class LogPlace:
+    """The file of one run. ``open`` takes it; ``settle`` gives it its last name once it is closed.
+
+    A log that another run is writing is left alone, and this one gets a name of its own. What a run that ended before
+    anything moved leaves behind goes beside the last good log, which keeps its name.
+    """
+
+    def __init__(self, wanted: Path) -> None:
+        self.wanted = wanted
+        self.path = wanted
+        self.older: Path | None = None         # where an older log was moved to
+        self.live = False                      # somebody else is writing ``wanted``
+        self.motion = False                    # set by whoever lets the shaft move
+
+    def open(self, wanted: Path) -> IO[bytes]:
+        """The file, held against other runs for as long as it is open. OSError, or UsageError for a foreign file."""
+        with _held(wanted.parent):
+            if wanted.exists() and not wanted.is_file():
+                return wanted.open("wb", buffering=0)      # a device
+            check_log_path(wanted)
+            self.live = wanted.is_file() and is_live(wanted)
+            if self.live:
+                self.path = _dated(wanted, time.time())
+            else:
+                self.older = make_room(wanted)
+            file = self.path.open("xb", buffering=0)
+            _lock(file.fileno())
+            return file
+
+    def name(self, *, stub: bool) -> Path:
+        """What the file will be called in the end. ``stub``: nothing moved in this run."""
+        if stub and self.older is not None and not _is_stub(self.older):
+            return self.wanted.with_name(f"{self.wanted.stem}.refused{self.wanted.suffix}")
+        return self.path
+
+    def settle(self, *, stub: bool) -> None:
+        """Once the file is closed: a stub makes room for the older log again."""
+        final = self.name(stub=stub)
+        if final != self.path and self.older is not None:
+            with suppress(OSError), _held(self.wanted.parent):      # nothing is lost under the names as they are
+                self.path.replace(final)
+                self.older.rename(self.path)
+                self.path = final
+
+
+def check_log_path(path: Path, where: str = "--log") -> None:
+    """UsageError for a file that is no log: it would be moved aside by mistake."""
+    from tdhil.recording.mcap_container import MAGIC
+
+    if not path.is_file() or path.suffix == ".mcap":
+        return
+    with suppress(OSError), path.open("rb") as file:
+        if file.read(5) in (b"", MAGIC[:5]):
+            return
+    raise UsageError("is no log; it is left as it is", where=f"{where} {path}", next_step="Name another, as run.mcap")
+
+
+def check_names(paths: Mapping[str, Path | None]) -> None:
+    """UsageError where two of the files that a run reads or writes are the same one; by option."""
+    seen: dict[Path, str] = {}
+    for option, path in paths.items():
+        if path is None:
+            continue
+        real = path.resolve()
+        if real in seen:
+            raise UsageError(f"is the file of {seen[real]} too", where=f"{option} {path}", next_step="Name another")
+        seen[real] = option
+
+
+def make_room(path: Path) -> Path | None:
+    """Move an older log at ``path`` aside, named by the time it was last written; its new place, if there was one."""
+    if not path.is_file():
+        return None
+    older = _dated(path, path.stat().st_mtime)
+    path.rename(older)
+    return older
+
+
+def is_live(path: Path) -> bool:
+    """Is some process writing this log now? False where the system can't tell."""
+    try:
+        import fcntl
+    except ImportError:
+        try:
+            path.rename(path)      # Windows renames nothing that is open
+        except OSError:
+            return True
+        return False
+    with suppress(OSError), path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def _dated(path: Path, time_s: float) -> Path:
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(time_s))
+    dated = path.with_name(f"{path.stem}-{stamp}{path.suffix}")
+    number = 1
+    while dated.exists():
+        number += 1
+        dated = path.with_name(f"{path.stem}-{stamp}-{number}{path.suffix}")
+    return dated
+
+
+def _is_stub(path: Path) -> bool:
+    """Does an older log hold no motion either?"""
+    from tdhil.errors import LogError
+    from tdhil.recording.log_reader import read_run
+
+    with suppress(OSError, LogError):
+        return path.stat().st_size < _LARGEST_STUB and not any(
+            stage.name != "setup" for stage in read_run(path).stages
+        )
+    return True
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """No other run chooses a name in this folder meanwhile; where the system has no such lock, nothing is held."""
+    descriptor = None
+    try:
+        import fcntl
+
+        with suppress(OSError):
+            descriptor = os.open(folder, os.O_RDONLY)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except ImportError:
+        pass
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _lock(descriptor: int) -> None:
+    with suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,0 +1,218 @@
+"""What was recorded, with all that identification needs: a log of ours or a trace in CSV, told apart by its content."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
+from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.recording import LagPrior, Recording, aborted_stage
+from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD, UNKNOWN_LAG_SD_SHARE
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from tdhil.recording.run_log import Ended
+
+_REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
+"""Exit codes of a run that tell of the run; the others tell of the process that it was."""
+
+_UNITS = {"time_s": "s", "speed_rad_s": "rad/s", "torque_nm": "N m", "fresh": "1", "limited": "1"}
+_LONG_NAMES = {
+    "time_s": "control time of the SYNC", "speed_rad_s": "reported speed of the motor shaft",
+    "torque_nm": "reported torque of the motor shaft", "fresh": "this cycle brought new feedback",
+    "limited": "an internal limit of the drive was active",
+}
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run or one trace. ``configuration``: the run's, as its log has it; ``log``: the file.
+
+    ``assumed``: what was assumed in reading a foreign trace, None for a run of ours; ``problems``: what of the file was
+    stepped over, a line each.
+    """
+
+    recording: Recording
+    configuration: Mapping[str, Any]
+    log: str
+    assumed: tuple[str, ...] | None = None
+    problems: tuple[str, ...] = ()
+    ended: Ended | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Did the run come to its end, and all of it into the log?"""
+        return self.recording.complete and aborted_stage(self.recording) is None
+
+    def asked(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """The configuration, with other settings of identification."""
+        own = {**self.configuration.get("identify", {}), **asked}
+        return {**self.configuration, "identify": own} if asked else dict(self.configuration)
+
+    def with_said(self, said: Mapping[str, str]) -> RunRecord:
+        """The same with another operator or note."""
+        return replace(self, configuration={**self.configuration, **said})
+
+    def require_motion(self) -> None:
+        """Raise NothingRecorded where the run was refused, or ended in setup: what ended it is all there is to say.
+
+        It has that run's own exit code, but for one that tells of a process and not of a run.
+        """
+        from tdhil.errors import NothingRecorded
+
+        ended, stages = self.ended, self.recording.stages
+        if ended is None or (len(self.recording.time_s) and any(stage.name != "setup" for stage in stages)):
+            return
+        in_stage = f"in stage {stages[-1].name}" if stages else "before its first stage"
+        raise NothingRecorded(
+            f"the run in this log ended {in_stage}, with nothing to identify from: {ended.message}",
+            ended.exit_code if ended.exit_code in _REPEATED else ExitCode.PARTIAL,
+            where=self.log, next_step=ended.next_step,
+        )
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The samples, a row a cycle, indexed by ``time_s``; units in ``attrs`` (extra `notebook`)."""
+        frame = _extra("pandas").DataFrame(self._columns()).set_index("time_s")
+        frame.attrs = {"units": dict(_UNITS), "log": self.log, "simulated": self.recording.simulated}
+        return frame
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The samples along ``time_s``, each with its unit and long name (extra `notebook`)."""
+        library = _extra("xarray")
+        columns = self._columns()
+        time_s = columns.pop("time_s")
+        described = {name: {"units": _UNITS[name], "long_name": _LONG_NAMES[name]} for name in _UNITS}
+        return library.Dataset(
+            {name: ("time_s", values, described[name]) for name, values in columns.items()},
+            coords={"time_s": ("time_s", time_s, described["time_s"])},
+            attrs={"log": self.log, "gear_ratio": self.recording.gear_ratio,
+                   "simulated": int(self.recording.simulated)},
+        )
+
+    def __len__(self) -> int:
+        return len(self.recording.time_s)
+
+    def __repr__(self) -> str:
+        recording = self.recording
+        time_s = recording.time_s
+        lasted = f", {time_s[-1] - time_s[0]:.0f} s" if len(time_s) else ""
+        kind = f", {recording.excitation.kind}" if recording.excitation is not None else ""
+        return f"<{'SIMULATED ' if recording.simulated else ''}run {self.log}: {len(self)} samples{lasted}{kind}>"
+
+    def _columns(self) -> dict[str, Any]:
+        return {name: getattr(self.recording, name) for name in _UNITS}
+
+
+def read(
+    path: str | Path,
+    *,
+    columns: Sequence[str] | None = None,
+    excitation: str | Path | None = None,
+    rated_torque_nm: float | None = None,
+    torque_limit_nm: float | None = None,
+    gear_ratio: float | None = None,
+    torque_scale_rel_sd: float | None = None,
+    lags: LagPrior | None = None,
+) -> RunRecord:
+    """Read a run.mcap, whole or cut short, or a trace in CSV; the options are those of ``tdhil replay`` for a trace.
+
+    ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an excitation.yaml. A
+    log of ours brings all of it along. Raises LogError (nothing of ours in the file), DataFileError (with the line)
+    and UsageError.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError("there is no such log", where=str(path),
+                         next_step="Name a run.mcap of this tool, or a trace in CSV")
+    if is_log(path):
+        of_trace = {
+            "columns": columns, "excitation": excitation, "rated_torque_nm": rated_torque_nm, "lags": lags,
+            "torque_limit_nm": torque_limit_nm, "gear_ratio": gear_ratio, "torque_scale_rel_sd": torque_scale_rel_sd,
+        }
+        for name, value in of_trace.items():
+            if value is not None:
+                raise UsageError("is for a trace in CSV; this log brings its own", where=name)
+        return _read_log(path)
+    return _read_trace(
+        path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags
+    )
+
+
+def is_log(path: Path) -> bool:
+    """Tell MCAP by its first bytes, also if there are no more than some of them. Raises NothingRecoverable."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise NothingRecoverable(f"can't be read ({error.strerror or error})", where=str(path)) from error
+    return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
+
+
+def stated_lags(
+    speed_lag_s: float | None, speed_lag_sd_s: float | None, torque_lag_s: float | None, torque_lag_sd_s: float | None,
+    source: str = "",
+) -> LagPrior:
+    """Reporting lags as somebody states them; without a deviation it is a tenth."""
+    def deviation(lag_s: float | None, stated_s: float | None) -> float:
+        if lag_s is None:
+            return 0.0
+        return UNKNOWN_LAG_SD_SHARE * lag_s if stated_s is None else stated_s
+
+    known = speed_lag_s is not None or torque_lag_s is not None
+    return LagPrior(
+        speed_lag_s, deviation(speed_lag_s, speed_lag_sd_s), torque_lag_s, deviation(torque_lag_s, torque_lag_sd_s),
+        source if known else "",
+    )
+
+
+def _read_log(path: Path) -> RunRecord:
+    from tdhil.recording.log_reader import read_run
+    from tdhil.recording.run_log import find_ended
+
+    try:
+        found = read_run(path)
+    except LogError as error:
+        raise NothingRecoverable(error.what, where=error.where, next_step=error.next_step) from error
+    ended = find_ended(found.configuration, found.events)
+    configuration: dict[str, Any] = found.configuration | ({} if ended is None else {"ended": asdict(ended)})
+    if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
+        began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
+        configuration["started"] = began.isoformat(timespec="seconds")
+    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended)
+
+
+def _read_trace(
+    path: Path, columns: Sequence[str] | None, excitation: str | Path | None, rated_torque_nm: float | None,
+    torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None, lags: LagPrior | None,
+) -> RunRecord:
+    from tdhil.recording.csv.layout import USUAL, parse_columns
+    from tdhil.recording.csv.reader import Bench, read_recording
+
+    bench = Bench(
+        rated_torque_nm=rated_torque_nm,
+        torque_limit_nm=torque_limit_nm,
+        torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
+        gear_ratio=1.0 if gear_ratio is None else gear_ratio,
+        lag_prior=LagPrior() if lags is None else lags,
+    )
+    choices = USUAL if columns is None else parse_columns(list(columns))
+    recording, assumed = read_recording(path, choices, None if excitation is None else Path(excitation), bench)
+    if scale is None:
+        assumed = (*assumed, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
+    return RunRecord(recording, {"identify": {"tolerance": 0.05, "confidence": 0.95}}, str(path), assumed)
+
+
+def _extra(name: str) -> Any:
+    """A library of the extra `notebook`. Raises UsageError, which says how to get it."""
+    from importlib import import_module
+
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise UsageError(f"{name} is not installed", next_step="Install it with: pip install '.[notebook]'") from error

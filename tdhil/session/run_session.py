@@ -1,0 +1,238 @@
+"""One run, from what was asked for to a log that is closed: log, drive, Runner, identification.
+
+The command line and the Python API both go through here, so that guard, stop and confirmation are the same. What a
+person sees and is asked is an `Attendant`'s; nothing here prints.
+"""
+
+from __future__ import annotations
+
+import io
+from contextlib import AbstractContextManager, suppress
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from tdhil.config.options import RunOptions
+from tdhil.config.rig import Rig
+from tdhil.errors import LogError
+from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.run_log import RunLog
+from tdhil.run.runner import Runner
+from tdhil.run.task import Display, Idle, RunOutcome, Task
+from tdhil.session.connection import Connection, PeerPlan
+from tdhil.session.consent import accepted_lines, note, require_accepted
+from tdhil.session.log_place import LogPlace
+from tdhil.session.open_drive import open_drive
+from tdhil.session.real_time import real_time_priority
+from tdhil.session.stop_signals import stop_on_signals
+from tdhil.session.task import bench_of, excitation_request, facts, machine_limits
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from drivers.drive import Identity, Preflight
+    from tdhil.session.conclude import Conclusion
+
+
+@dataclass(frozen=True)
+class Consent:
+    """What the operator takes upon himself by name, for one run: no file of the bench says any of it."""
+
+    no_watchdog: bool = False
+    shared_watchdog: bool = False
+    wider_limits: tuple[str, ...] = ()
+    speed_unit: bool = False
+    reset_fault: bool = False
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """Everything that is known of a run before a drive is touched."""
+
+    options: RunOptions
+    connection: Connection
+    peer: PeerPlan
+    rig: Rig | None
+    consent: Consent = field(default_factory=Consent)
+    operator: str | None = None
+    note: str | None = None
+    real_time_priority: bool = False
+
+
+class Attendant(Protocol):
+    """Who is there while a run goes: watches it, lets the shaft move, sees it turn."""
+
+    def watch(self) -> AbstractContextManager[Display]:
+        """The display of this run, for as long as it goes."""
+        ...
+
+    def confirm(self, task: Task, preflight: Preflight, idle: Idle, unverified: tuple[str, ...]) -> None:
+        """Return if the shaft may be moved; raise PreflightRefused if not."""
+        ...
+
+    def confirm_speed(self, speed_rad_s: float, why: str, idle: Idle) -> None:
+        """Return if the shaft is seen to turn at that speed; raise PreflightRefused if not."""
+        ...
+
+    def say(self, text: str) -> None:
+        """Take one line, by the way."""
+        ...
+
+    def warn(self, text: str) -> None:
+        """Take one line that must not be missed."""
+        ...
+
+
+class RunSession:
+    """One run. `move` runs the drive, `conclude` identifies; `close` always, or `abandon` where all else failed."""
+
+    def __init__(self, request: RunRequest, attendant: Attendant, *, report: bool = False) -> None:
+        """Open the log; nothing else is touched. ``report``: one will be written, so its modules are loaded as well."""
+        load_what_the_end_needs(report)
+        options, peer = request.options, request.peer
+        self._request, self._attendant = request, attendant
+        self._place = place = LogPlace(Path(options.log))
+        writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
+                           modbus=request.connection.drive == "modbus")
+        writer.path = place.path
+        if place.live:
+            attendant.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")
+        elif place.older is not None:
+            attendant.say(f"an older {place.wanted} was kept as {place.older}")
+        self._outcome: RunOutcome | None = None
+        said = {"operator": request.operator, "note": request.note}
+        self.log = RunLog(writer, configuration(request) | said)
+
+    @property
+    def path(self) -> Path:
+        """What the log will be called in the end."""
+        return self._place.name(stub=self._stub)
+
+    @property
+    def _stub(self) -> bool:
+        stopped = self._outcome is not None and self._outcome.stop is not None
+        return not (self._place.motion or stopped)
+
+    def move(self) -> RunOutcome:
+        """Connect, five stages, stop, close. Raises what kept the drive from being opened."""
+        request, log, attendant = self._request, self.log, self._attendant
+        options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
+        trace = None if options.trace is None else Path(options.trace)
+        data = rig.drive_data if rig is not None else None
+        with stop_on_signals() as stop_request, open_drive(
+            peer, options, connection, data, log.frame, trace
+        ) as drive, attendant.watch() as display, real_time_priority(
+            request.real_time_priority, stepped=peer.stepped
+        ) as raised:
+            if raised.said:
+                log.configure(real_time_priority=raised.plain())
+                attendant.say(raised.said)
+            self._outcome = outcome = Runner(
+                drive,
+                self._task,
+                log,
+                stop_request,
+                display,
+                self._confirm,
+                reset_fault=request.consent.reset_fault,
+                say=attendant.say,
+                confirm_speed=attendant.confirm_speed,
+            ).run()
+        for fault in peer.never_came:
+            with suppress(LogError):
+                log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
+            attendant.warn(f"tdhil: --fault {fault} never came: this run did not reach its moment")
+        return outcome
+
+    def conclude(self) -> Conclusion:
+        """Identify from what was recorded, and put the result into the log."""
+        from tdhil.session.conclude import conclude
+
+        found = conclude(self.log.recording(complete=True), self.log.run, str(self.path))
+        with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
+            self.log.result(found.document)
+        return found
+
+    def close(self) -> None:
+        """Finish the log. Raises LogError; the file has its name then, too."""
+        try:
+            self.log.close()
+        finally:
+            self._place.settle(stub=self._stub)
+
+    def abandon(self) -> None:
+        """Finish the log where something else is the cause already. Raises nothing of the log."""
+        with suppress(LogError):
+            self.log.close()
+        self._place.settle(stub=self._stub)
+
+    def _confirm(self, task: Task, preflight: Preflight, idle: Idle) -> None:
+        request = self._request
+        taken = accepted_lines(request.connection.profile, request.options.accept_unverified)
+        self._attendant.confirm(task, preflight, idle, taken)
+        self._place.motion = True
+
+    def _task(self, identity: Identity) -> Task:
+        request, log = self._request, self.log
+        profile, consent, accepted = request.connection.profile, request.consent, request.options.accept_unverified
+        bench = bench_of(identity, request.rig)
+        log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
+        if not identity.simulated:
+            require_accepted(profile, accepted)
+            log.configure(unverified=list(accepted_lines(profile, accepted)))
+        elif text := note(profile):
+            self._attendant.say(text)
+        limits = machine_limits(
+            bench,
+            accept_no_watchdog=consent.no_watchdog,
+            accept_shared_watchdog=consent.shared_watchdog,
+            accept_wider=consent.wider_limits,
+            accept_speed_unit=consent.speed_unit,
+        )
+        return Task(limits, excitation_request(request.options), facts(bench))
+
+
+def configuration(request: RunRequest) -> dict[str, Any]:
+    """For the log: everything that identification needs.
+
+    And the whole profile, so that a later decoder can start again from the raw frames.
+    """
+    options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
+    return {
+        "tdhil": __version__,
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "rig_file": None if rig is None or not rig.file else rig.file,
+        "options": {name: {"value": value, "source": source} for name, value, source in options.rows()},
+        "drive": connection.drive,
+        "bus": {name: {"value": value, "source": source} for name, value, source in connection.rows()},
+        "profile": connection.profile.model_dump(mode="json", by_alias=True),
+        "embedded_simulator": peer.embedded,
+        "stepped": peer.stepped,
+        "seed": peer.seed,
+        "plant": None if peer.plant is None else peer.plant.model_dump(mode="json"),
+        "faults": [fault.text for fault in peer.faults],
+        "identify": {"confidence": options.confidence, "tolerance": options.tolerance, "model": options.model},
+        "converted": [list(row) for row in rig.conversions] if rig is not None else [],
+        "reference_inertia_kg_m2": None if rig is None else rig.reference_inertia_kg_m2,
+    }
+
+
+def load_what_the_end_needs(report: bool) -> None:
+    """Load it before anything moves: later there may be no descriptor left to read what stop and result need."""
+    import traceback  # noqa: F401
+
+    import scipy.optimize
+    import scipy.signal
+    import scipy.special
+    import scipy.stats  # noqa: F401
+    from rich.console import Console
+
+    from tdhil.estimation import identify  # noqa: F401
+    from tdhil.estimation.result import Verdict  # noqa: F401
+    from tdhil.report import card, document, html  # noqa: F401
+    from tdhil.session import conclude  # noqa: F401
+
+    with Console(file=io.StringIO()).status(""):
+        pass      # rich loads its spinners when it needs them
+    if report:
+        from tdhil.report import page, plots  # noqa: F401
