@@ -1,0 +1,211 @@
+"""The Python API: the same documents as the command line's, the same guard, stop and confirmation."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tdhil
+from drivers.drive import Identity, Mode, Preflight
+from drivers.errors import PreflightRefused
+from tdhil.cli.main import main
+from tdhil.errors import ExitCode, UsageError
+from tdhil.session.confirm import AskingAttendant, TerminalAttendant
+
+SHORT = tdhil.Multisine(frequency_hz=0.5, periods=6)
+EXAMPLE = Path(__file__).parents[2] / "examples" / "identify_in_python.py"
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    with contextlib.chdir(folder), tdhil.simulate(seed=7) as drive:
+        return tdhil.run(drive, SHORT, mode="speed", log=folder / "run.mcap", operator="A. Tester")
+
+
+def test_importing_it_loads_nothing():
+    code = "import sys, tdhil; print(sorted({'numpy', 'scipy', 'can', 'rich', 'pydantic'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_every_name_that_it_promises_is_there():
+    for name in tdhil.__all__:
+        assert getattr(tdhil, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = tdhil.nothing
+
+
+def test_a_run_is_read_back_as_it_was(record):
+    again = tdhil.read(record.log)
+    assert (again.recording.time_s == record.recording.time_s).all()
+    assert (again.recording.torque_nm == record.recording.torque_nm).all()
+    assert again.recording.excitation == record.recording.excitation
+    assert again.whole
+    assert again.configuration["operator"] == "A. Tester"
+    assert tdhil.identify(again).to_dict() == tdhil.identify(record).to_dict()
+
+
+def test_the_document_is_that_of_the_command_line(record, capsys):
+    code = main(["replay", record.log, "--json", "--model", "rigid", "--confidence", "0.9"])
+    result = tdhil.identify(tdhil.read(record.log), model="rigid", confidence=0.9)
+    assert json.loads(json.dumps(result.to_dict())) == json.loads(capsys.readouterr().out)
+    assert result.exit_code == code
+
+
+def test_a_result_shows_itself_as_the_card(record, capsys):
+    result = tdhil.identify(record)
+    main(["replay", record.log])
+    assert str(result).split() == capsys.readouterr().out.split()
+    html = result._repr_html_()
+    assert html.startswith("<pre") and "moment of inertia at the motor shaft" in html and "SIMULATED" in html
+    assert max(map(len, str(result).splitlines())) <= 80
+    assert "SIMULATED" in repr(record)
+
+
+def test_a_trace_in_csv_takes_the_options_of_replay(record, capsys, tmp_path):
+    rows = zip(record.recording.time_s, record.recording.speed_rad_s, record.recording.torque_nm, strict=True)
+    trace = tmp_path / "trace.csv"
+    trace.write_text("t,w,m\n" + "".join(f"{t:.4f},{w / 0.10471975512:.4f},{m:.3f}\n" for t, w, m in rows))
+    columns = ["time=t:s", "speed=w:rpm", "torque=m:N·m"]
+    found = tdhil.identify(tdhil.read(trace, columns=columns, gear_ratio=2.0, torque_scale_rel_sd=0.01))
+    main(["replay", str(trace), "--json", "--gear", "2", "--torque-scale-sd", "0.01", "--columns", *columns])
+    assert json.loads(json.dumps(found.to_dict())) == json.loads(capsys.readouterr().out)
+    with pytest.raises(UsageError, match="for a trace in CSV"):
+        tdhil.read(record.log, gear_ratio=2.0)
+
+
+def test_what_ends_a_run_is_raised_once_the_shaft_rests(tmp_path):
+    with tdhil.simulate(seed=7, faults=["sto@speed+15s"]) as drive, pytest.raises(tdhil.TdhilError) as caught:
+        tdhil.run(drive, SHORT, log="broken.mcap")
+    assert "log: broken.mcap" in caught.value.__notes__
+    assert tdhil.read("broken.mcap").ended is not None
+    assert not tdhil.read("broken.mcap").whole
+
+
+def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log(record):
+    with tdhil.simulate(seed=7) as drive, pytest.raises(PreflightRefused, match="plan of stage 5"):
+        tdhil.run(drive, tdhil.Multisine(amplitude_rad_s=1000.0), log="none.mcap")
+    assert not Path("none.mcap").exists()
+
+
+@pytest.mark.parametrize(("wrong", "said"), [
+    ({"plant": "nowhere.yaml"}, "nowhere.yaml"),
+    ({"faults": ["nonsense"]}, "no fault is called"),
+    ({"profile": "nobody/nothing"}, "nobody/nothing"),
+])
+def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
+    with pytest.raises(tdhil.TdhilError, match=said), tdhil.simulate(seed=7, **wrong):
+        pass
+
+
+def test_a_consent_that_there_is_not_is_refused():
+    with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match="no such consent: no_guard"):
+        tdhil.run(drive, SHORT, no_guard=True)
+
+
+class Asked:
+    """A real drive's preflight, as far as a confirmation looks at it."""
+
+    def __init__(self):
+        self.cycles = 0
+
+    def idle(self):
+        self.cycles += 1
+
+
+def ask(attendant, real_preflight, asked):
+    from tdhil.config.rig import simulated_default_rig
+    from tdhil.run.settings import ExcitationRequest
+    from tdhil.run.task import Task
+    from tdhil.session.task import machine_limits
+
+    task = Task(machine_limits(simulated_default_rig()), ExcitationRequest())
+    attendant.confirm(task, real_preflight, asked.idle, ())
+
+
+@pytest.fixture
+def real_preflight():
+    return Preflight(
+        identity=Identity(1, 2, 3, 4, "a real drive", simulated=False), checks=(),
+        modes=frozenset({Mode.SPEED, Mode.TORQUE}), switch_while_enabled=True, quick_stop_in_torque_mode=True,
+        rated_torque_nm=500.0, torque_resolution_nm=0.5, speed_resolution_rad_s=0.01, watchdog_s=0.5,
+        safe_action="quick_stop",
+    )
+
+
+@pytest.mark.parametrize("answer", [False, None, "yes", 1])
+def test_only_true_moves_a_real_shaft(real_preflight, answer):
+    from tdhil.report.live import stderr_console
+
+    told = []
+    attendant = AskingAttendant(stderr_console(), lambda text: told.append(text) or answer)
+    with pytest.raises(PreflightRefused, match="not confirmed"):
+        ask(attendant, real_preflight, Asked())
+    assert "hard-wired emergency stop" in told[0]
+
+
+def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_preflight):
+    import time
+
+    from tdhil.report.live import stderr_console
+
+    asked = Asked()
+
+    def fails(text):
+        time.sleep(0.05)
+        raise RuntimeError("nobody home")
+
+    with pytest.raises(RuntimeError, match="nobody home"):
+        ask(AskingAttendant(stderr_console(), fails), real_preflight, asked)
+    assert asked.cycles > 0
+
+
+def test_without_a_terminal_nobody_confirms(real_preflight, monkeypatch):
+    from tdhil.report.live import stderr_console
+
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(PreflightRefused, match="nobody is there to confirm"):
+        ask(TerminalAttendant(stderr_console()), real_preflight, Asked())
+
+
+def test_true_moves(real_preflight):
+    from tdhil.report.live import stderr_console
+
+    ask(AskingAttendant(stderr_console(), lambda text: True), real_preflight, Asked())
+
+
+def test_frames_for_notebooks(record):
+    pytest.importorskip("pandas")
+    frame = record.to_pandas()
+    assert list(frame.columns) == ["speed_rad_s", "torque_nm", "fresh", "limited"]
+    assert frame.index.name == "time_s" and len(frame) == len(record)
+    assert frame.attrs["units"]["torque_nm"] == "N m"
+
+
+def test_datasets_for_notebooks(record):
+    pytest.importorskip("xarray")
+    data = record.to_xarray()
+    assert data.speed_rad_s.attrs["units"] == "rad/s"
+    assert data.sizes == {"time_s": len(record)}
+
+
+def test_a_library_that_is_missing_is_named(record, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(UsageError, match=r"pandas is not installed.*notebook"):
+        record.to_pandas()
+
+
+def test_the_example_runs(tmp_path):
+    done = subprocess.run([sys.executable, EXAMPLE], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == ExitCode.OK, done.stderr
+    assert "kg·m²" in done.stdout
