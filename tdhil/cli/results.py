@@ -6,10 +6,12 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.streams import OutputLost
-from tdhil.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from tdhil.recording.recording import Recording
 
 
 def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:

@@ -12,6 +12,7 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil import version
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def install_command() -> str:
     This package stands in no index, so its own name would find nothing.
     """
     python = shlex.quote(sys.executable or "python")
-    clone = Path(__file__).resolve().parents[2]
+    clone = Path(version.__file__).resolve().parent.parent
     if (clone / "pyproject.toml").is_file():
         return f"{python} -m pip install -e {shlex.quote(f'{clone}[report]')}"
     try:

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
-from tdhil.recording.mcap_container import MAGIC
-from tdhil.recording.recording import LagPrior, Recording, aborted_stage
-from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD, UNKNOWN_LAG_SD_SHARE
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from tdhil.recording.recording import LagPrior, Recording
     from tdhil.recording.run_log import Ended
 
 _REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
@@ -48,6 +46,8 @@ class RunRecord:
     @property
     def whole(self) -> bool:
         """Did the run come to its end, and all of it into the log?"""
+        from tdhil.recording.recording import aborted_stage
+
         return self.recording.complete and aborted_stage(self.recording) is None
 
     def asked(self, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -88,12 +88,13 @@ class RunRecord:
         columns = self._columns()
         time_s = columns.pop("time_s")
         described = {name: {"units": _UNITS[name], "long_name": _LONG_NAMES[name]} for name in _UNITS}
-        return library.Dataset(
+        data: xarray.Dataset = library.Dataset(
             {name: ("time_s", values, described[name]) for name, values in columns.items()},
             coords={"time_s": ("time_s", time_s, described["time_s"])},
             attrs={"log": self.log, "gear_ratio": self.recording.gear_ratio,
                    "simulated": int(self.recording.simulated)},
         )
+        return data
 
     def __len__(self) -> int:
         return len(self.recording.time_s)
@@ -146,6 +147,8 @@ def read(
 
 def is_log(path: Path) -> bool:
     """Tell MCAP by its first bytes, also if there are no more than some of them. Raises NothingRecoverable."""
+    from tdhil.recording.mcap_container import MAGIC
+
     try:
         with path.open("rb") as file:
             head = file.read(len(MAGIC))
@@ -159,6 +162,9 @@ def stated_lags(
     source: str = "",
 ) -> LagPrior:
     """Reporting lags as somebody states them; without a deviation it is a tenth."""
+    from tdhil.recording.recording import LagPrior
+    from tdhil.session.task import UNKNOWN_LAG_SD_SHARE
+
     def deviation(lag_s: float | None, stated_s: float | None) -> float:
         if lag_s is None:
             return 0.0
@@ -193,6 +199,8 @@ def _read_trace(
 ) -> RunRecord:
     from tdhil.recording.csv.layout import USUAL, parse_columns
     from tdhil.recording.csv.reader import Bench, read_recording
+    from tdhil.recording.recording import LagPrior
+    from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
 
     bench = Bench(
         rated_torque_nm=rated_torque_nm,

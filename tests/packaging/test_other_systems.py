@@ -100,12 +100,12 @@ def test_signals_that_the_system_lacks_are_left_out(monkeypatch):
 
 
 def test_the_hint_installs_from_where_this_was_installed(monkeypatch, tmp_path):
-    import tdhil
+    from tdhil import version
     from tdhil.report.page import install_command
 
     assert "-m pip install -e " in install_command()
     assert "[report]" in install_command()
-    monkeypatch.setattr(tdhil, "__file__", str(tmp_path / "site-packages" / "tdhil" / "__init__.py"))
+    monkeypatch.setattr(version, "__file__", str(tmp_path / "site-packages" / "tdhil" / "version.py"))
     command = install_command()
     assert "matplotlib" in command
     assert "jinja2" in command
