@@ -6,6 +6,7 @@ The simulated drive's watchdog must bring the shaft to rest once nothing reaches
 import can
 import pytest
 
+from sim_bus.canopen.inline import InlineSimulator
 from tests.faults.adapter import Adapter
 from tests.faults.rehearsal import at
 
@@ -15,18 +16,16 @@ WATCHDOG_S = 0.6
 
 @pytest.fixture
 def adapter(rehearse, monkeypatch):
-    """The host's bus; the simulator opens the first one."""
+    """The host's bus, as the simulator hands it out."""
     made = []
-    plain = can.Bus
+    plain = InlineSimulator.station
 
-    def bus(*args, **options):
-        made.append(plain(*args, **options))
-        if len(made) == 2:
-            made[-1] = Adapter(made[-1])
+    def station(simulator):
+        made.append(Adapter(plain(simulator)))
         return made[-1]
 
-    monkeypatch.setattr(can, "Bus", bus)
-    return lambda: made[1]
+    monkeypatch.setattr(InlineSimulator, "station", station)
+    return lambda: made[0]
 
 
 def run_with(rehearse, monkeypatch, after_s, act, *arguments):
