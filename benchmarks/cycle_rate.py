@@ -4,7 +4,7 @@ Three loops take turns, A B C A B C …, in this one process on python-can's vir
 
 A  bare     RPDO1 and SYNC out, TPDO1 in, struct both ways; a thread with python-can alone answers each SYNC.
 B  drive    `Cia402Drive.exchange` against the embedded simulator: stepped, enabled, turning, with all its noise.
-C  run      the same under `Bench.cycle`: guard, every frame, command and sample logged, the file closed.
+C  run      the same under `ControlLoop.cycle`: guard, every frame, command and sample logged, the file closed.
 
 One more round of C is timed piece by piece, as CPU time of each thread. Absolute figures drift with the machine, so
 ratios are what counts: `--require 0.5` makes the exit code say whether B reaches that share of A.
@@ -29,18 +29,18 @@ from can.interfaces.virtual import VirtualBus
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, FrameTap, Limits, Mode, PowerState, Preflight
+from drivers.drive import Command, DriveLimits, FrameTap, Mode, PowerState, Preflight
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.run_log import RunLog
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.guard import Guard
 from tdhil.run.settings import MachineLimits, StopRequest
 
 RATE_HZ = 250.0
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
 TURN = Command(Mode.SPEED, 2.0, 0.0)
 RPDO = Struct("<Hhi")
 SYNC, RPDO_ID, TPDO_ID = 0x080, 0x201, 0x181
@@ -122,7 +122,7 @@ def run_path(cycles: int, clock: Clockwork | None = None) -> float:
             MachineLimits(0.5, LIMITS.speed_rad_s, LIMITS.torque_nm, 1e6), drive.period_s,
             preflight.speed_resolution_rad_s, preflight.torque_resolution_nm,
         )
-        bench = Bench(drive, guard, log, StopRequest())
+        bench = ControlLoop(drive, guard, log, StopRequest())
         if clock:
             clock.attach(simulator, guard, log)
         begin = time.perf_counter()

@@ -21,12 +21,12 @@ import can
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, Sample
+from drivers.drive import Command, DriveLimits, Mode, Sample
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.canopen.simulator import EmbeddedSimulator
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
 TURN = Command(Mode.SPEED, 2.0, 0.0)
 Open = Callable[[ExitStack], can.BusABC]
 

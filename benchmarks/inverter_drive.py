@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState, Preflight, Sample
+from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
 from sim_bus.inverter import RPM, Inverter
 from sim_bus.params import RigParams
 from tdhil.recording.builder import RecordingBuilder
@@ -35,7 +35,7 @@ class InverterDrive:
     def connect(self) -> Identity:
         return Identity(0, 0, 0, 0, "inverter", True)
 
-    def preflight(self, limits: Limits) -> Preflight:
+    def preflight(self, limits: DriveLimits) -> Preflight:
         params, self._stop_rad_s2 = self.inverter.params, limits.quick_stop_rad_s2
         return Preflight(
             identity=self.connect(), checks=(), modes=frozenset(Mode), switch_while_enabled=True,

@@ -21,14 +21,14 @@ import can
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, quantile
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from profiles.library import load_canopen_profile
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.run_log import RunLog
 from tdhil.session.real_time import real_time_priority
 
 RATE_HZ = 250.0
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=5.0)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=5.0)
 REST = Command(Mode.SPEED, 0.0, 0.0)
 DRIVE_PRIORITY = 60
 HOG = "while True: pass"

@@ -67,7 +67,7 @@ def run(seed: int, tolerance: float | None, fixed_s: float | None = None, params
     if outcome.cause is not None:
         return Result(seed, *(float("nan"),) * 4, 0, repr(outcome.cause))
     log.configure(identify={"confidence": 0.95, "tolerance": tolerance or 0.05})
-    document, _ = conclude(log.recording(complete=True), log.run, "")
+    document = conclude(log.recording(complete=True), log.run, "").document
     stage = next(one for one in outcome.stages if one.name == "acquire")
     decisions: list[dict[str, Any]] = log.run.get("stopping", {}).get("decisions", [])
     looked = decisions[-1]["look"]["half_width_now"] if decisions and decisions[-1]["look"] else float("nan")

@@ -90,7 +90,7 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class Limits:
+class DriveLimits:
     """What the caller wants the drive itself to enforce, written to it and read back in preflight."""
 
     speed_rad_s: float
@@ -182,7 +182,7 @@ class Drive(Protocol):
 
     ``close`` gives changed settings back and returns, a line each, those that it couldn't.
 
-    A drive may also be `Looking`, `Telling`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and one that
+    A drive may also be `Polled`, `Telling`, `Positioned`, `Paced`, `KeptAlive`, `Rehearsed` and `Timed`, and one that
     `StopsFeeding`.
     """
 
@@ -197,7 +197,7 @@ class Drive(Protocol):
 
     def connect(self) -> Identity: ...
 
-    def preflight(self, limits: Limits) -> Preflight: ...
+    def preflight(self, limits: DriveLimits) -> Preflight: ...
 
     def reset_fault(self) -> None: ...
 
@@ -213,14 +213,14 @@ class Drive(Protocol):
 
 
 @runtime_checkable
-class Looking(Protocol):
+class Polled(Protocol):
     """A drive that can also be asked for one sample beside the cycle, while a stop gets no feedback from that.
 
-    ``look`` takes a part of the watchdog's time at most, and asks once more for what `quick_stop` or `disable` asked
+    ``poll`` takes a part of the watchdog's time at most, and asks once more for what `quick_stop` or `disable` asked
     for; it never enables. None without an answer; it may raise TdhilError, too.
     """
 
-    def look(self) -> Sample | None: ...
+    def poll(self) -> Sample | None: ...
 
 
 @runtime_checkable
@@ -241,7 +241,7 @@ class StopsFeeding(Protocol):
     """A drive that a stop can leave to its own watchdog while it goes on being watched.
 
     After ``stop_feeding`` nothing goes out that the watchdog takes for the host's sign of life: `exchange` goes on with
-    what doesn't feed it, be it by listening alone, and so does `Looking.look`. There is no way back but `close`. Called
+    what doesn't feed it, be it by listening alone, and so does `Polled.poll`. There is no way back but `close`. Called
     only where a watchdog is armed; it may raise TdhilError, and a second call does nothing.
     """
 

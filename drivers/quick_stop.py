@@ -52,7 +52,7 @@ class Target(Protocol):
     def ask(self, attempt: int) -> None:
         """Ask for the quick stop; a later attempt may go further than an earlier one."""
 
-    def look(self) -> Seen:
+    def poll(self) -> Seen:
         """What the drive shows now."""
 
     def remarks(self) -> tuple[str, ...]:
@@ -90,7 +90,7 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
             _note(troubles, error)
         now_s = clock.now_s()
         try:
-            last = target.look()
+            last = target.poll()
         except TdhilError as error:
             _note(troubles, error)
             now_s = clock.now_s()

@@ -147,7 +147,7 @@ class Regulation(Enum):
 
 
 @dataclass(slots=True)
-class Limits:
+class LoopLimits:
     """What the loops must not exceed; torque both ways is given positive."""
 
     torque_forward_nm: float
@@ -177,7 +177,7 @@ class Controller:
 
     def __init__(self, params: DriveParams) -> None:
         self._params = params
-        self.limits = Limits(params.torque_limit_nm, params.torque_limit_nm, params.speed_limit_rpm * RPM)
+        self.limits = LoopLimits(params.torque_limit_nm, params.torque_limit_nm, params.speed_limit_rpm * RPM)
         self.regulation = Regulation.OFF
         self.limited = False           # torque or speed limit acting
         self.filtered_rad_s = 0.0
@@ -315,7 +315,7 @@ class Controller:
         return self.reference - self._overspeed - params.speed_gain_nm_s_rad * beyond
 
 
-def limits_sum(limits: Limits) -> float:
+def limits_sum(limits: LoopLimits) -> float:
     """The most that the speed limiter may ever have to take away: from one torque limit to the other."""
     return limits.torque_forward_nm + limits.torque_reverse_nm
 

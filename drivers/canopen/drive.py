@@ -27,11 +27,11 @@ from drivers.canopen.position import Angle, find_angle
 from drivers.canopen.preflight import find_free_node, find_units, read_identity, refuse_in_doubt
 from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
-from drivers.canopen.sdo_feedback import keep_stepping, look, push
+from drivers.canopen.sdo_feedback import keep_stepping, poll, push
 from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
 from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, ReadBack, SignOfLife, Watch
 from drivers.clock import RATES_HZ, Clock, Ticks, how_late
-from drivers.drive import Command, Counters, FrameTap, Identity, Limits, Mode, PositionReading, Preflight, Sample
+from drivers.drive import Command, Counters, DriveLimits, FrameTap, Identity, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.left_behind import LeftBehind
 from drivers.own_limits import OwnLimits
@@ -187,7 +187,7 @@ class Cia402Drive:
             request = bytes((0x2F, MARKER_INDEX & 0xFF, MARKER_INDEX >> 8, MARKER_STAGE, STAGE_NUMBERS[stage], 0, 0, 0))
             self._link.send(0x600 + self._node, request)
 
-    def preflight(self, limits: Limits) -> Preflight:
+    def preflight(self, limits: DriveLimits) -> Preflight:
         """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
@@ -434,7 +434,7 @@ class Cia402Drive:
             self._link.drain()
         self._watch.check()
 
-    def look(self) -> Sample | None:
+    def poll(self) -> Sample | None:
         """Status, speed and torque by SDO, for a stop whose cyclic feedback is not to be had; None without an answer.
 
         Once something else than enabling was asked for, that goes out by SDO (6040h) too. Raises CommunicationLost.
@@ -443,7 +443,7 @@ class Cia402Drive:
             self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
         self._life.feed()
         begun_s = self.clock.now_s()
-        found = look(self._objects, self._profile, self._watchdog_s)
+        found = poll(self._objects, self._profile, self._watchdog_s)
         if found is None:
             return None
         if self.clock.stepped:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from drivers.canopen.pdo import RPM, decode_value, encode_value
 from drivers.canopen.sdo import Objects, name
-from drivers.drive import Check, Limits, Outcome
+from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import Table
@@ -105,7 +105,7 @@ _TITLES = {
 
 
 def set_limits(
-    table: Table, objects: Objects, profile: CanopenProfile, limits: Limits, rated_nm: float, own: OwnLimits
+    table: Table, objects: Objects, profile: CanopenProfile, limits: DriveLimits, rated_nm: float, own: OwnLimits
 ) -> None:
     """The drive's own torque limit, speed limit and quick stop, written and read back; ``own`` says which may be."""
     elsewhere = {one.set_to for one in profile.parameters}
@@ -151,7 +151,8 @@ def note_temperature(table: Table, limit_c: float | None) -> None:
 
 
 def _set(
-    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: Limits, rated_nm: float, own: OwnLimits
+    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: DriveLimits, rated_nm: float,
+    own: OwnLimits
 ) -> None:
     """One parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
     where, mend = name(one.index, one.sub), one.advice or ""
@@ -191,7 +192,7 @@ def _set(
         )
 
 
-def _count(settings: Settings, one: Parameter, limits: Limits, rated_nm: float) -> float:
+def _count(settings: Settings, one: Parameter, limits: DriveLimits, rated_nm: float) -> float:
     """The limit in the parameter's unit, rounded to its counts: torque down, speed and braking up."""
     per_lsb = settings.per_lsb(one)
     nm = 1.0 if one.unit == "nm" else 1.0 / rated_nm

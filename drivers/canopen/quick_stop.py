@@ -172,7 +172,7 @@ class Cia402Target:
             self._burst()
         self._objects.write(_CONTROLWORD, 0, self._word, 16)
 
-    def look(self) -> Seen:
+    def poll(self) -> Seen:
         """6041h and 606Ch."""
         status = self._objects.read(0x6041)
         raw = self._objects.read(self._speed_at, signed=True)

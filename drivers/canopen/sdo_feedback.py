@@ -36,7 +36,7 @@ class Looked(NamedTuple):
     torque: float | None
 
 
-def look(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked | None:
+def poll(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked | None:
     """The three objects one after the other, in well under the watchdog's time; None without status or speed."""
     with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
         try:

@@ -18,9 +18,9 @@ from drivers.clock import Ticks
 from drivers.drive import (
     Command,
     Counters,
+    DriveLimits,
     FrameTap,
     Identity,
-    Limits,
     Mode,
     Outcome,
     PositionReading,
@@ -162,7 +162,7 @@ class ModbusDrive:
         if self._identity is not None and self._identity.simulated:
             tell_stage(self._access, stage)
 
-    def preflight(self, limits: Limits) -> Preflight:
+    def preflight(self, limits: DriveLimits) -> Preflight:
         """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
@@ -292,7 +292,7 @@ class ModbusDrive:
             return self._watch()
         self._look_for_others()
         if self._wish is Wish.ENABLED:
-            self._heat.look(self._timeout_s)
+            self._heat.poll(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
         word = controlword_towards(
             self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
@@ -330,7 +330,7 @@ class ModbusDrive:
         if self._other.seen and self._wish is not Wish.ENABLED:
             return                     # known, and the line is needed for the stop
         try:
-            self._other.look(self._timeout_s)
+            self._other.poll(self._timeout_s)
         except LinkLost:
             self._stay_out()
             raise
@@ -392,7 +392,7 @@ class ModbusDrive:
         """A cycle that only reads, or not even that while reading feeds the watchdog."""
         begun_s = self.clock.now_s()
         self._cycles += 1
-        sample = self.look()
+        sample = self.poll()
         if sample is None:
             self._missed += 1
             self._ticks.done()
@@ -406,7 +406,7 @@ class ModbusDrive:
             self._stay_out()
             raise
 
-    def look(self) -> Sample | None:
+    def poll(self) -> Sample | None:
         """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still tell how it is.
 
         While it shows itself enabled the quick-stop word is written by itself, once each time.

@@ -43,7 +43,7 @@ class _Word(NamedTuple):
 
 
 class OtherMaster:
-    """Knows what this host has sent and what the settings were; `look` is to be called before a cycle writes."""
+    """Knows what this host has sent and what the settings were; `poll` is to be called before a cycle writes."""
 
     def __init__(self, access: Access, profile: ModbusProfile, plan: CyclePlan) -> None:
         self._access = access
@@ -99,7 +99,7 @@ class OtherMaster:
         for address, word in image.items():
             self._sent.setdefault(address, deque(maxlen=self._keep or None)).append(word)
 
-    def look(self, timeout_s: float) -> None:
+    def poll(self, timeout_s: float) -> None:
         """One read, if it is time. Raises CommunicationLost, naming what somebody else has written.
 
         A look without an answer is none: the cycle tells of a bad line.

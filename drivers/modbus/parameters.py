@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from drivers.drive import Limits, ReportingFilters
+from drivers.drive import DriveLimits, ReportingFilters
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, to_counts
@@ -244,7 +244,7 @@ _LIMIT = {
 }
 
 
-def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float,
+def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, rated_nm: float,
                found: Parameters, own: OwnLimits) -> None:
     """Every parameter with `set_to` but the watchdog, which comes last of all; a row each. ``own``: which may be."""
     kinds = set()
@@ -265,7 +265,8 @@ def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Lim
 
 
 def _write_limit(
-    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float],
+    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float,
+    values: Mapping[str, float],
     own: OwnLimits,
 ) -> None:
     """One of the drive's own limits: left alone where it is the tighter one, unless that may be widened."""
@@ -322,7 +323,8 @@ def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Re
 
 
 def write_setting(
-    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float]
+    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float,
+    values: Mapping[str, float],
 ) -> bool:
     """Write one parameter and read it back; whether it stands as wanted."""
     register, where = parameter.register_, where_of(parameter)
@@ -345,7 +347,7 @@ def write_setting(
     return table.attempt(parameter.title, wanted, where, work, advice)
 
 
-def wanted_setting(parameter: Parameter, limits: Limits, rated_nm: float, values: Mapping[str, float]) -> Setting:
+def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float, values: Mapping[str, float]) -> Setting:
     """The counts that say what rig.yaml wants. Raises CommandRejected where the unit or the register can't hold it."""
     register, kind, where = parameter.register_, parameter.set_to, where_of(parameter)
     assert register is not None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from drivers.drive import Limits, Mode, Outcome, PowerState
+from drivers.drive import DriveLimits, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
 from drivers.modbus.access import Access
 from drivers.modbus.codec import RANGES, Scales, find_scales, from_words, register_name, si_per_count, to_counts
@@ -52,7 +52,7 @@ def clear_setpoints(table: Table, access: Access, profile: ModbusProfile, off: i
 
 def check_setpoints(
     table: Table, access: Access, profile: ModbusProfile, scales: Scales, rated_nm: float,
-    values: Mapping[str, float], limits: Limits,
+    values: Mapping[str, float], limits: DriveLimits,
 ) -> frozenset[str]:
     """A row for each setpoint: several values written, read back, and compared with the drive's echo if any.
 
@@ -97,8 +97,8 @@ def _check_one(
         try:
             for value in tests:
                 counts = to_counts(value, lsb, register, where)
-                for look in range(1 if echo is None else LOOKS):
-                    if look:
+                for poll in range(1 if echo is None else LOOKS):
+                    if poll:
                         access.clock.wait_until(access.clock.now_s() + ECHO_LOOK_S)
                     access.write(register, counts)      # each time: a watchdog may be on already
                     found = access.read(seen_in) * seen_lsb

@@ -90,7 +90,7 @@ class ModbusTarget:
                 self._reverse = bool(word & control.reverse_bits)
         return control.speed_bits | ((control.reverse_bits or 0) if self._reverse else 0)
 
-    def look(self) -> Seen:
+    def poll(self) -> Seen:
         """Status word and speed.
 
         While the shaft still turns under power the quick-stop word is written again: the drive's watchdog may be one

@@ -69,7 +69,7 @@ class Heat:
         for one in self._in_status:
             self._judge(one, status)
 
-    def look(self, timeout_s: float) -> None:
+    def poll(self, timeout_s: float) -> None:
         """One read, if it is time; without an answer it is none. Raises LimitHit, and LinkLost."""
         now_s = self._access.clock.now_s()
         numbers = [one for one in self._watched if one in self._numbers]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from drivers.drive import Limits
+from drivers.drive import DriveLimits
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
@@ -73,7 +73,7 @@ def measure_pace(
 
 
 def arm_watchdog(
-    table: Table, access: Access, profile: ModbusProfile, limits: Limits, rated_nm: float, found: Parameters,
+    table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, rated_nm: float, found: Parameters,
     period_s: float, feed: Callable[[], object],
 ) -> bool:
     """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back.
@@ -114,7 +114,8 @@ def arm_watchdog(
 
 
 def check_who_feeds(
-    table: Table, access: Access, profile: ModbusProfile, limits: Limits, feed: Callable[[], object], *, simulated: bool
+    table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, feed: Callable[[], object], *,
+    simulated: bool
 ) -> bool:
     """A row of what feeds an armed watchdog; whether any other client does.
 
@@ -171,7 +172,7 @@ def _others_requests(
 
 
 def _write(
-    table: Table, access: Access, parameter: Parameter, limits: Limits, rated_nm: float, found: Parameters,
+    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float, found: Parameters,
     feed: Callable[[], object],
 ) -> None:
     if not write_setting(table, access, parameter, limits, rated_nm, found.values):

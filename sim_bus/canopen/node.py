@@ -75,7 +75,7 @@ class Cia402Node:
         self._guard = LifeGuard()
         self._objects = ApplicationObjects(self.store, self.application, self.worn.units if self.worn else None)
         if self.worn is not None:
-            self.worn.dress(self.store, self._guard, self._set_period)
+            self.worn.apply(self.store, self._guard, self._set_period)
         self._receive = [
             ReceivePdo(self.store, n, self._objects.setters, self._route, self._short_pdo) for n in range(4)
         ]

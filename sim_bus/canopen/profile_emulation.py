@@ -155,7 +155,7 @@ _QUICK_STOP_RAMP = 2
 
 
 class WornProfile:
-    """Made before the objects are bound, for the units; `dress` is called after, for what comes and goes."""
+    """Made before the objects are bound, for the units; `apply` is called after, for what comes and goes."""
 
     def __init__(self, profile: CanopenProfile, application: Application) -> None:
         self.profile = profile
@@ -166,7 +166,7 @@ class WornProfile:
         application.modes = frozenset(Mode(code) for code in wanted if code in list(Mode))
         application.mode = application.first_mode
 
-    def dress(self, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]) -> None:
+    def apply(self, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]) -> None:
         """Everything at once."""
         self._remove(store)
         self._identify(store)

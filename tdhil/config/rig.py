@@ -180,7 +180,7 @@ _ONLY_THE_OPERATOR = {
 }
 
 
-class Run(DataModel):
+class RunSection(DataModel):
     """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
@@ -237,7 +237,7 @@ class Rig(DataModel):
     drive_data: DriveData = DriveData()
     expected: Expected = Expected()
     reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
-    run: Run = Run()
+    run: RunSection = RunSection()
 
     _file: str = PrivateAttr(default="")
     _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.frequency_domain.inference import rejects
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines
 from tdhil.estimation.result import (
@@ -58,7 +58,7 @@ class PeriodicCase(Case):
     levels: Levels
     stretches: tuple[Stretch, ...]
     fits: tuple[PeriodLines, ...]
-    tie: ViscousTie | None
+    constraint: ViscousConstraint | None
     every: tuple[Line, ...]
     lines: tuple[Line, ...] = ()
     usable: tuple[Line, ...] = ()

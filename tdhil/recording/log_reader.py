@@ -190,7 +190,7 @@ RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and
 
 
 @dataclass(frozen=True)
-class Run:
+class LoggedRun:
     """A run as the log has it. ``complete`` is False where the file wasn't closed or some of it is lost.
 
     ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none. ``epoch_ns`` is the
@@ -207,7 +207,7 @@ class Run:
     epoch_ns: int = 0
 
 
-def read_run(path: Path, *, salvage: bool = False) -> Run:
+def read_run(path: Path, *, salvage: bool = False) -> LoggedRun:
     """Everything but the raw frames and the commands. Raises `LogError` if there is nothing of ours in the file.
 
     ``salvage``: also where the file's head is damaged.
@@ -276,7 +276,7 @@ class _Reading:
             log_format.EVENT: self._event,
         }
 
-    def run(self, path: Path, salvage: bool) -> Run:
+    def run(self, path: Path, salvage: bool) -> LoggedRun:
         for found in messages(path, salvage=salvage):
             if isinstance(found, Ours):
                 self._message(found.number, found.payload)
@@ -292,7 +292,7 @@ class _Reading:
         self._learn()
         run = self._texts.get(log_format.CONFIGURATION, {}).get("run")
         complete = self._whole and not self._lost
-        return Run(
+        return LoggedRun(
             recording=self._builder.recording(complete=complete),
             configuration=run if isinstance(run, dict) else {},
             result=self._texts.get(log_format.RESULT),

@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 from tdhil.errors import LogBroken, LogError, LogUnopened, NothingRecoverable
 from tdhil.recording.log_format import CHANNELS, CLASSES, EVENT, LOG, RECOVERED, Event, log_payload
 from tdhil.recording.log_messages import event_message
-from tdhil.recording.log_reader import Ours, Run, messages, read_run
+from tdhil.recording.log_reader import LoggedRun, Ours, messages, read_run
 from tdhil.recording.mcap_container import Container
 
 CHUNK_BYTES: Final = 2**18
@@ -36,7 +36,7 @@ class Gap:
 class Salvage:
     """What was found. ``gaps`` are holes that no single missed cycle explains; ``lost`` is in words, a line each."""
 
-    run: Run
+    run: LoggedRun
     gaps: tuple[Gap, ...]
     lost: tuple[str, ...]
 
@@ -64,7 +64,7 @@ def examine(path: Path) -> Salvage:
     return Salvage(run, gaps, tuple(lost))
 
 
-def find_gaps(run: Run) -> tuple[Gap, ...]:
+def find_gaps(run: LoggedRun) -> tuple[Gap, ...]:
     """Where samples are missing between others: more than 20 periods, a period being the median step."""
     time_s = run.recording.time_s
     with np.errstate(invalid="ignore", over="ignore"):        # a hostile file's times may be anything

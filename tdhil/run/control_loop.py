@@ -39,7 +39,7 @@ class RunLog(Protocol):
 Watcher = Callable[[Command, Sample], None]
 
 
-class Bench:
+class ControlLoop:
     """A drive under guard. ``watch`` sees every cycle (live display); ``stop_request`` is looked at in each."""
 
     def __init__(

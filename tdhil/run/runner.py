@@ -9,14 +9,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 
-from drivers.drive import Command, Drive, Limits, Mode, Outcome, Paced, Preflight, Sample, Timed
+from drivers.drive import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, Sample, Timed
 from drivers.errors import PreflightRefused
 from tdhil.errors import Interrupted
 from tdhil.recording.recording import Excitation, LagPrior, Ramp
 from tdhil.recording.run_log import RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess, SwingPlan
 from tdhil.run.guard import Guard
 from tdhil.run.preconditions import (
@@ -119,14 +119,14 @@ class Runner:
 
     def _run_stages(self) -> None:
         with self._book.stage("setup", 10.0):
-            task, bench, preflight = self._prepare()
+            task, loop, preflight = self._prepare()
             limits, assumptions = task.limits, task.assumptions
             mode = choose_mode(task.request, limits, preflight)
-            _, torque_offset = measure_offsets(bench, limits)
+            _, torque_offset = measure_offsets(loop, limits)
             self._log.learn(torque_offset_nm=torque_offset)
-            self._confirm(task, preflight, lambda: self._idle(bench))
+            self._confirm(task, preflight, lambda: self._idle(loop))
             self._stop = StopSequence(
-                bench,
+                loop,
                 limits,
                 preflight.speed_resolution_rad_s,
                 preflight.quick_stop_in_torque_mode,
@@ -135,38 +135,38 @@ class Runner:
                 torque_offset_nm=torque_offset,
                 watched=preflight.watched,
             )
-            bench.guard.start_clock(bench.now_s)
-            breakaway = probe_sign(bench, limits, mode, preflight.speed_resolution_rad_s)
+            loop.guard.start_clock(loop.now_s)
+            breakaway = probe_sign(loop, limits, mode, preflight.speed_resolution_rad_s)
             if breakaway is not None:
-                self._log.event(bench.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
+                self._log.event(loop.now_s, "probe", f"the shaft moved forward at {breakaway:.1f} N·m")
         with self._book.stage("speed", 50.0):
             onlooker = Onlooker(
                 self._confirm_speed, preflight.identity.simulated, limits.accept_speed_unit, self._say
             )
             speed = run_speed(
-                bench, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset, onlooker
+                loop, limits, assumptions, preflight.speed_resolution_rad_s, torque_offset, onlooker
             )
             self._log.motion(None, speed.levels, (speed.ramp,))
-            self._note_rough(bench, speed)
-            self._note_timing(bench, speed)
+            self._note_rough(loop, speed)
+            self._note_timing(loop, speed)
             resolution = preflight.speed_resolution_rad_s
             slow: tuple[Sample, ...] = ()
             if mode is Mode.TORQUE:
-                slow = slow_down(bench, limits, speed.model, assumptions, speed.high.speed_rad_s, resolution)
+                slow = slow_down(loop, limits, speed.model, assumptions, speed.high.speed_rad_s, resolution)
         ramps: tuple[Ramp, ...] = (speed.ramp,)
         drifted: TorqueResult | None = None
         if mode is Mode.TORQUE:
             with self._book.stage("torque", 15.0):
                 drifted = run_torque(
-                    bench, limits, assumptions, speed, slow, torque_offset, resolution, preflight.torque_setpoint
+                    loop, limits, assumptions, speed, slow, torque_offset, resolution, preflight.torque_setpoint
                 )
                 ramps = (speed.ramp, drifted.ramp)
                 self._log.motion(None, speed.levels, ramps)
         else:
             why = no_torque(task.request.mode, preflight)
             self._book.skip("torque", f"{why}: no switch, and no second look at the inertia by a drift")
-        model = self._model(bench, speed, drifted)
-        planner = StagePlanner(bench, self._log, self._display, self._say)
+        model = self._model(loop, speed, drifted)
+        planner = StagePlanner(loop, self._log, self._display, self._say)
         planned = planner.plan(task, speed, mode, self._prior)
         plan = planned.plan
         control: MeanSpeedControl | None = None
@@ -174,20 +174,20 @@ class Runner:
             with self._book.stage("hold", 15.0):
                 control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
                 target = plan.start_rad_s if isinstance(plan, SwingPlan) else plan.segments[0].reference.offset_rad_s
-                run_hold(bench, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
+                run_hold(loop, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
         else:
             self._book.skip("hold", f"{why}: the drive's own speed control holds the mean speed")
         with self._book.stage("acquire", planned.duration_s + 10.0):
             announced = self._announcer(speed, ramps)
             if isinstance(plan, SwingPlan):
-                run_swings(bench, limits, plan, control, assumptions, announced)
+                run_swings(loop, limits, plan, control, assumptions, announced)
             else:
                 run_acquire(
-                    bench, limits, plan, control, announced, planner.enough(planned),
+                    loop, limits, plan, control, announced, planner.enough(planned),
                     preflight.speed_resolution_rad_s,
                 )
 
-    def _prepare(self) -> tuple[Task, Bench, Preflight]:
+    def _prepare(self) -> tuple[Task, ControlLoop, Preflight]:
         identity = self._drive.connect()
         self._log.learn(simulated=identity.simulated)
         task = self._make_task(identity)
@@ -200,7 +200,7 @@ class Runner:
         if not self._drive.clock.stepped:
             no_reckoner = self._make_ready()
         preflight = self._book.preflight = self._drive.preflight(
-            Limits(
+            DriveLimits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
                 limits.temperature_c,
@@ -248,11 +248,11 @@ class Runner:
         guard.no_braking = NOT_YET
         if isinstance(self._drive, Timed):
             guard.host_late = self._drive.host_late
-        bench = Bench(self._drive, guard, self._log, self._stop_request, self._display.cycle)
-        bench.reckoner = self._reckoner
+        loop = ControlLoop(self._drive, guard, self._log, self._stop_request, self._display.cycle)
+        loop.reckoner = self._reckoner
         if no_reckoner:
-            bench.no_reckoner(no_reckoner)
-        return task, bench, preflight
+            loop.no_reckoner(no_reckoner)
+        return task, loop, preflight
 
     def _make_ready(self) -> str:
         """Load and start whatever would hold the loop up later; why there is no process for arithmetic, if so."""
@@ -278,38 +278,38 @@ class Runner:
         self._log.configure(rate_tried=choice.plain())
         self._say(choice.text)
 
-    def _model(self, bench: Bench, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
+    def _model(self, loop: ControlLoop, speed: SpeedResult, drifted: TorqueResult | None) -> RigGuess:
         """The rough rig: stage 2's, with the drift of stage 3 as a witness."""
         model = speed.model
         if drifted is not None and drifted.rough is not None:
             ratio = drifted.rough.inertia_kg_m2 / model.inertia_kg_m2
             text = f"rough inertia {model.inertia_kg_m2:.4g} kg·m² from the ramp, {ratio:.2f} of it from the drift"
-            self._log.event(bench.now_s, "plan", text)
+            self._log.event(loop.now_s, "plan", text)
         return model
 
     def _announcer(self, speed: SpeedResult, ramps: tuple[Ramp, ...]) -> Callable[[Excitation], None]:
         return lambda motion: self._log.motion(motion, speed.levels, ramps)
 
-    def _note_timing(self, bench: Bench, speed: SpeedResult) -> None:
+    def _note_timing(self, loop: ControlLoop, speed: SpeedResult) -> None:
         """How far a sample's time may be off; torque and speed may be apart by as much."""
         half_s = sum(sample.half_width_s for sample in speed.last) / max(1, len(speed.last))
         if half_s > 0.0:
             self._prior = with_timing(self._prior, half_s)
             self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
             text = f"a sample's time is known to ±{1e3 * half_s:.3g} ms, the half of a transaction"
-            self._log.event(bench.now_s, "rate", text)
+            self._log.event(loop.now_s, "rate", text)
 
-    def _note_rough(self, bench: Bench, speed: SpeedResult) -> None:
+    def _note_rough(self, loop: ControlLoop, speed: SpeedResult) -> None:
         model = speed.model
         self._log.event(
-            bench.now_s,
+            loop.now_s,
             "plan",
             f"rough model: J {model.inertia_kg_m2:.4g} kg·m² ± {100 * speed.rough.rel_error:.0f} %, "
             f"B {model.viscous_nm_s_rad:.3g} N·m·s/rad, T_c {model.coulomb_nm:.3g} N·m",
         )
 
-    def _idle(self, bench: Bench) -> None:
-        bench.cycle(Command(Mode.SPEED, 0.0, 0.0))
+    def _idle(self, loop: ControlLoop) -> None:
+        loop.cycle(Command(Mode.SPEED, 0.0, 0.0))
 
     def _log_failure(self, error: BaseException) -> None:
         try:

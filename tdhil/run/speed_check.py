@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, NoReturn
 
 from drivers.drive import Command, Mode, Positioned, PositionReading, Sample
 from drivers.errors import PreflightRefused
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.task import ConfirmSpeed, Say, nobody_sees
 
@@ -214,16 +214,16 @@ class SpeedLook:
     """Of one run's stage 2: `ramp` to the first mean speed, `level` around its level, `conclude` behind it."""
 
     def __init__(
-        self, bench: Bench, limits: MachineLimits, assumptions: ControlAssumptions, resolution_rad_s: float,
+        self, loop: ControlLoop, limits: MachineLimits, assumptions: ControlAssumptions, resolution_rad_s: float,
         onlooker: Onlooker,
     ) -> None:
-        self._bench = bench
+        self._loop = loop
         self._limits = limits
         self._lag_s = 2.0 * assumptions.largest_speed_lag_s
         self._resolution_rad_s = resolution_rad_s
         self._onlooker = onlooker
         self._slow_rad_s = slow_speed(limits, resolution_rad_s)
-        self._drive: Positioned | None = bench.drive if isinstance(bench.drive, Positioned) else None
+        self._drive: Positioned | None = loop.drive if isinstance(loop.drive, Positioned) else None
         self._angles = Angles()
         self._next_s = -math.inf
         self._every_s = 0.0
@@ -239,10 +239,10 @@ class SpeedLook:
     def ramp(self, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> None:
         """To the first mean speed, in speed mode. Raises PreflightRefused for a wrong unit of speed."""
         self._begin()
-        bench = self._bench
+        loop = self._loop
         if abs(end_rad_s) < self._slow_rad_s:      # so slow that it would show nothing
             self._pause(_Paused(math.copysign(self._slow_rad_s, end_rad_s or 1.0), True))
-        steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / bench.period_s))
+        steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / loop.period_s))
         span = end_rad_s - start_rad_s
         passed = False
         for step in range(1, steps + 1):
@@ -274,7 +274,7 @@ class SpeedLook:
     # -- watching --------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        self._every_s = max(EVERY_S, min(EVERY_CYCLES * self._bench.period_s, SELDOM_S))
+        self._every_s = max(EVERY_S, min(EVERY_CYCLES * self._loop.period_s, SELDOM_S))
         reading = None if self._drive is None else self._read()
         if reading is None:
             self._lost = "the drive tells no angle of its shaft"
@@ -282,12 +282,12 @@ class SpeedLook:
                 self._settle_without()
             return
         self._watching = True
-        self._bench.beside = self._beside
+        self._loop.beside = self._beside
 
     def _end(self) -> None:
         self._done = True
         self._watching = False
-        self._bench.beside = None
+        self._loop.beside = None
 
     def _read(self) -> PositionReading | None:
         assert self._drive is not None
@@ -298,7 +298,7 @@ class SpeedLook:
         angles = self._angles
         angles.saw(sample)
         self._highest_rad_s = max(self._highest_rad_s, abs(command.speed_rad_s))
-        if self._lost or sample.time_s < self._next_s - 0.5 * self._bench.period_s:
+        if self._lost or sample.time_s < self._next_s - 0.5 * self._loop.period_s:
             return
         self._next_s = sample.time_s + self._every_s
         reading = self._read()
@@ -351,10 +351,10 @@ class SpeedLook:
     # -- waiting, comparing, asking --------------------------------------------------------------------------
 
     def _cycle(self, speed_rad_s: float) -> Sample:
-        return self._bench.cycle(Command(Mode.SPEED, speed_rad_s, 0.0))
+        return self._loop.cycle(Command(Mode.SPEED, speed_rad_s, 0.0))
 
     def _waited(self, speed_rad_s: float, seconds: float) -> Iterator[None]:
-        for _ in range(self._bench.cycles(seconds)):
+        for _ in range(self._loop.cycles(seconds)):
             self._cycle(speed_rad_s)
             yield
 
@@ -425,19 +425,19 @@ class SpeedLook:
         An angle that was read when a frozen host woke up, or of a drive that has stopped by itself since its last
         sample, says nothing of a unit.
         """
-        self._bench.beside = None
-        self._bench.cycle(command)
+        self._loop.beside = None
+        self._loop.cycle(command)
         raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
 
     def _ask(self, command: Command) -> None:
         """The operator says whether the shaft turns as fast as the drive reports. Raises PreflightRefused if not."""
-        bench, why = self._bench, self._lost or "the angle that the drive tells was not fit to be compared"
+        loop, why = self._loop, self._lost or "the angle that the drive tells was not fit to be compared"
         self._lost = why
         if self._onlooker.accepted or self._onlooker.simulated:
             self._settle_without()
             return
-        bench.hold(command, self._lag_s)
-        seen = bench.hold(command, SEEN_S)
+        loop.hold(command, self._lag_s)
+        seen = loop.hold(command, SEEN_S)
         mean_rad_s = sum(sample.speed_rad_s for sample in seen) / len(seen)
         if abs(mean_rad_s) < 0.2 * abs(command.speed_rad_s):
             self._refuse(
@@ -447,17 +447,17 @@ class SpeedLook:
                 f"Does the drive hold so low a speed? If its unit has been seen to be right, take it by {BY_NAME}",
             )
         self._log(f"{why}: the operator is asked whether the shaft turns at {mean_rad_s:.3f} rad/s")
-        bench.quiet = True
+        loop.quiet = True
         try:
             self._onlooker.confirm(mean_rad_s, why, lambda: self._again(command))
         finally:
-            bench.quiet = False
+            loop.quiet = False
         self._seen(BY_OPERATOR, None, "")
         self._log(f"the operator saw the shaft turn at {mean_rad_s:.3f} rad/s")
         self._done = True
 
     def _again(self, command: Command) -> None:
-        self._bench.cycle(command)
+        self._loop.cycle(command)
 
     def _settle_without(self) -> None:
         """Nobody looks: a simulated drive, or one whose unit the operator has taken by name."""
@@ -469,10 +469,10 @@ class SpeedLook:
         self._done = True
 
     def _seen(self, by: str, ratio: float | None, where: str) -> None:
-        self._bench.log.configure(speed_unit={"seen_by": by, "ratio": ratio, "where": where})
+        self._loop.log.configure(speed_unit={"seen_by": by, "ratio": ratio, "where": where})
 
     def _log(self, text: str) -> None:
-        self._bench.log.event(self._bench.now_s, "probe", text)
+        self._loop.log.event(self._loop.now_s, "probe", text)
 
 
 def warnings(run: Any) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from tdhil.recording.recording import FloatArray, LagPrior, SteppedSetpoint
 from tdhil.recording.run_log import RunLog
 from tdhil.run import excitation
 from tdhil.run.adaptive_duration import Decision, Enough
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
 from tdhil.run.excitation import Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.run.guard import Guard
@@ -29,8 +29,8 @@ RESERVE_S = 30.0
 class StagePlanner:
     """Of one run, whose bench it keeps going while it reckons."""
 
-    def __init__(self, bench: Bench, log: RunLog, display: Display, say: Say) -> None:
-        self._bench = bench
+    def __init__(self, loop: ControlLoop, log: RunLog, display: Display, say: Say) -> None:
+        self._loop = loop
         self._log = log
         self._display = display
         self._say = say
@@ -41,22 +41,22 @@ class StagePlanner:
         Raises LimitHit where no plan fits the shaft within its limits, PreflightRefused where it would have to brake
         and must not, and whatever a cycle raises.
         """
-        bench = self._bench
+        loop = self._loop
         request, limits, model = task.request, task.limits, speed.model
         room = excitation.MachineLimits(
             limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
         )
         course = speed.course if mode is Mode.SPEED else None
-        last = bench.last
+        last = loop.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
         keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
-        left_s = bench.guard.left_s(bench.now_s) - RESERVE_S
+        left_s = loop.guard.left_s(loop.now_s) - RESERVE_S
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
         theta = Knowledge(assumed, prior).theta(model)
 
         work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course, left_s)
         try:
-            planned = bench.compute(work, keep)
+            planned = loop.compute(work, keep)
         except PlanRefused as error:
             raise LimitHit(
                 f"no plan of stage 5 fits this shaft, as stages 2 and 3 have shown it: {error}",
@@ -64,17 +64,17 @@ class StagePlanner:
                 next_step=f"The shaft was stopped. {error.next_step}",
             ) from error
         plan = planned.plan
-        if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and bench.guard.no_braking:
+        if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and loop.guard.no_braking:
             raise PreflightRefused(
-                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {bench.guard.no_braking}",
+                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
                 where="plan of stage 5",
-                next_step=bench.guard.to_brake,
+                next_step=loop.guard.to_brake,
             )
         if course is not None:
             self._note_following(plan)
         self._display.planned(plan)
         self._log.event(
-            bench.now_s,
+            loop.now_s,
             "plan",
             f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
@@ -110,12 +110,12 @@ class StagePlanner:
             return
         self._log.learn(
             stepped_setpoint=SteppedSetpoint(
-                self._bench.period_s, following.zero_s, following.first_s, following.second_s2
+                self._loop.period_s, following.zero_s, following.first_s, following.second_s2
             )
         )
 
     def _tell(self, text: str) -> None:
-        self._log.event(self._bench.now_s, "plan", text)
+        self._log.event(self._loop.now_s, "plan", text)
         self._say(text)
 
 

@@ -32,14 +32,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.drive import Command, Drive, Looking, Mode, PowerState, Sample, StopsFeeding
+from drivers.drive import Command, Drive, Mode, Polled, PowerState, Sample, StopsFeeding
 from drivers.errors import CommandRejected, StopNotConfirmed
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
-from tdhil.run.string_release import MEAN_S, LetGo, LetGoLimits
+from tdhil.run.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Single looks at a drive (`drivers.drive.Looking`) for a stop without feedback of the cycle, or none to believe.
+# Single looks at a drive (`drivers.drive.Polled`) for a stop without feedback of the cycle, or none to believe.
 #
 # A look feeds what supervises the host. So it must not go on for ever at a shaft that is not slowing down: such a one
 # is left to the drive's own watchdog, which wants silence (`Slowing`).
@@ -59,7 +59,7 @@ class Looks:
     """Knows when a look is due. ``only``: the cyclic feedback is not believed any more."""
 
     def __init__(self, drive: Drive, period_s: float) -> None:
-        self._drive = drive if isinstance(drive, Looking) else None
+        self._drive = drive if isinstance(drive, Polled) else None
         self._period_s = period_s
         self._missing_s = 0.0
         self._due_s = AFTER_S
@@ -87,7 +87,7 @@ class Looks:
 
     def ask(self) -> Sample | None:
         """Look now; None without an answer. May raise."""
-        sample = self._drive.look() if self._drive is not None else None
+        sample = self._drive.poll() if self._drive is not None else None
         if sample is not None:
             self.answered += 1
             self._due_s, self._pause_s = self._missing_s + EVERY_S, EVERY_S
@@ -129,7 +129,7 @@ SLOWER_SHARE = 0.99
 LONGEST_S = 300.0
 
 
-class Patience:
+class StopTimeout:
     """``see`` every sample and ``wait`` every cycle without one; ``over`` says when to give up."""
 
     def __init__(self, enough_s: float, at_rest_rad_s: float) -> None:
@@ -208,7 +208,7 @@ class StopSequence:
 
     def __init__(
         self,
-        bench: Bench,
+        loop: ControlLoop,
         limits: MachineLimits,
         speed_resolution_rad_s: float,
         quick_stop_in_torque_mode: bool,
@@ -219,10 +219,10 @@ class StopSequence:
         watched: bool = True,
     ) -> None:
         assumptions = assumptions or ControlAssumptions()
-        self._bench = bench
+        self._loop = loop
         self._limits = limits
         self._at_rest_rad_s = max(3.0 * speed_resolution_rad_s, AT_REST_SHARE * limits.speed_max_rad_s)
-        self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * bench.period_s)
+        self._longest_gap_s = max(LONGEST_GAP_S, LONGEST_GAP_CYCLES * loop.period_s)
         self._settle_s = 3.0 * assumptions.largest_speed_lag_s
         # The ramp from the highest speed, with as much again for a drive at its torque limit, and the settling.
         ramp_s = limits.speed_max_rad_s / limits.quick_stop_rad_s2
@@ -231,24 +231,24 @@ class StopSequence:
         self._watched = watched
         self._string = None
         if limits.load == "string":
-            self._string = LetGoLimits(
+            self._string = StringReleaseLimits(
                 torque_nm=limits.torque_nm,
                 speed_rad_s=limits.speed_max_rad_s,
                 ramp_nm_s=limits.torque_ramp_nm_s,
                 torque_resolution_nm=torque_resolution_nm,
                 torque_offset_nm=torque_offset_nm,
             )
-        self._held: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
+        self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = 0.0
         self._trouble: list[str] = []
-        self._looks = Looks(bench.drive, bench.period_s)
+        self._looks = Looks(loop.drive, loop.period_s)
         self._slowing = Slowing(self._at_rest_rad_s)
         self._unmoved_s = max(
             UNMOVED_STRING_S if self._string is not None else UNMOVED_S, UNMOVED_RAMP_SHARE * ramp_s
         )
         self._fed = True
         self._silent = 0
-        self._enough_silent = max(SILENT_CYCLES, bench.cycles(SILENT_S))
+        self._enough_silent = max(SILENT_CYCLES, loop.cycles(SILENT_S))
         self._running = False
         self._report: StopReport | None = None
 
@@ -268,7 +268,7 @@ class StopSequence:
         return self._report or StopReport(False, None, False, tuple(self._trouble))
 
     def _sequence(self) -> StopReport:
-        self._bench.guard.expected = None
+        self._loop.guard.expected = None
         if self._string is not None and self._slow_down():
             self._let_go(self._string)
         at_rest_s = self._decelerate()
@@ -282,32 +282,32 @@ class StopSequence:
 
     def _slow_down(self) -> bool:
         """Speed mode, ramped to zero: whether the drive followed, and so holds the shaft under speed control now."""
-        last = self._bench.last
+        last = self._loop.last
         speed = last.speed_rad_s if last is not None and math.isfinite(last.speed_rad_s) else 0.0
-        came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._bench.period_s
-        patience = Patience(self._enough_s, self._at_rest_rad_s)
+        came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
+        patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
         since_s = 0.0
         while not patience.over:
             speed = math.copysign(max(0.0, abs(speed) - step), came_from)
             sample = self._exchange(Command(Mode.SPEED, speed, 0.0))
-            since_s += self._bench.period_s
+            since_s += self._loop.period_s
             if sample is None:
                 if self._silent >= self._enough_silent:
                     return False
-                patience.wait(self._bench.period_s)
+                patience.wait(self._loop.period_s)
                 continue
             regulated = sample.mode is Mode.SPEED
             if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S):
                 return False
-            patience.see(sample.speed_rad_s, self._bench.period_s)
+            patience.see(sample.speed_rad_s, self._loop.period_s)
             if regulated and speed == 0.0 and sample.speed_rad_s * came_from <= self._at_rest_rad_s:
                 return True
         self._trouble.append("the shaft did not follow speed mode to standstill; quick stop instead")
         return False
 
-    def _let_go(self, string: LetGoLimits) -> None:
+    def _let_go(self, string: StringReleaseLimits) -> None:
         """Yield to what the string holds, until nothing is left or the bounds are reached."""
-        going = LetGo(string, self._at_rest_rad_s, self._bench.period_s)
+        going = StringRelease(string, self._at_rest_rad_s, self._loop.period_s)
         command = _REST
         while not (going.done or going.failed):
             sample = self._exchange(command)
@@ -329,7 +329,7 @@ class StopSequence:
 
     def _wound_up(self) -> bool:
         """Does the drive hold a torque that disabling would let go at once?"""
-        last = self._bench.last
+        last = self._loop.last
         if self._string is None or not self._held or last is None or last.state in _NO_TORQUE:
             return False
         held_nm = math.fsum(self._held) / len(self._held) - self._string.torque_offset_nm
@@ -344,35 +344,35 @@ class StopSequence:
 
     def _decelerate(self) -> float | None:
         if not self._quick_stop_in_torque_mode:
-            for _ in range(self._bench.cycles(MODE_S)):
+            for _ in range(self._loop.cycles(MODE_S)):
                 sample = self._exchange(_REST)
                 if sample is not None and sample.mode is Mode.SPEED:
                     break
-        asked = self._ask(self._bench.drive.quick_stop)
+        asked = self._ask(self._loop.drive.quick_stop)
         at_rest_s = self._see_rest(asked)
         if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
             at_rest_s = self._see_rest(asked)
         return at_rest_s
 
     def _see_rest(self, asked: bool) -> float | None:
-        patience = Patience(self._enough_s, self._at_rest_rad_s)
+        patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
         braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
         quiet_since_s: float | None = None
         heard_s = 0.0
         while not patience.over:
-            asked = asked or self._ask(self._bench.drive.quick_stop)
+            asked = asked or self._ask(self._loop.drive.quick_stop)
             sample = self._exchange(_REST, or_look=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     self._trouble.append("no feedback from the drive any more")
                     return None
-                patience.wait(self._bench.period_s)
+                patience.wait(self._loop.period_s)
                 continue
             if not self._gets_slower(sample):
                 return None
-            patience.see(sample.speed_rad_s, self._bench.period_s)
+            patience.see(sample.speed_rad_s, self._loop.period_s)
             if not braking.see(sample.time_s, sample.speed_rad_s) and self._leave_to_watchdog(sample):
-                patience = Patience(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
+                patience = StopTimeout(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
             # Single lost frames don't unsay what the others showed; a longer gap does.
             unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
@@ -386,7 +386,7 @@ class StopSequence:
 
     def _leave_to_watchdog(self, sample: Sample) -> bool:
         """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
-        drive = self._bench.drive
+        drive = self._loop.drive
         if not (self._fed and self._watched and isinstance(drive, StopsFeeding)):
             return False
         try:
@@ -406,9 +406,9 @@ class StopSequence:
         return True
 
     def _disable(self) -> bool:
-        asked = self._ask(self._bench.drive.disable)
-        for _ in range(self._bench.cycles(3.0)):
-            asked = asked or self._ask(self._bench.drive.disable)
+        asked = self._ask(self._loop.drive.disable)
+        for _ in range(self._loop.cycles(3.0)):
+            asked = asked or self._ask(self._loop.drive.disable)
             sample = self._exchange(_REST, or_look=True)
             if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
@@ -419,8 +419,8 @@ class StopSequence:
 
     def _stays_at_rest(self) -> bool:
         """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
-        quiet_s, told, heard_s = 0.0, False, self._bench.now_s
-        for _ in range(self._bench.cycles(REST_AFTER_S)):
+        quiet_s, told, heard_s = 0.0, False, self._loop.now_s
+        for _ in range(self._loop.cycles(REST_AFTER_S)):
             sample = self._exchange(_REST, or_look=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
@@ -429,7 +429,7 @@ class StopSequence:
                 continue
             # Looks are further apart than cycles are; a longer gap shows nothing.
             apart_s = sample.time_s - heard_s if self._looks.standing else 0.0
-            quiet_s += max(self._bench.period_s, min(self._longest_gap_s, apart_s))
+            quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
                 quiet_s = 0.0
@@ -460,7 +460,7 @@ class StopSequence:
         """One cycle's feedback; where there is none, a look's, if that may be taken and one is due."""
         sample: Sample | None = None
         try:
-            sample = self._bench.stop_cycle(command)
+            sample = self._loop.stop_cycle(command)
         except BaseException as error:  # whatever it is, the stop goes on
             self._note(error)
         if sample is None or not sample.fresh or (or_look and self._looks.only):
@@ -472,7 +472,7 @@ class StopSequence:
             self._silent += 1
             return None
         self._silent = 0
-        self._bench.last = sample
+        self._loop.last = sample
         self._held.append(sample.torque_nm)
         return sample
 
@@ -491,7 +491,7 @@ class StopSequence:
 
     def _contradicted(self) -> bool:
         """Does a look show another drive than the cycle's feedback does? Then only looks are believed from now on."""
-        told = self._bench.last
+        told = self._loop.last
         try:
             sample = self._looks.ask()
         except BaseException as error:  # whatever it is, the stop goes on

@@ -42,7 +42,7 @@ EXTRA_S = 90.0
 
 
 @dataclass(frozen=True)
-class LetGoLimits:
+class StringReleaseLimits:
     """Torque in N·m at the motor shaft; ``ramp_nm_s`` as in rig.yaml."""
 
     torque_nm: float
@@ -57,10 +57,10 @@ class LetGoLimits:
         return max(RESIDUAL_SHARE * self.torque_nm, RESIDUAL_QUANTA * self.torque_resolution_nm)
 
 
-class LetGo:
+class StringRelease:
     """Fed with every fresh sample; says how fast to yield, and when nothing is left."""
 
-    def __init__(self, limits: LetGoLimits, at_rest_rad_s: float, period_s: float) -> None:
+    def __init__(self, limits: StringReleaseLimits, at_rest_rad_s: float, period_s: float) -> None:
         self._limits = limits
         self._at_rest_rad_s = at_rest_rad_s
         self._period_s = period_s

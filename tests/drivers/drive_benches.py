@@ -17,12 +17,12 @@ import can
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.inline import InlineSimulator
 from sim_bus.params import FAITHFUL, QUIET, RigParams
 
-LIMITS = Limits(
+LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_wider=frozenset({"quick-stop"})
 )
 RPM = math.pi / 30.0

@@ -8,12 +8,12 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault
 from tests.drivers.drive_benches import CanopenBench, Run
 from tests.drivers.power_machine import ENABLED
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 PERIOD_S = 0.004
 
 

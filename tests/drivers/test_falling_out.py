@@ -4,10 +4,10 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 TURN = Command(Mode.SPEED, 1.0, 0.0)
 
 

@@ -15,10 +15,10 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile
 
-LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+LIMITS = DriveLimits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 NAME = "siemens/s120-canopen"
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import LOWER_THE_RATE, MonotonicClock, SteppedClock, Ticks, how_late
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)
 TURN = Command(Mode.SPEED, 1.0, 0.0)
 PERIOD_S = 0.004
 
@@ -243,7 +243,7 @@ def test_standing_still_is_no_error_while_a_rate_is_tried_and_one_afterwards(pre
 def test_a_short_watchdog_leaves_no_slow_rate(wire, peer, profile, fake_time):
     drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
-    drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.06))
+    drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.06))
     assert drive.rates_hz == (250.0, 200.0, 125.0, 100.0)
 
 

@@ -6,13 +6,13 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import PreflightRefused
 from drivers.left_behind import LeftBehind, read
 from tests.drivers.scripted_drive import ScriptedDrive, u
 
 ALL = frozenset({"torque", "speed", "quick-stop"})
-LIMITS = Limits(10.0, 300.0, 2.0, 0.4, accept_wider=ALL)
+LIMITS = DriveLimits(10.0, 300.0, 2.0, 0.4, accept_wider=ALL)
 FOUND = {0x6072: 100, 0x6080: 40, 0x6085: 1910, 0x605A: 2, 0x6007: 1}
 
 
@@ -61,7 +61,7 @@ def test_each_is_written_down_before_it_is_changed(make, real, tmp_path):
     """A host may die between any two of its frames."""
     seen = []
 
-    def look(request):
+    def poll(request):
         if request[0] & 0xE3 == 0x23:
             index, sub = int.from_bytes(request[1:3], "little"), request[3]
             if index in FOUND:
@@ -71,7 +71,7 @@ def test_each_is_written_down_before_it_is_changed(make, real, tmp_path):
                 assert int.from_bytes(entry.before, "little") == FOUND[index]
                 seen.append(index)
 
-    real.before_answer = look
+    real.before_answer = poll
     run(make())
     assert sorted(set(seen)) == sorted(FOUND)
 
@@ -82,7 +82,7 @@ def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_pa
     real.machine.state = "switch on disabled"
     assert real.value(0x6072) == 300
     drive = make()
-    found = run(drive, Limits(10.0, 300.0, 2.0, 0.4))
+    found = run(drive, DriveLimits(10.0, 300.0, 2.0, 0.4))
     assert (real.value(0x6072), real.value(0x6080), real.value(0x6085)) == (100, 40, 1910)
     assert found.kept_torque_nm == pytest.approx(100.0)
     (row,) = [check for check in found.checks if check.name == "left by an earlier run"]
@@ -97,7 +97,7 @@ def test_the_next_run_gives_back_what_a_killed_one_left(make, real, wire, tmp_pa
 def test_what_somebody_has_set_since_is_left_alone(make, real, tmp_path):
     run(make())
     real.objects[0x6072, 0] = u(77, 2)
-    run(make(), Limits(10.0, 300.0, 2.0, 0.4))
+    run(make(), DriveLimits(10.0, 300.0, 2.0, 0.4))
     assert real.value(0x6072) == 77
 
 
@@ -105,7 +105,7 @@ def test_another_drive_is_not_given_it(make, real, wire, tmp_path):
     run(make())
     real.objects[0x1018, 4] = u(0x45, 4)
     real.objects[0x6072, 0] = u(300, 2)
-    run(make(), Limits(10.0, 300.0, 2.0, 0.4))
+    run(make(), DriveLimits(10.0, 300.0, 2.0, 0.4))
     assert real.value(0x6072) == 300
 
 

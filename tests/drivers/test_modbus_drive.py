@@ -6,7 +6,7 @@ import json
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
@@ -16,7 +16,7 @@ from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, MODE, Bank, high_and_low
 from tests.drivers.power_machine import OFF, STOPPING
 
-LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+LIMITS = DriveLimits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
 GENERIC = load_modbus_profile("generic/modbus")
 PERIOD_S = 0.01
 

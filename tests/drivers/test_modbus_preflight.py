@@ -6,7 +6,7 @@ import json
 import pytest
 
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, Limits, Mode, Outcome
+from drivers.drive import Command, DriveLimits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
@@ -14,7 +14,7 @@ from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
 
-LIMITS = Limits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+LIMITS = DriveLimits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import csv
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.quick_stop import ModbusTarget
@@ -15,7 +15,7 @@ from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
 MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
 FAST_RAD_S = 4.0
 

@@ -7,7 +7,7 @@ ships, and the driver reads one with a mistake in it.
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Limits
+from drivers.drive import DriveLimits
 from drivers.errors import PreflightRefused
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
@@ -17,7 +17,7 @@ from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.modbus.wrong_maps import parse
 from sim_bus.params import RigParams
 
-LIMITS = Limits(
+LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5,
     accept_wider=frozenset({"torque", "speed", "quick-stop"}),         # or a register that reads tighter is let be
 )
@@ -96,6 +96,6 @@ def test_an_echo_too_coarse_for_the_limits_says_so(speed_rad_s, coarse):
     simulated.machine.parameters.put("maximum_reference", 10_000.0)
     drive = ModbusDrive(EmbeddedLink(simulated.serve, SteppedClock()), profile, unit=1, rated_torque_nm=1000.0)
     drive.connect()
-    limits = Limits(speed_rad_s=speed_rad_s, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
+    limits = DriveLimits(speed_rad_s=speed_rad_s, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
     notes = [check.name for check in drive.preflight(limits).checks if "too coarse" in check.found]
     assert notes == ["speed setpoint as the drive understood it, how finely"] * coarse

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Limits, Mode, Outcome
+from drivers.drive import DriveLimits, Mode, Outcome
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
@@ -19,7 +19,7 @@ from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, TIME_OUT, Bank
 from tests.drivers.profile_benches import S120Bench
 
-LIMITS = Limits(
+LIMITS = DriveLimits(
     speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5, accept_no_watchdog=True,
     accept_wider=frozenset({"torque", "speed", "quick-stop"}),
 )

@@ -6,11 +6,11 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
 from tests.drivers.scripted_drive import u
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 
 
 @pytest.fixture
@@ -305,7 +305,7 @@ def test_its_frames_are_known_by_their_own_identifier(make, wire, peer):
 def test_a_mode_that_was_lost_shows_within_a_tenth_of_a_second_or_a_cycle(wire, peer, profile, rate_hz):
     drive = Cia402Drive(wire, profile, SteppedClock(), node=1, rate_hz=rate_hz)
     drive.connect()
-    drive.preflight(Limits(10.0, 300.0, 2.0, 3.0))
+    drive.preflight(DriveLimits(10.0, 300.0, 2.0, 3.0))
     syncs = peer.value(0x1801, 2)
     assert 1 <= syncs <= 5
     assert syncs / rate_hz <= max(0.1, 1.0 / rate_hz) + 1e-9
@@ -326,7 +326,7 @@ def test_a_mode_that_is_not_displayed_any_more_is_not_known(running, wire, peer)
 def test_a_short_watchdog_is_fed_five_times_in_its_time(wire, peer, profile, fake_time, watchdog_s):
     drive = Cia402Drive(wire, profile, MonotonicClock(), node=1)
     drive.connect()
-    drive.preflight(Limits(10.0, 300.0, 2.0, watchdog_s))
+    drive.preflight(DriveLimits(10.0, 300.0, 2.0, watchdog_s))
     sent, plain = [], wire.on_send
     wire.on_send = lambda identifier, data: (
         sent.append(fake_time.now_s) if identifier == 0x77F else None, plain(identifier, data)
@@ -345,7 +345,7 @@ def test_after_stop_feeding_nothing_goes_out_that_the_watchdog_hears(running, wi
     sample = go(running, wire, 2.0)
     assert sample.fresh                            # in stepped time the SYNC goes on, and with it the feedback
     assert {identifier for identifier, _ in wire.sent} == {0x080}
-    running.look()
+    running.poll()
     assert not wire.of(0x77F)
 
 
@@ -360,7 +360,7 @@ def test_in_real_time_not_even_the_sync_goes_out(make, wire, peer):
     assert not go(drive, wire, 0.5).fresh
     assert wire.sent == []
     peer.objects |= {(0x606C, 0): bytes(4), (0x6077, 0): bytes(2)}
-    assert drive.look() is not None
+    assert drive.poll() is not None
     assert {identifier for identifier, _ in wire.sent} == {0x601}
 
 

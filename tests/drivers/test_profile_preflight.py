@@ -169,7 +169,7 @@ def test_a_bare_stop_sees_the_speed_in_the_drives_own_scale(make, kind):
     bench = make(kind)
     Run(bench).turning(5.0)
     target = Cia402Target(bench._second, load_canopen_profile(kind.PROFILE), bench.drive.clock, node=1)
-    seen = target.look()
+    seen = target.poll()
     assert seen.speed == pytest.approx(5.0, abs=0.2)
     assert not seen.near_zero
 

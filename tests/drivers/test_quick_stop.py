@@ -135,13 +135,13 @@ def test_what_undoes_it_gets_it_by_rpdo_too_and_is_switched_off_in_the_end(wire,
 def test_what_is_seen_of_the_drive(wire, scripted):
     scripted.objects[0x606C, 0] = u(500, 4)
     target = target_of(wire)
-    seen = target.look()
+    seen = target.poll()
     assert seen.speed == pytest.approx(50.0 * 2.0 * 3.14159265 / 60.0, rel=1e-6)      # 0.1 rpm
     assert (seen.unit, seen.near_zero, seen.standstill, seen.follows) == ("rad/s", False, False, True)
     scripted.objects[0x606C, 0] = u(-3, 4)
-    assert target.look().near_zero
+    assert target.poll().near_zero
     target.ask(1)
-    seen = target.look()
+    seen = target.poll()
     assert "quick stop active" in seen.text
     assert not seen.follows
 

@@ -6,7 +6,7 @@ import struct
 import pytest
 
 from drivers.canopen import bus
-from drivers.drive import Looking, PowerState
+from drivers.drive import Polled, PowerState
 from drivers.errors import CommunicationLost, DriveFault
 from tests.drivers.drive_benches import CanopenBench, Run
 from tests.drivers.modbus_bank import CONTROL
@@ -53,12 +53,12 @@ def test_a_look_shows_what_the_cycle_shows(run):
     run.ready()
     run.enable()
     sample = run.go(3.0, speed=2.0)
-    look = run.drive.look()
-    assert isinstance(run.drive, Looking)
-    assert look.fresh and look.state is PowerState.ENABLED
-    assert look.speed_rad_s == pytest.approx(sample.speed_rad_s, abs=0.01 + 3.0 * run.bench.speed_lsb)
-    assert math.isfinite(look.torque_nm)
-    assert abs(look.torque_nm - sample.torque_nm) < 60.0
+    poll = run.drive.poll()
+    assert isinstance(run.drive, Polled)
+    assert poll.fresh and poll.state is PowerState.ENABLED
+    assert poll.speed_rad_s == pytest.approx(sample.speed_rad_s, abs=0.01 + 3.0 * run.bench.speed_lsb)
+    assert math.isfinite(poll.torque_nm)
+    assert abs(poll.torque_nm - sample.torque_nm) < 60.0
     # Nothing was asked of the drive by it: the run goes on.
     assert run.cycle(speed=2.0).state is PowerState.ENABLED
 
@@ -70,13 +70,13 @@ def test_in_pre_operational_it_sees_rest_and_disables(turning, bench):
     bench.heard()
     for _ in range(60):                                   # 2 rad/s at 1 rad/s²
         assert quietly(turning, 10) == []
-        look = turning.drive.look()
-    assert look.speed_rad_s == pytest.approx(0.0, abs=0.05)
+        poll = turning.drive.poll()
+    assert poll.speed_rad_s == pytest.approx(0.0, abs=0.05)
     assert abs(bench.true_speed_rad_s) < 0.01
     turning.drive.disable()
-    turning.drive.look()
+    turning.drive.poll()
     quietly(turning, 2)
-    assert turning.drive.look().state is PowerState.OFF
+    assert turning.drive.poll().state is PowerState.OFF
     words = [struct.unpack("<H", data[4:6])[0] for data in requests(bench) if data[1:4] == b"\x40\x60\x00"]
     assert words and all(word & 0x0F != 0x0F for word in words)
 
@@ -86,10 +86,10 @@ def test_a_stopped_node_is_asked_in_pre_operational(turning, bench):
     quietly(turning, 40, speed=2.0)
     turning.drive.quick_stop()
     bench.heard()
-    look = turning.drive.look()
+    poll = turning.drive.poll()
     commands = [data for identifier, data in bench.heard() if identifier == 0]
     assert commands == [bytes((0x80, 1))]
-    assert look is not None and look.state is not PowerState.ENABLED
+    assert poll is not None and poll.state is not PowerState.ENABLED
 
 
 def test_after_a_restart_nothing_is_enabled(turning, bench):
@@ -97,11 +97,11 @@ def test_after_a_restart_nothing_is_enabled(turning, bench):
     quietly(turning, 10, speed=2.0)
     turning.drive.quick_stop()
     bench.heard()
-    first = turning.drive.look()
+    first = turning.drive.poll()
     assert first.state is PowerState.OFF
     for _ in range(200):
         quietly(turning, 10)
-        last = turning.drive.look()
+        last = turning.drive.poll()
     assert abs(last.speed_rad_s) < 0.05 < abs(first.speed_rad_s)      # it coasted, and its time went on
     assert not any(data[1:4] == b"\x40\x60\x00" for data in requests(bench))
 
@@ -112,9 +112,9 @@ def test_an_enabled_drive_gets_the_quick_stop_by_sdo(turning, bench):
     bench.bus.send = lambda message: None if message.arbitration_id == 0x201 else send(message)
     turning.drive.quick_stop()
     assert turning.cycle().state is PowerState.ENABLED
-    turning.drive.look()
+    turning.drive.poll()
     turning.go(0.1)
-    assert turning.drive.look().state is PowerState.QUICK_STOP
+    assert turning.drive.poll().state is PowerState.QUICK_STOP
     turning.go(4.0)
     assert abs(bench.true_speed_rad_s) < 0.01
 
@@ -125,14 +125,14 @@ def test_no_answer_is_no_sample_and_is_asked_for_once(turning, bench, head):
         message for _ in range(1) if message.arbitration_id != 0x581 or bytes(message.data[1:4]) != head[1:]
     ]
     bench.heard()
-    assert turning.drive.look() is None
+    assert turning.drive.poll() is None
     assert sum(data[:4] == head for data in requests(bench)) == 1
 
 
 def test_a_bus_that_is_gone(turning, bench):
     bench.bus.send_error = OSError("gone")
     with pytest.raises(CommunicationLost):
-        turning.drive.look()
+        turning.drive.poll()
 
 
 # -- Modbus: plain reads ------------------------------------------------------------------------------------
@@ -146,11 +146,11 @@ def test_a_drive_that_takes_no_writes_is_still_seen(code):
     with pytest.raises(DriveFault):
         run.cycle()
     run.bank.requests.clear()
-    look = run.drive.look()
-    assert look.fresh and look.state is PowerState.ENABLED
+    poll = run.drive.poll()
+    assert poll.fresh and poll.state is PowerState.ENABLED
     assert [pdu[0] for pdu in run.bank.requests] == [3, 6]           # read, and the word tried by itself
     run.bank.machine.state = STOPPING
-    assert run.drive.look().state is PowerState.QUICK_STOP
+    assert run.drive.poll().state is PowerState.QUICK_STOP
 
 
 def test_the_quick_stop_word_goes_out_by_itself():
@@ -161,8 +161,8 @@ def test_the_quick_stop_word_goes_out_by_itself():
         run.cycle()
     assert run.bank.machine.state == ENABLED
     run.bank.writes.clear()
-    run.drive.look()
-    assert run.drive.look().state is PowerState.QUICK_STOP
+    run.drive.poll()
+    assert run.drive.poll().state is PowerState.QUICK_STOP
     assert [address for address, _ in run.bank.writes] == [CONTROL]
 
 
@@ -171,4 +171,4 @@ def test_a_drive_that_tells_nothing(silent):
     run = BankRun().enabled()
     run.bank.silent = silent
     run.bank.refuse = {} if silent else dict.fromkeys((3, 6, 16, 23), 2)
-    assert run.drive.look() is None
+    assert run.drive.poll() is None

@@ -9,10 +9,10 @@ from drivers.canopen.bus import CanLink, Condition, condition, queue_is_full
 from drivers.canopen.drive import Cia402Drive
 from drivers.canopen.supervision import Watch
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
 
-LIMITS = Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
+LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 
 
 @pytest.fixture

@@ -34,8 +34,8 @@ def truth_of(speed_lag, torque_lag):
 def test_a_descent_that_begins_without_a_lag_finds_it(seed):
     """scipy, begun at the truth, is the oracle; a descent from the best fit without torque's lag gets as low."""
     truth = truth_of(0.215, 0.136)
-    lines, tie = synthetic(Averaged(), seed, 0.3, HERTZ, lags=(0.215, 0.136))
-    problem = Likelihood(lines, Model(), tie, ())
+    lines, constraint = synthetic(Averaged(), seed, 0.3, HERTZ, lags=(0.215, 0.136))
+    problem = Likelihood(lines, Model(), constraint, ())
     limits = box(problem, rough_inertia_of(problem))
     inside = 1e-6 * limits.scale
     best = least_squares(problem.residuals, np.clip(truth, limits.low + inside, limits.high - inside),

@@ -132,7 +132,7 @@ def test_an_average_is_one_of_the_family(over):
 
 
 def test_likelihood_jacobian_is_the_derivative():
-    from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+    from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
     from tdhil.estimation.frequency_domain.likelihood import Likelihood
     from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
     from tdhil.estimation.frequency_domain.spectrum import Line
@@ -143,7 +143,7 @@ def test_likelihood_jacobian_is_the_derivative():
         speed = rng.standard_normal(2) + 1j * rng.standard_normal(2)
         return Line(hertz, speed, 60.0 * speed * (1 + 2j), np.array([5.0, 6.0]), 0.02, 30.0, 0.1 + 0.2j, 9.0)
 
-    problem = Likelihood((line(0.1), line(0.3)), Model(), ViscousTie(8.0, 0.01, 0.1, 9.0),
+    problem = Likelihood((line(0.1), line(0.3)), Model(), ViscousConstraint(8.0, 0.01, 0.1, 9.0),
                          (GaussianPrior(2, 0.3, 0.05),))
     residuals, jacobian = problem.linearised(THETA)
     assert np.allclose(residuals, problem.residuals(THETA), rtol=1e-12)

@@ -118,9 +118,9 @@ def test_a_string_has_a_double_that_the_lines_cannot_tell(wave, resistance, end,
 
 def test_the_double_of_a_string_does_not_stand_in_its_place():
     """Wherever the descents begin: also at the double, where scatter makes it the likelier by a hair."""
-    lines, tie = synthetic(TwoMass(), 0, 20.0)
-    two = fit_compliant(TwoMassShaft(), lines, tie, (), {})
-    problem = Likelihood(lines, Model(StringShaft()), tie, ())
+    lines, constraint = synthetic(TwoMass(), 0, 20.0)
+    two = fit_compliant(TwoMassShaft(), lines, constraint, (), {})
+    problem = Likelihood(lines, Model(StringShaft()), constraint, ())
     limits = box(problem, rough_inertia_of(problem))
     held = dict.fromkeys(problem.model.structure, 0.0)
     m = two.mechanical
@@ -131,7 +131,7 @@ def test_the_double_of_a_string_does_not_stand_in_its_place():
         start = np.concatenate([string_parameters(double), two.fitted.simple.theta[len(m):]])
         start[4] = 2.0 * m[4] * (resistance / spring / wave) ** 2       # as little damping as the spring has
         ends.append(minimise(problem, limits, start, held))
-    beside = fit_compliant(StringShaft(), lines, tie, (), {}, two)
+    beside = fit_compliant(StringShaft(), lines, constraint, (), {}, two)
     doubles = [fit for fit in ends if string_resonances(fit.theta[:7])[0] < np.pi * LINES[0]]
     assert min(abs(fit.objective - beside.fitted.simple.objective) for fit in doubles) < 1.0, "as good, all but"
     likelier = replace(doubles[0], objective=beside.fitted.simple.objective - 1.0)

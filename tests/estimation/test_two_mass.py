@@ -18,7 +18,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     fit_compliant,
     inertias,
 )
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
 from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, resonances, stiffness
 from tdhil.estimation.frequency_domain.spectrum import Line
@@ -56,7 +56,7 @@ def synthetic(plant, seed, noise_nm, hertz=LINES, amplitude=0.2, lags=(0.4, 0.15
                           np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
                           complex(scatter(torque, speed)), 10.0))
     sd = 0.05 * noise_nm
-    return tuple(found), ViscousTie(plant.impedance(1e-5).real + sd * rng.normal(), 0.0, sd, 10.0)
+    return tuple(found), ViscousConstraint(plant.impedance(1e-5).real + sd * rng.normal(), 0.0, sd, 10.0)
 
 
 @few
@@ -145,8 +145,8 @@ def test_intervals_hold_over_seeds():
     plant, misses = TwoMass(), 0
     truth = {"inertia": plant.motor, "load": plant.load, "stiffness": plant.stiffness, "total": plant.total}
     for seed in range(5):
-        lines, tie = synthetic(plant, seed, 20.0)
-        found = inertias(fit_compliant(TwoMassShaft(), lines, tie, (), {}), 0.95)
+        lines, constraint = synthetic(plant, seed, 20.0)
+        found = inertias(fit_compliant(TwoMassShaft(), lines, constraint, (), {}), 0.95)
         for name, value in truth.items():
             one = found[name]
             assert one.value == pytest.approx(value, rel=0.15)
@@ -158,8 +158,8 @@ def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
     """Rejected outright, or doubted and then explained by a load that swings."""
     plant = TwoMass(83.0, 21.0, 21.0 * (2.0 * np.pi * 0.55) ** 2, 2.0, 6.0, 2.0)
     for seed in range(3):
-        lines, tie = synthetic(plant, seed, 1.0, (0.05, 0.1, 0.15, 0.25, 0.35, 0.5))
-        rigid = fit_rigid(lines, NO_LEVELS, tie, (), {}, 0.95)
+        lines, constraint = synthetic(plant, seed, 1.0, (0.05, 0.1, 0.15, 0.25, 0.35, 0.5))
+        rigid = fit_rigid(lines, NO_LEVELS, constraint, (), {}, 0.95)
         assert may_swing(rigid)
 
 
@@ -176,8 +176,8 @@ def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line():
 
 
 def test_too_few_lines_are_counted_and_refused():
-    lines, tie = synthetic(TwoMass(), 0, 20.0, LINES[:3])
-    found = choose("two-mass", lines, tie, (), {})
+    lines, constraint = synthetic(TwoMass(), 0, 20.0, LINES[:3])
+    found = choose("two-mass", lines, constraint, (), {})
     assert isinstance(found, Refusal)
     assert "9 unknowns" in found.reason
     assert "at least 4 lines" in found.advice

@@ -12,7 +12,7 @@ import pytest
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, LogError, exit_code
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.task import STAGES
 from tests.run.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
@@ -388,7 +388,7 @@ def test_row_37_a_setpoint_that_is_none_never_reaches_the_bus(mode, value):
 @in_motion
 def test_row_37_a_setpoint_that_is_none_ends_the_run(stage):
     here = World()
-    fed, plain = [], Bench.cycle
+    fed, plain = [], ControlLoop.cycle
 
     def poisoned(bench, command):
         if here.display.stage == stage and here.display.seen == IN_STAGE and not fed:
@@ -397,7 +397,7 @@ def test_row_37_a_setpoint_that_is_none_ends_the_run(stage):
         return plain(bench, command)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Bench, "cycle", poisoned)
+        patch.setattr(ControlLoop, "cycle", poisoned)
         result = here.runner(ExcitationRequest(periods=2)).run()
     Ended(here, result, fed[0]).assert_stopped(CommandRejected, ExitCode.INTERNAL, "not finite")
     assert all(command.torque_nm == command.torque_nm for command in here.drive.commands)

@@ -13,7 +13,7 @@ from tdhil.recording.log_reader import read_run
 from tdhil.recording.run_log import RunLog
 from tdhil.report.live import LiveDisplay
 from tdhil.run import stage_planner
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tests.faults.rehearsal import at
 from tests.path.path_runs import tdhil
 
@@ -146,12 +146,12 @@ NONE = (float("nan"), float("inf"), 1e9)
 
 @pytest.mark.parametrize(("field", "value"), [*product(["torque_nm", "speed_rad_s"], NONE)])
 def test_row_37_a_setpoint_that_is_none(field, value, rehearse, monkeypatch, seen):
-    due, plain = [], Bench.cycle
+    due, plain = [], ControlLoop.cycle
 
     def poisoned(bench, command):
         return plain(bench, command._replace(**{field: value}) if due else command)
 
-    monkeypatch.setattr(Bench, "cycle", poisoned)
+    monkeypatch.setattr(ControlLoop, "cycle", poisoned)
     acted = at(monkeypatch, "speed", 3.0, due.append)
     run = rehearse()
     assert run.done.code == 1

@@ -16,13 +16,13 @@ from typing import Any
 
 import drivers.canopen.drive
 from drivers.clock import MonotonicClock
-from drivers.drive import Command, Limits, Mode
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import TdhilError
 from profiles.library import load_canopen_profile
 from tests.drivers.scripted_drive import FakeTime, ScriptedBus, ScriptedDrive
 
 IDENTIFIERS = (0x000, 0x080, 0x081, 0x181, 0x281, 0x381, 0x581, 0x601, 0x701, 0x77F, 0x7E5, 0x182)
-LIMITS = Limits(10.0, 400.0, 2.0, 0.5)
+LIMITS = DriveLimits(10.0, 400.0, 2.0, 0.5)
 _profile = load_canopen_profile("generic/cia402")
 
 

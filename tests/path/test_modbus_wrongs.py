@@ -115,7 +115,7 @@ def test_a_scale_that_no_register_tells_gives_no_number(name, monkeypatch, tmp_p
 @pytest.mark.parametrize("name", some_always((name,) for name in NAMES))
 def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     from drivers.clock import SteppedClock
-    from drivers.drive import Limits
+    from drivers.drive import DriveLimits
     from drivers.modbus.drive import ModbusDrive
     from drivers.modbus.link import EmbeddedLink
 
@@ -124,7 +124,7 @@ def test_preflight_notes_what_it_can_not_tell(name, monkeypatch, tmp_path):
     drive = ModbusDrive(EmbeddedLink(peer.serve, SteppedClock()), profile, unit=peer.unit, given=dict(peer.untold),
                         rated_torque_nm=None if profile.rated_torque else peer.rated_torque_nm)
     drive.connect()
-    found = drive.preflight(Limits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
+    found = drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5))
     assert found.refused == ()
     notes = [check.name for check in found.checks if "in motion only" in check.found]
     assert notes == [f"{name} setpoint as the drive understood it" for name in unseen(profile)]

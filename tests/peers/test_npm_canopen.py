@@ -14,7 +14,7 @@ import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
-from drivers.drive import Command, Limits, Mode, Outcome, PowerState
+from drivers.drive import Command, DriveLimits, Mode, Outcome, PowerState
 from profiles.library import load_canopen_profile
 from tdhil.recording.log_reader import read_frames
 from tests.path.path_runs import HANGS_S, STAGES, identify, peer, process, tdhil
@@ -129,7 +129,7 @@ def test_our_driver_drives_a_foreign_slave(slave):
     assert (identity.vendor, identity.product, identity.revision, identity.serial) == (0, 402, 0x10000, 7)
     assert identity.name == "npm canopen drive"
     assert identity.simulated
-    found = drive.preflight(Limits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=5.0))
+    found = drive.preflight(DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=5.0))
     wrong = [check for check in found.checks if check.outcome is Outcome.REFUSED]
     assert found.refused == (), wrong
     assert found.rated_torque_nm == pytest.approx(1000.0)
@@ -166,7 +166,7 @@ def test_a_foreign_slave_loses_our_heartbeat(slave):
     hub, child = slave
     drive = driver(hub, MonotonicClock(), rate_hz=50.0)
     drive.connect()
-    assert drive.preflight(Limits(10.0, 300.0, 2.0, watchdog_s=3.0)).refused == ()
+    assert drive.preflight(DriveLimits(10.0, 300.0, 2.0, watchdog_s=3.0)).refused == ()
     drive.enable(Mode.SPEED)
     for _ in range(100):
         drive.exchange(Command(Mode.SPEED, 2.0, 0.0))

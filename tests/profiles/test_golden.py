@@ -6,8 +6,7 @@ from functools import cache
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Mode
-from drivers.drive import Limits as DriveLimits
+from drivers.drive import Command, DriveLimits, Mode
 from drivers.modbus import pdu as requests
 from drivers.modbus.access import Access
 from drivers.modbus.codec import find_scales, settle, si_per_count

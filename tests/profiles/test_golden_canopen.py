@@ -11,7 +11,7 @@ import yaml
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Limits, Mode, PowerState
+from drivers.drive import Command, DriveLimits, Mode, PowerState
 from profiles.library import load_canopen_profile, profile_names, profile_path
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams
@@ -63,7 +63,7 @@ class Bench:
         self.drive.connect()
         for entry in golden.get("stands", ()):
             self.node.store.write(entry["index"] << 8 | entry["sub"], entry["value"])
-        self.found = self.drive.preflight(Limits(**golden["limits"], accept_wider=frozenset({"quick-stop"})))
+        self.found = self.drive.preflight(DriveLimits(**golden["limits"], accept_wider=frozenset({"quick-stop"})))
 
     def close(self):
         self.host.shutdown()

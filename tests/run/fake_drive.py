@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from drivers.clock import SteppedClock
-from drivers.drive import Check, Command, Counters, Identity, Limits, Mode, Outcome, PowerState, Preflight, Sample
+from drivers.drive import Check, Command, Counters, DriveLimits, Identity, Mode, Outcome, PowerState, Preflight, Sample
 from drivers.errors import CommunicationLost
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.guard import Guard
 from tdhil.run.runner import Runner
 from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
@@ -72,7 +72,7 @@ class FakeDrive:
         self.calls.append("connect")
         return Identity(1, 2, 3, 4, "fake", self.simulated)
 
-    def preflight(self, limits: Limits) -> Preflight:
+    def preflight(self, limits: DriveLimits) -> Preflight:
         self.calls.append("preflight")
         return Preflight(
             identity=Identity(1, 2, 3, 4, "fake", self.simulated), checks=self.refused, modes=self.modes,
@@ -247,7 +247,7 @@ class World:
         self.display = FakeDisplay()
         self.stop_request = StopRequest()
         self.guard = Guard(limits, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION)
-        self.bench = Bench(self.drive, self.guard, self.log, self.stop_request, watch or self.display.cycle)
+        self.bench = ControlLoop(self.drive, self.guard, self.log, self.stop_request, watch or self.display.cycle)
 
     def stop_sequence(self, **options) -> StopSequence:
         return StopSequence(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, Counters, Identity, Limits, Mode, PowerState, Preflight, Sample
+from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
 from sim_bus.inverter import Inverter, Regulation
 from sim_bus.params import DriveParams, RigParams
 from tdhil.recording.builder import RecordingBuilder
@@ -69,7 +69,7 @@ class LineDrive:
         self._plant_s = 0.0
         self._slot_s = 0.0
         self._state = self._wish = PowerState.OFF
-        self._limits = Limits(10.0, 400.0, 2.0, 0.5)
+        self._limits = DriveLimits(10.0, 400.0, 2.0, 0.5)
         self._mode: Mode = Mode.SPEED
 
     @property
@@ -85,7 +85,7 @@ class LineDrive:
     def connect(self) -> Identity:
         return Identity(1, 2, 3, 4, "line", True)
 
-    def preflight(self, limits: Limits) -> Preflight:
+    def preflight(self, limits: DriveLimits) -> Preflight:
         self._limits, self.ready = limits, True
         reporting = self.params.reporting
         return Preflight(

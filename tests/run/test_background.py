@@ -107,7 +107,7 @@ def test_the_plan_is_the_one_that_a_thread_makes(world, reckoner, monkeypatch, w
         asked.append(work)
         raise Interrupted(signal.SIGINT)
 
-    monkeypatch.setattr(stage_planner.Bench, "compute", compute)
+    monkeypatch.setattr(stage_planner.ControlLoop, "compute", compute)
     world().runner(wish).run()
     (work,) = asked
     there, here = reckoner.ask(work), work()

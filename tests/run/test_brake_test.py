@@ -77,12 +77,12 @@ def test_nothing_below_zero_is_sent_before_the_probe(world, friction):
     here = world(FakeDrive(coulomb=friction[0], viscous=friction[1]))
     early = []
 
-    def look(stage, cycles):
+    def poll(stage, cycles):
         if here.guard_text() == NOT_YET:
             early.extend(torque_below_zero(here.drive))
 
     here.guard_text = lambda: "" if any("braking torque tried" in text for _, text in here.log.events) else NOT_YET
-    here.display.on_cycle = look
+    here.display.on_cycle = poll
     assert here.runner().run().cause is None
     assert early == []
     assert any("the shaft slowed down" in text for _, text in here.log.events)

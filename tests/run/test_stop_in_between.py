@@ -27,7 +27,7 @@ class Seen(FakeDrive):
     def __post_init__(self):
         self.misbehave, self.gone, self.told = cycle_feedback, lambda cycle: False, {}
 
-    def look(self):
+    def poll(self):
         return self.report()
 
 
@@ -39,7 +39,7 @@ class SeenString(StringDrive):
         super().__post_init__()
         self.misbehave, self.gone, self.told = cycle_feedback, lambda cycle: False, {}
 
-    def look(self):
+    def poll(self):
         return self.report()
 
 
@@ -144,7 +144,7 @@ def test_quick_stop_comes_as_soon_as_speed_mode_is_there(world, follows, most):
 def test_a_look_that_fails_is_told_and_the_stop_goes_on(world, gone):
     @dataclass
     class Unseen(Seen):
-        def look(self):
+        def poll(self):
             raise CommunicationLost("6041h does not answer")
 
     here = world(Unseen())

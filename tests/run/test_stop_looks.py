@@ -36,7 +36,7 @@ class LookedAt(FakeDrive):
             return self._frozen._replace(time_s=sample.time_s)
         return sample
 
-    def look(self):
+    def poll(self):
         self.looks += 1
         if self.raises is not None:
             raise self.raises
@@ -103,9 +103,9 @@ def test_without_a_watchdog_that_would_act_the_host_goes_on_asking(world):
     """The drive takes the quick stop only after a while; nobody else would stop the shaft."""
 
     class Late(LookedAt):
-        def look(self):
+        def poll(self):
             self.brakes = self.looks > 20
-            return super().look()
+            return super().poll()
 
     here = world(Late(brakes=False))
     here.turn(5.0)

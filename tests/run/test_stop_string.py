@@ -11,12 +11,12 @@ from drivers.drive import Check, Identity, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
 from tdhil.run.preconditions import refuse_with_string
 from tdhil.run.settings import ExcitationRequest
-from tdhil.run.stop import BLOCK_S, LONGEST_S, MODE_S, Patience
-from tdhil.run.string_release import FASTEST_SWING_S, QUIET_S, STIFFEST, TRAVEL_RAD, LetGo, LetGoLimits
+from tdhil.run.stop import BLOCK_S, LONGEST_S, MODE_S, StopTimeout
+from tdhil.run.string_release import FASTEST_SWING_S, QUIET_S, STIFFEST, TRAVEL_RAD, StringRelease, StringReleaseLimits
 from tests.run.fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
 from tests.run.string_drive import RESIDUAL_NM, STRING, StringWorld
 
-LIMITS = LetGoLimits(torque_nm=400.0, speed_rad_s=10.0, ramp_nm_s=20.0, torque_resolution_nm=1.0)
+LIMITS = StringReleaseLimits(torque_nm=400.0, speed_rad_s=10.0, ramp_nm_s=20.0, torque_resolution_nm=1.0)
 
 
 def torques(here):
@@ -199,7 +199,7 @@ def test_backwards_too_it_comes_to_rest_first():
 
 
 def letting_go(limits=LIMITS, period_s=0.02):
-    return LetGo(limits, 0.05, period_s)
+    return StringRelease(limits, 0.05, period_s)
 
 
 @settings(max_examples=60)
@@ -293,7 +293,7 @@ def test_what_counts_as_nothing(limit, resolution, residual):
 
 
 def waited(speeds, enough_s=19.0, period_s=0.5):
-    patience = Patience(enough_s, 0.05)
+    patience = StopTimeout(enough_s, 0.05)
     for speed in speeds:
         if patience.over:
             break
@@ -336,9 +336,9 @@ REAL = Identity(1, 2, 3, 4, "real", simulated=False)
 
 
 def preflight_of(**change):
-    from drivers.drive import Limits
+    from drivers.drive import DriveLimits
 
-    found = FakeDrive().preflight(Limits(10.0, 400.0, 2.0, 0.5))
+    found = FakeDrive().preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
     return replace(found, **change)
 
 

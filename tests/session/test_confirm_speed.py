@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from drivers.errors import PreflightRefused
-from tdhil.config.rig import Run
+from tdhil.config.rig import RunSection
 from tdhil.session.confirm import confirm_speed, turns_text
 
 
@@ -59,7 +59,7 @@ def test_no_terminal_at_all(monkeypatch):
 
 
 def test_a_file_never_says_it():
-    assert "--accept-speed-unit" in Run.never_here["accept_speed_unit"]
+    assert "--accept-speed-unit" in RunSection.never_here["accept_speed_unit"]
 
 
 @pytest.mark.parametrize(("speed_rad_s", "said"), [

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from tdhil.studies.coverage.bound import Watched, bound_of, cramer_rao, density, information
 from tdhil.studies.coverage.plants import FLEET, Noise, Report
-from tdhil.studies.coverage.simulate import Run
+from tdhil.studies.coverage.simulate import SimulatedRun
 from tdhil.studies.coverage.study import (
     COVERAGE,
     CoverageSettings,
@@ -68,10 +68,10 @@ def test_the_notes_design_has_about_the_notes_bound() -> None:
     assert 0.10 < bound < 0.50
 
 
-def _runs(values: list[tuple[float, float] | None]) -> list[Run]:
+def _runs(values: list[tuple[float, float] | None]) -> list[SimulatedRun]:
     return [
-        Run("field", n, 100.0, "valid", "") if one is None else Run("field", n, 100.0, "valid", "", one[0],
-                                                                    one[0] - one[1], one[0] + one[1])
+        SimulatedRun("field", n, 100.0, "valid", "") if one is None
+        else SimulatedRun("field", n, 100.0, "valid", "", one[0], one[0] - one[1], one[0] + one[1])
         for n, one in enumerate(values)
     ]
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tdhil.studies.coverage import study
-from tdhil.studies.coverage.simulate import Run
+from tdhil.studies.coverage.simulate import SimulatedRun
 from tdhil.studies.coverage.study import COVERAGE, CoverageSettings
 from tdhil.studies.output import StudyBar
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 def some_runs(wanted, processes):
     """Two groups, then Ctrl-C."""
     for task in wanted[:2]:
-        yield tuple(Run(task.plant.name, number, 100.0, "valid", "", 104.0, 103.0, 105.0)
+        yield tuple(SimulatedRun(task.plant.name, number, 100.0, "valid", "", 104.0, 103.0, 105.0)
                     for number in range(task.first, task.first + task.count))
     raise KeyboardInterrupt
 
@@ -57,7 +57,7 @@ def test_a_whole_benchmark_says_nothing_of_it(monkeypatch):
 
 
 def _all(wanted, processes):
-    return [tuple(Run(task.plant.name, n, 100.0, "valid", "", 104.0, 103.0, 105.0) for n in range(task.count))
+    return [tuple(SimulatedRun(task.plant.name, n, 100.0, "valid", "", 104.0, 103.0, 105.0) for n in range(task.count))
             for task in wanted]
 
 

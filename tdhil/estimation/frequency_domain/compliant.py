@@ -16,7 +16,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     inertias,
     intervals,
 )
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, coulomb_level
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
     REJECT_P,
     grown_lines,
@@ -27,7 +27,7 @@ from tdhil.estimation.frequency_domain.inference import (
     torque_scale_line,
 )
 from tdhil.estimation.frequency_domain.model import GaussianPrior
-from tdhil.estimation.frequency_domain.optimiser import Held
+from tdhil.estimation.frequency_domain.optimiser import Fixed
 from tdhil.estimation.frequency_domain.rigid import RigidResult, fitted_points, known_of, lags_of, of_reports
 from tdhil.estimation.frequency_domain.shafts import (
     DAMPING,
@@ -90,24 +90,27 @@ def _clear(line: Line) -> bool:
 
 
 def choose(
-    asked: Asked, lines: tuple[Line, ...], tie: ViscousTie | None, priors: tuple[GaussianPrior, ...], held: Held
+    asked: Asked, lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...],
+    fixed: Fixed
 ) -> Chosen | Refusal:
-    """``priors`` and ``held`` as with a rigid shaft."""
-    refusal = _refuse_count(StringShaft() if asked == "string" else TwoMassShaft(), lines, tie, priors)
+    """``priors`` and ``fixed`` as with a rigid shaft."""
+    refusal = _refuse_count(StringShaft() if asked == "string" else TwoMassShaft(), lines, constraint, priors)
     if refusal is not None:
         return refusal
+
     if asked != "auto":
-        forced = fit_compliant(TwoMassShaft() if asked == "two-mass" else StringShaft(), lines, tie, priors, held)
+        shaft = TwoMassShaft() if asked == "two-mass" else StringShaft()
+        forced = fit_compliant(shaft, lines, constraint, priors, fixed)
         return Chosen(forced, rejected=rejects(forced.residual))
-    two = fit_compliant(TwoMassShaft(), lines, tie, priors, held)
+    two = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
     if two.residual is None:      # a shaft taken in place of one that was contradicted must be one that could be, too
         return Refusal(
             f"{len(lines)} excited lines leave nothing to test two masses on a spring with",
             "excite more lines about two mean speeds, from well below the resonance to well above it",
         )
-    if _refuse_count(StringShaft(), lines, tie, priors) is not None:
+    if _refuse_count(StringShaft(), lines, constraint, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
-    string = fit_compliant(StringShaft(), lines, tie, priors, held, two)
+    string = fit_compliant(StringShaft(), lines, constraint, priors, fixed, two)
     if not rejects(two.residual) and not _outdoes(string, two):
         return Chosen(two, string, rejected=not plausible(two))
     return Chosen(string, rejected=rejects(string.residual) or not plausible(string))
@@ -131,10 +134,10 @@ def may_swing(rigid: RigidResult) -> bool:
         return True
     if rigid.first_order or rigid.residual is None or rigid.residual.p_value > _DOUBT:
         return False
-    if _refuse_count(TwoMassShaft(), problem.lines, problem.tie, problem.priors) is not None:
+    if _refuse_count(TwoMassShaft(), problem.lines, problem.constraint, problem.priors) is not None:
         return False
     try:
-        two = fit_compliant(TwoMassShaft(), problem.lines, problem.tie, problem.priors, fitted.held)
+        two = fit_compliant(TwoMassShaft(), problem.lines, problem.constraint, problem.priors, fitted.fixed)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return False
     return fitted.whole.objective - two.fitted.simple.objective > _MUCH
@@ -151,15 +154,15 @@ def plausible(fit: CompliantFit) -> bool:
 def _refuse_count(
     shaft: TwoMassShaft | StringShaft,
     lines: tuple[Line, ...],
-    tie: ViscousTie | None,
+    constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
 ) -> Refusal | None:
     """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft."""
-    equations, unknowns = 2 * len(lines) + (tie is not None) + len(priors), len(shaft.names) + _REPORTS
+    equations, unknowns = 2 * len(lines) + (constraint is not None) + len(priors), len(shaft.names) + _REPORTS
     if equations >= unknowns:
         return None
     name = "a string" if isinstance(shaft, StringShaft) else "two masses on a spring"
-    wanted = math.ceil(0.5 * (unknowns - (tie is not None) - len(priors)))
+    wanted = math.ceil(0.5 * (unknowns - (constraint is not None) - len(priors)))
     return Refusal(
         f"{len(lines)} excited lines, mean speeds and known lags give {equations} equations, but {name} behind a "
         f"drive's reports {'has' if isinstance(shaft, StringShaft) else 'have'} {unknowns} unknowns",
@@ -188,24 +191,24 @@ class CompliantResult:
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
     """Of the model that stands; where two masses stand, their intervals hold what a string would say too."""
     alone = intervals(chosen.fit, confidence)
-    held = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
+    fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
     return CompliantResult(
-        inertia=held.inertia,
+        inertia=fixed.inertia,
         shaft=Compliant(
-            total_inertia=held.total if held.total.finite else None,
-            load_inertia=_unless_open(held.load),
-            stiffness_nm_rad=_unless_open(held.stiffness),
-            damping_nm_s_rad=None if chosen.fit.is_string else _unless_open(held.damping),
-            resonance_hz=_unless_open(held.resonance),
-            antiresonance_hz=_unless_open(held.antiresonance),
+            total_inertia=fixed.total if fixed.total.finite else None,
+            load_inertia=_unless_open(fixed.load),
+            stiffness_nm_rad=_unless_open(fixed.stiffness),
+            damping_nm_s_rad=None if chosen.fit.is_string else _unless_open(fixed.damping),
+            resonance_hz=_unless_open(fixed.resonance),
+            antiresonance_hz=_unless_open(fixed.antiresonance),
         ),
-        viscous=held.viscous,
-        coulomb=_coulomb(levels, chosen.fit, held, confidence),
+        viscous=fixed.viscous,
+        coulomb=_coulomb(levels, chosen.fit, fixed, confidence),
         speed_lag_s=speed_lag,
         torque_lag_s=torque_lag,
         skew_s=skew,
-        budget=_budget(chosen.fit, alone.inertia, held.inertia, confidence, torque_scale_rel_sd),
+        budget=_budget(chosen.fit, alone.inertia, fixed.inertia, confidence, torque_scale_rel_sd),
     )
 
 
@@ -215,27 +218,27 @@ def _unless_open(one: Estimate) -> Estimate | None:
 
 def _united(one: CompliantIntervals, others: dict[str, Estimate]) -> CompliantIntervals:
     """The values of ``one``, and all that either holds."""
-    held = {}
+    fixed = {}
     for name, other in others.items():
         own: Estimate = getattr(one, name)
-        held[name] = Estimate(own.value, min(own.low, other.low), max(own.high, other.high))
-    return replace(one, **held)
+        fixed[name] = Estimate(own.value, min(own.low, other.low), max(own.high, other.high))
+    return replace(one, **fixed)
 
 
-def _coulomb(levels: Levels, fit: CompliantFit, held: CompliantIntervals, confidence: float) -> Estimate | None:
+def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confidence: float) -> Estimate | None:
     """Dry friction of both ends, from the levels: it is in the mean torque only."""
     if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
         return None
     fitted = fit.fitted
     free = [index for index in fitted.free if index not in fitted.simple_held]
     sd_viscous, dof = standard_deviation(fitted.problem, fitted.simple.theta, VISCOUS, free)
-    value, sd = coulomb_level(levels, held.total.value, held.viscous.value, sd_viscous)
+    value, sd = coulomb_level(levels, fixed.total.value, fixed.viscous.value, sd_viscous)
     half = student_quantile(confidence, min(dof, levels.dof)) * sd
     return Estimate(value, value - half, value + half) if math.isfinite(half) else None
 
 
 def _budget(
-    fit: CompliantFit, alone: Estimate, held: Estimate, confidence: float, torque_scale_rel_sd: float
+    fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
     """As `budget.py` has it for a rigid shaft: set free one group after another, each its share in squares."""
     at = fit.fitted.problem.model.at
@@ -254,11 +257,11 @@ def _budget(
         ("timing", half(*lags), "skew between speed and torque"),
         ("lags", half(), "time constants of the reports' filters"),
         ("lag structure", 0.5 * (alone.high - alone.low), "filters of two poles, moving averages"),
-        ("shaft model", 0.5 * (held.high - held.low), "a spring that weighs something: a string"),
+        ("shaft model", 0.5 * (fixed.high - fixed.low), "a spring that weighs something: a string"),
     )
-    lines = grown_lines(grown, 0.5 * (held.high - held.low))
+    lines = grown_lines(grown, 0.5 * (fixed.high - fixed.low))
     told = (line for line in lines if line.source != "shaft model" or line.half_width_kg_m2 > 0.0)
-    return (*told, torque_scale_line(held.value, torque_scale_rel_sd, confidence))
+    return (*told, torque_scale_line(fixed.value, torque_scale_rel_sd, confidence))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -281,9 +284,9 @@ def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = Non
     """
     told = None
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
-    priors, held = known_of(case.recording.lag_prior, len(case.usable), case.tie)
+    priors, fixed = known_of(case.recording.lag_prior, len(case.usable), case.constraint)
     try:
-        chosen = choose(case.options.model, case.usable, case.tie, priors, held)
+        chosen = choose(case.options.model, case.usable, case.constraint, priors, fixed)
         if isinstance(chosen, Chosen) and not chosen.rejected:
             told = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
@@ -369,7 +372,7 @@ def _caveats(fit: CompliantFit, found: CompliantResult) -> tuple[str, ...]:
         if one is not None and min(hertz) <= one.value <= max(hertz):
             article = "an" if name == "antiresonance" else "a"
             said.append(f"{article} {name} at {one.value:.3g} Hz lies inside the excited band")
-    if fit.fitted.problem.tie is None:
+    if fit.fitted.problem.constraint is None:
         said.append("only one mean speed: viscous friction rests on the lines, not on levels")
     if not fit.fitted.first_order:
         said.append("first-order lags do not explain the reports; filters of two poles and moving averages do")

@@ -8,11 +8,11 @@ import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.inference import REJECT_P, estimate, residual_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
-from tdhil.estimation.frequency_domain.optimiser import Apart, Fit, Held, box, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.optimiser import Apart, Fit, Fixed, box, minimise, rough_inertia_of
 from tdhil.estimation.frequency_domain.shafts import (
     DAMPING,
     INERTIA,
@@ -56,15 +56,15 @@ _ALIKE = (0.15, 0.12)                    # octaves of swing, share of the string
 _TRIED, _KEPT = 24, 5
 
 
-def compliant_starts(problem: Likelihood, held: Held) -> list[FloatArray]:
+def compliant_starts(problem: Likelihood, fixed: Fixed) -> list[FloatArray]:
     """The most promising theta, (P,) each; for `TwoMassShaft` and `StringShaft`."""
     lines = tuple(
         replace(line, s_tt=line.s_tt + _BLUR**2 * float(np.mean(np.abs(line.torque) ** 2 * line.periods)))
         for line in problem.lines
     )
-    blurred = Likelihood(lines, problem.model, problem.tie, problem.priors)
+    blurred = Likelihood(lines, problem.model, problem.constraint, problem.priors)
     limits = box(problem, rough_inertia_of(problem))
-    first_order = {**dict.fromkeys(problem.model.structure, 0.0), **held}
+    first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
     fits = [minimise(blurred, limits, start, first_order) for start in _proposals(blurred)]
     return [fit.theta for fit in sorted(fits, key=lambda fit: fit.objective)[:_KEPT]]
 
@@ -251,7 +251,7 @@ class ViewedShaft:
 def viewed(fitted: Fitted, view: View) -> Fitted:
     """The same fits in the view's parameters; `view.index` is where the interval is asked for."""
     old = fitted.problem
-    problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.tie, old.priors)
+    problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.constraint, old.priors)
     size = old.model.mechanical
 
     def seen(fit: Fit) -> Fit:
@@ -314,24 +314,24 @@ class CompliantIntervals:
 def fit_compliant(
     shaft: TwoMassShaft | StringShaft,
     lines: tuple[Line, ...],
-    tie: ViscousTie | None,
+    constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
-    held: Held,
+    fixed: Fixed,
     near: CompliantFit | None = None,
 ) -> CompliantFit:
-    """Fit and test. ``priors`` and ``held`` count as with a rigid shaft, and are moved to where this one has them.
+    """Fit and test. ``priors`` and ``fixed`` count as with a rigid shaft, and are moved to where this one has them.
 
     ``near``: two lumps already fitted, from which a string's descents begin too.
     """
     model = Model(shaft)
     moved = model.mechanical - _RIGID
     priors = tuple(replace(prior, index=prior.index + moved) for prior in priors)
-    held = {index + moved: value for index, value in held.items()}
-    problem = Likelihood(lines, model, tie, priors)
-    starts = compliant_starts(problem, held)
+    fixed = {index + moved: value for index, value in fixed.items()}
+    problem = Likelihood(lines, model, constraint, priors)
+    starts = compliant_starts(problem, fixed)
     if near is not None:
         starts = [np.insert(near.fitted.simple.theta, STRING_SHARE, _LIGHT), *starts]
-    fitted = fit_model(problem, held, starts, apart=too_slow(problem))
+    fitted = fit_model(problem, fixed, starts, apart=too_slow(problem))
     return CompliantFit(fitted, residual_of(fitted))
 
 
@@ -392,10 +392,10 @@ def _hertz(fit: CompliantFit) -> tuple[float, float]:
     turn = 0.5 / math.pi
     if not fit.is_string:
         return turn, turn
-    held, loose = string_resonances(fit.mechanical)
+    fixed, loose = string_resonances(fit.mechanical)
     m = fit.mechanical
     plain = float(m[SWING]), float(m[SWING] * np.sqrt(1.0 + m[LOAD] / m[INERTIA]))
-    return turn * held / plain[0], turn * loose / plain[1]
+    return turn * fixed / plain[0], turn * loose / plain[1]
 
 
 def _scaled(one: Estimate, by: float) -> Estimate:

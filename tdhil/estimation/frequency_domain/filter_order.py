@@ -25,7 +25,7 @@ from tdhil.estimation.frequency_domain.optimiser import (
     Apart,
     Box,
     Fit,
-    Held,
+    Fixed,
     best_fit,
     box,
     lowest,
@@ -41,25 +41,25 @@ _SHAPES = ((SPEED_SHAPE, 0.25), (TORQUE_SHAPE, 0.25), (AVERAGE, 0.1), (AVERAGE, 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model's two fits. ``held``: parameters that are known for certain, whatever the structure."""
+    """A model's two fits. ``fixed``: parameters that are known for certain, whatever the structure."""
 
     problem: Likelihood
     limits: Box
-    held: Held
+    fixed: Fixed
     simple: Fit             # first-order lags
     whole: Fit              # the whole family
     simple_weight: float    # of the first-order fit, 0 to 1
     rivals: tuple[Fit, ...] = ()     # other answers of the whole family, elsewhere
 
     @property
-    def simple_held(self) -> Held:
+    def simple_held(self) -> Fixed:
         """What is held in the first-order fit."""
-        return {**dict.fromkeys(self.problem.model.structure, 0.0), **self.held}
+        return {**dict.fromkeys(self.problem.model.structure, 0.0), **self.fixed}
 
     @property
     def free(self) -> list[int]:
         """Parameters of the whole family that are free."""
-        return [index for index in range(self.problem.model.size) if index not in self.held]
+        return [index for index in range(self.problem.model.size) if index not in self.fixed]
 
     @property
     def first_order(self) -> bool:
@@ -79,7 +79,7 @@ class Fitted:
 
 def fit_model(
     problem: Likelihood,
-    held: Held,
+    fixed: Fixed,
     starts: Sequence[FloatArray],
     rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
     apart: Apart | None = None,
@@ -90,24 +90,24 @@ def fit_model(
     """
     model = problem.model
     limits = box(problem, rough_inertia_of(problem))
-    first_order = {**dict.fromkeys(model.structure, 0.0), **held}
+    first_order = {**dict.fromkeys(model.structure, 0.0), **fixed}
     simple = best_fit(problem, limits, first_order, starts, apart)
-    open_structure = [index for index in model.structure if index not in held]
-    others = tuple(minimise(problem, limits, start, held) for start in (rivals_of(simple.theta) if rivals_of else []))
+    open_structure = [index for index in model.structure if index not in fixed]
+    others = tuple(minimise(problem, limits, start, fixed) for start in (rivals_of(simple.theta) if rivals_of else []))
     if not open_structure:
-        return Fitted(problem, limits, held, simple, simple, 1.0, others)
+        return Fitted(problem, limits, fixed, simple, simple, 1.0, others)
     fits = [simple]
     for shape, value in _SHAPES:
         start = simple.theta.copy()
-        if model.at(shape) not in held:
+        if model.at(shape) not in fixed:
             start[model.at(shape)] = value
-            fits.append(minimise(problem, limits, start, held))
-    fits.append(minimise(problem, limits, simple.theta, held))
+            fits.append(minimise(problem, limits, start, fixed))
+    fits.append(minimise(problem, limits, simple.theta, fixed))
     whole = lowest(fits, apart)
-    gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(held))
+    gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(fixed))
     excess = gain - len(open_structure) * math.log(problem.numbers)
     weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
-    return Fitted(problem, limits, held, simple, whole, weight, others)
+    return Fitted(problem, limits, fixed, simple, whole, weight, others)
 
 
 def excess_rise(problem: Likelihood, fitted: int) -> float:

@@ -48,7 +48,7 @@ _BEND = 0.15                 # of the trends' difference times the time between 
 
 
 @dataclass(frozen=True)
-class Warming:
+class FrictionDrift:
     """Trend of friction: ``rate`` (N·m/s) as believed, its ``variance``, ``own`` (S,) per segment as believed.
 
     ``bend`` (N·m/s): sd of what the segments' different trends leave open; ``clear``: worth a warning.
@@ -61,9 +61,9 @@ class Warming:
     clear: bool = False
 
 
-def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> Warming:
+def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> FrictionDrift:
     """Of S segments' periods: middle (P,) in s and mean torque less J times its acceleration, (P,) N·m."""
-    none = Warming(own=(0.0,) * len(times))
+    none = FrictionDrift(own=(0.0,) * len(times))
     dof = sum(max(len(time) - 2, 0) for time in times)
     centred = [(time - time.mean(), torque - torque.mean()) for time, torque in zip(times, torques, strict=True)]
     lever = sum(float(t @ t) for t, _ in centred)
@@ -79,7 +79,7 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> Warming:
         return none
     spread = max(own) - min(own)
     unsure = sum(variance / power for t, _ in centred if (power := float(t @ t)) > 0.0)
-    return Warming(
+    return FrictionDrift(
         rate=share * trend,
         variance=share**2 * sd**2 + share * (1.0 - share) * trend**2,
         own=tuple(share * c for c in own),
@@ -88,7 +88,7 @@ def warming_of(times: list[FloatArray], torques: list[FloatArray]) -> Warming:
     )
 
 
-def warming_warning(warming: Warming) -> tuple[str, ...]:
+def warming_warning(warming: FrictionDrift) -> tuple[str, ...]:
     """What a user should know; empty where there is no clear trend."""
     if not warming.clear:
         return ()
@@ -130,7 +130,7 @@ class Levels:
     density: float
     dof: float
     time: FloatArray = field(default_factory=lambda: np.zeros(0))
-    warming: Warming = field(default_factory=Warming)
+    warming: FrictionDrift = field(default_factory=FrictionDrift)
 
     @property
     def direction(self) -> float:
@@ -143,7 +143,7 @@ class Levels:
 
 
 @dataclass(frozen=True)
-class ViscousTie:
+class ViscousConstraint:
     """B = slope − slope_per_inertia·J, with its standard deviation sd and degrees of freedom."""
 
     slope: float
@@ -192,15 +192,15 @@ def measure_levels(
     return Levels(table[:, 0], table[:, 1], table[:, 2], table[:, 3], density, dof, time, warming)
 
 
-def _warming(times: list[FloatArray], errors: list[FloatArray]) -> Warming:
+def _warming(times: list[FloatArray], errors: list[FloatArray]) -> FrictionDrift:
     """Of the segments that have periods; the others drift like the rest."""
-    held = [number for number, error in enumerate(errors) if len(error)]
-    found = warming_of([times[number] for number in held], [errors[number][:, 1] for number in held])
-    own = dict(zip(held, found.own, strict=True))
+    fixed = [number for number, error in enumerate(errors) if len(error)]
+    found = warming_of([times[number] for number in fixed], [errors[number][:, 1] for number in fixed])
+    own = dict(zip(fixed, found.own, strict=True))
     return replace(found, own=tuple(own.get(number, found.rate) for number in range(len(errors))))
 
 
-def tie_viscous(levels: Levels) -> ViscousTie | None:
+def tie_viscous(levels: Levels) -> ViscousConstraint | None:
     """What the levels say of B; None if they don't span different speeds in one direction."""
     if len(levels.speed) < 2 or not _span_enough(list(zip(levels.speed, levels.torque, strict=True))):
         return None
@@ -216,7 +216,7 @@ def tie_viscous(levels: Levels) -> ViscousTie | None:
     sd = float(np.sqrt(variance))
     slope = _slope(levels.speed, levels.torque, levels.duration)
     floor = 1e-9 * float(np.max(np.abs(levels.torque))) / float(np.max(np.abs(levels.speed)))
-    return ViscousTie(slope, _slope(levels.speed, levels.drift, levels.duration), max(sd, floor), levels.dof)
+    return ViscousConstraint(slope, _slope(levels.speed, levels.drift, levels.duration), max(sd, floor), levels.dof)
 
 
 def coulomb_level(levels: Levels, inertia: float, viscous: float, viscous_sd: float) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
 from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, measure_levels, tie_viscous
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
 from tdhil.estimation.frequency_domain.inference import contradicted
 from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent
 from tdhil.estimation.frequency_domain.rigid import (
@@ -46,7 +46,7 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
     fits = tuple(period_lines(stretch, samples) for stretch in cut)
     rough = _rough(fits)
     levels = measure_levels(cut, fits, samples, recording.levels, rough)
-    tie = _tie(case, levels, rough)
+    constraint = _tie(case, levels, rough)
     return PeriodicCase(
         recording=recording,
         options=case.options,
@@ -59,8 +59,8 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
         levels=levels,
         stretches=cut,
         fits=fits,
-        tie=tie,
-        every=pooled_lines(fits, tie.slope if tie is not None else 0.0, levels.warming.own),
+        constraint=constraint,
+        every=pooled_lines(fits, constraint.slope if constraint is not None else 0.0, levels.warming.own),
     )
 
 
@@ -109,27 +109,27 @@ def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:
     every test before. Raises Refused where the lines are too few.
     """
     options, scale = case.options, case.recording.torque_scale_rel_sd
-    priors, held = known_of(case.recording.lag_prior, len(lines), case.tie)
-    refusal = refuse_count(len(lines), case.tie, priors)
+    priors, fixed = known_of(case.recording.lag_prior, len(lines), case.constraint)
+    refusal = refuse_count(len(lines), case.constraint, priors)
     if options.model == "paper":
-        priors, held = (), unfiltered()
+        priors, fixed = (), unfiltered()
         refusal = None if len(lines) > 1 else _ONE_LINE
     if refusal is not None:
         raise Refused(refusal.reason, refusal.advice)
     try:
-        return fit_rigid(lines, case.levels, case.tie, priors, held, options.confidence, scale)
+        return fit_rigid(lines, case.levels, case.constraint, priors, fixed, options.confidence, scale)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
 
 
-def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousTie | None:
+def _tie(case: Case, levels: Levels, rough_inertia: float) -> ViscousConstraint | None:
     """B from the levels; the less sure, the more the friction curve is bent: between two speeds it is a chord."""
-    tie = tie_viscous(levels)
-    if tie is None:
+    constraint = tie_viscous(levels)
+    if constraint is None:
         return None
     inertia = Inertia(rough_inertia, _ROUGH_REL_SD * rough_inertia)
     curve = friction_curve(case.recording, case.samples, levels, inertia, case.options)
-    return replace(tie, sd=math.hypot(tie.sd, curve.viscous_spread_nm_s_rad))
+    return replace(constraint, sd=math.hypot(constraint.sd, curve.viscous_spread_nm_s_rad))
 
 
 def _rough(fits: tuple[PeriodLines, ...]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Held, minimise
+from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, minimise
 from tdhil.estimation.frequency_domain.shafts import INERTIA
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import BudgetLine, Estimate, InertiaEstimate, ResidualTest
@@ -76,8 +76,8 @@ def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> Residu
     measured = 2.0 * float(np.sum(m)) + len(problem.priors)
     statistic = float(np.sum((2.0 * nu + m - 1.0) * np.log1p(q / nu)))
     statistic += float(sum(((theta[p.index] - p.mean) / p.sd) ** 2 for p in problem.priors))
-    if problem.tie is not None:
-        n = problem.tie.dof
+    if problem.constraint is not None:
+        n = problem.constraint.dof
         measured += 1.0
         statistic += max(n - 0.5, 0.5) * math.log1p(problem.tie_error(theta) ** 2 / n)
     left = measured - fitted
@@ -180,23 +180,23 @@ def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
 
 
 def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0) -> Estimate:
-    """Value and interval of theta[index]; infinite on a side that the data leave open. Held: no width.
+    """Value and interval of theta[index]; infinite on a side that the data leave open. Fixed: no width.
 
     ``behind``: by how much −2 ln L lies above that of another model's fit, to which this one is a rival.
     """
     value = fitted.value(unit(fitted, index))
-    if index in fitted.held:
+    if index in fitted.fixed:
         return Estimate(value, value, value)
     quantile = quantile_of(fitted, index, confidence)
     if behind >= quantile**2:
         return Estimate(value, value, value)
-    seen = [value, *_edges(fitted, fitted.whole, fitted.held, index, quantile, behind)]
+    seen = [value, *_edges(fitted, fitted.whole, fitted.fixed, index, quantile, behind)]
     if behind == 0.0 and fitted.first_order and fitted.simple is not fitted.whole and index not in fitted.simple_held:
         seen += _edges(fitted, fitted.simple, fitted.simple_held, index, 1.0, 0.0)
     for rival in fitted.rivals:
         further = behind + rival.objective - fitted.whole.objective
         if further < quantile**2:
-            seen += _edges(fitted, rival, fitted.held, index, quantile, further)
+            seen += _edges(fitted, rival, fitted.fixed, index, quantile, further)
     return Estimate(value, min(seen), max(seen))
 
 
@@ -214,15 +214,15 @@ def first_order_estimate(fitted: Fitted, index: int, confidence: float) -> Estim
 
 
 def _edges(
-    fitted: Fitted, fit: Fit, held: Held, index: int, quantile: float, behind: float
+    fitted: Fitted, fit: Fit, fixed: Fixed, index: int, quantile: float, behind: float
 ) -> tuple[float, float]:
     problem, limits = fitted.problem, fitted.limits
-    sd, _ = standard_deviation(problem, fit.theta, index, [i for i in range(len(fit.theta)) if i not in held])
+    sd, _ = standard_deviation(problem, fit.theta, index, [i for i in range(len(fit.theta)) if i not in fixed])
     natural = float(limits.scale[index])
     step = min(max(quantile * sd, 1e-7 * natural), 0.3 * max(abs(float(fit.theta[index])), natural))
 
     def refit(start: FloatArray, value: float) -> Fit:
-        return minimise(problem, limits, start, {**held, index: value})
+        return minimise(problem, limits, start, {**fixed, index: value})
 
     rise = quantile**2 - behind
     low, high = (profile_edge(refit, limits, fit, index, side * step, rise) for side in (-1.0, 1.0))
@@ -304,7 +304,7 @@ def budget_of(
         ("lags", half_width_first_order(fitted, INERTIA, confidence, friction),
          "time constants of the reports' filters"),
         ("friction model", half_width_first_order(fitted, INERTIA, confidence),
-         "its slope" + ("" if fitted.problem.tie is None else ", known from the levels of mean torque")),
+         "its slope" + ("" if fitted.problem.constraint is None else ", known from the levels of mean torque")),
         ("lag structure", half, "filters of two poles, moving averages"),
     )
     return (*grown_lines(grown, half), torque_scale_line(inertia.value, torque_scale_rel_sd, confidence))

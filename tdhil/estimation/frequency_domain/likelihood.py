@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.estimation.frequency_domain.friction_levels import ViscousTie
+from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.recording.recording import FloatArray
@@ -40,11 +40,11 @@ class Likelihood:
         self,
         lines: tuple[Line, ...],
         model: Model,
-        tie: ViscousTie | None,
+        constraint: ViscousConstraint | None,
         priors: tuple[GaussianPrior, ...],
         load: Load | None = None,
     ) -> None:
-        self.lines, self.model, self.tie, self.priors = lines, model, tie, priors
+        self.lines, self.model, self.constraint, self.priors = lines, model, constraint, priors
         self.s: ComplexArray = 2j * np.pi * np.array([line.hertz for line in lines])
         self.owner: NDArray[np.intp] = np.repeat(np.arange(len(lines)), [len(line.speed) for line in lines])
         self.speed: ComplexArray = np.concatenate([line.speed for line in lines])
@@ -64,12 +64,13 @@ class Likelihood:
         self._prior_index = np.array([prior.index for prior in known], dtype=np.intp)
         self._prior_mean = np.array([prior.mean for prior in known])
         self._prior_sd = np.array([prior.sd for prior in known])
-        self._tie_row = model.viscous_row + (tie.slope_per_inertia if tie is not None else 0.0) * model.inertia_row
+        slope = 0.0 if constraint is None else constraint.slope_per_inertia
+        self._tie_row = model.viscous_row + slope * model.inertia_row
 
     @property
     def numbers(self) -> int:
         """n: how many real numbers are fitted."""
-        return 2 * len(self.owner) + len(self.priors) + (self.tie is not None)
+        return 2 * len(self.owner) + len(self.priors) + (self.constraint is not None)
 
     def unloaded(self, theta: FloatArray) -> tuple[Line, ...]:
         """The lines without the torque of the load."""
@@ -155,26 +156,27 @@ class Likelihood:
 
     def _prior_residuals(self, theta: FloatArray) -> FloatArray:
         known: FloatArray = (theta[self._prior_index] - self._prior_mean) / self._prior_sd
-        if self.tie is None:
+        if self.constraint is None:
             return known
         z = self.tie_error(theta)
-        return np.append(known, np.sign(z) * np.sqrt((self.tie.dof + 1.0) * np.log1p(z * z / self.tie.dof)))
+        dof = self.constraint.dof
+        return np.append(known, np.sign(z) * np.sqrt((dof + 1.0) * np.log1p(z * z / dof)))
 
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
-        if self.tie is None:
+        if self.constraint is None:
             return self._prior_rows
-        z, n = self.tie_error(theta), self.tie.dof
+        z, n = self.tie_error(theta), self.constraint.dof
         value = np.sqrt((n + 1.0) * np.log1p(z * z / n))
         slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else np.sqrt((n + 1.0) / n)
-        return np.concatenate([self._prior_rows, slope / self.tie.sd * self._tie_row[None, :]])
+        return np.concatenate([self._prior_rows, slope / self.constraint.sd * self._tie_row[None, :]])
 
     def tie_error(self, theta: FloatArray) -> float:
         """How far the friction is from what the levels say, in standard deviations.
 
         The combination of theta that they speak of is the friction slope plus its slope per inertia.
         """
-        assert self.tie is not None
-        return float((self._tie_row @ theta - self.tie.slope) / self.tie.sd)
+        assert self.constraint is not None
+        return float((self._tie_row @ theta - self.constraint.slope) / self.constraint.sd)
 
     def information(self, theta: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, float]]]:
         """Fisher information (P, P), and its parts with the degrees of freedom of each part's weight.
@@ -191,6 +193,6 @@ class Likelihood:
             part: FloatArray = weight[k] * shrink * (own.conj().T @ own).real
             parts.append((part, 2.0 * float(self.nu[k])))
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
-        if self.tie is not None:
-            parts.append((np.outer(self._tie_row, self._tie_row) / self.tie.sd**2, self.tie.dof))
+        if self.constraint is not None:
+            parts.append((np.outer(self._tie_row, self._tie_row) / self.constraint.sd**2, self.constraint.dof))
         return np.sum([part for part, _ in parts], axis=0), parts

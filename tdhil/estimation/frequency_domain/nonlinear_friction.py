@@ -14,7 +14,7 @@ import numpy as np
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, slope_over_speed, tie_viscous
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, slope_over_speed, tie_viscous
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
     estimate,
@@ -25,7 +25,7 @@ from tdhil.estimation.frequency_domain.inference import (
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
-from tdhil.estimation.frequency_domain.optimiser import Fit, Held, box, minimise, rigid_rivals, rough_inertia_of
+from tdhil.estimation.frequency_domain.optimiser import Fit, Fixed, box, minimise, rigid_rivals, rough_inertia_of
 from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of, rigid_finding
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines
@@ -187,7 +187,7 @@ class Motion:
     waves: tuple[Wave, ...]
     levels: Levels
     lines: tuple[Line, ...]
-    tie: ViscousTie | None
+    constraint: ViscousConstraint | None
 
 
 @dataclass(frozen=True)
@@ -203,8 +203,8 @@ class BentFit:
         return self.fitted.whole.objective
 
 
-def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, rigid: RigidResult) -> list[BentFit]:
-    """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``held``: as rigid."""
+def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, rigid: RigidResult) -> list[BentFit]:
+    """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``fixed``: as rigid."""
     # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
     start = rigid.fitted.simple.theta
     speeds = [wave.over_period(start[_RIGID:]) for wave in motion.waves]
@@ -213,17 +213,17 @@ def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, rig
     if len(ways) != 1 or slowest <= _SLOWEST * min(abs(wave.mean) for wave in motion.waves):
         return []
     priors = tuple(replace(prior, index=prior.index + 1) for prior in priors)
-    held = {index + 1: value for index, value in held.items()}
+    fixed = {index + 1: value for index, value in fixed.items()}
     fastest = max(float(np.max(np.abs(speed))) for speed in speeds)
 
     def near(bend: Bend) -> _Near:
-        return _near(bend, motion, priors, held, np.insert(start, BEND, 0.0))
+        return _near(bend, motion, priors, fixed, np.insert(start, BEND, 0.0))
 
     tried = [near(bend) for bend in bends(slowest, fastest)]
     tried += _between(tried, near)
     least = min(fit.objective for _, _, fit in tried)
     found = [
-        BentFit(bend, whole := fit_model(problem, held, [fit.theta]), residual_of(whole, 1))
+        BentFit(bend, whole := fit_model(problem, fixed, [fit.theta]), residual_of(whole, 1))
         for bend, problem, fit in tried
         if fit.objective <= least + _HOPELESS
     ]
@@ -264,13 +264,13 @@ def _between(tried: list[_Near], near: Callable[[Bend], _Near]) -> list[_Near]:
 
 
 def _near(
-    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], held: Held, start: FloatArray
+    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, start: FloatArray
 ) -> _Near:
     """With first-order lags, one descent in each round, from where the last one ended."""
     theta = start
     for _ in range(_ROUNDS):
         problem = _problem(bend, motion, priors, theta[BEND + 1 :])
-        first_order = {**dict.fromkeys(problem.model.structure, 0.0), **held}
+        first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
         fit = minimise(problem, box(problem, rough_inertia_of(problem)), theta, first_order)
         theta = fit.theta
     return bend, problem, fit
@@ -288,7 +288,7 @@ def _problem(bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], phi:
     friction = np.concatenate([[mean for _, mean in seen], bend.over(levels.speed[len(seen) :])])
     typical = float(np.mean(np.abs(levels.speed)) / np.max(np.abs(friction)))
     shaft = BentShaft(slope_over_speed(levels, friction), typical)
-    return Likelihood(motion.lines, Model(shaft), motion.tie, priors, Load(BEND, entries))
+    return Likelihood(motion.lines, Model(shaft), motion.constraint, priors, Load(BEND, entries))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -302,21 +302,21 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
 
     None where this one does no better, or leaves the inertia open.
     """
-    tie = tie_viscous(case.levels)
-    if tie is None or rigid_rivals(rigid.fitted.simple.theta):
+    constraint = tie_viscous(case.levels)
+    if constraint is None or rigid_rivals(rigid.fitted.simple.theta):
         return None
     waves = tuple(
         wave_of(fit, one.segment) for fit, one in zip(case.fits, case.stretches, strict=True) if len(fit.speed)
     )
     straight = rigid.fitted
-    motion = Motion(waves, case.levels, straight.problem.lines, tie)
+    motion = Motion(waves, case.levels, straight.problem.lines, constraint)
     try:
-        found = fit_bends(motion, straight.problem.priors, straight.held, rigid)
+        found = fit_bends(motion, straight.problem.priors, straight.fixed, rigid)
         if not found or found[0].residual is None or rejects(found[0].residual):
             return None
         if straight.whole.objective - found[0].objective <= _MORE * math.log(found[0].fitted.problem.numbers):
             return None
-        result = _result(found, tie, case.options.confidence, case.recording.torque_scale_rel_sd)
+        result = _result(found, constraint, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
     finding = rigid_finding(result, case, "a rigid shaft whose friction is no straight line over speed")
@@ -332,14 +332,16 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
     )
 
 
-def _result(found: list[BentFit], tie: ViscousTie, confidence: float, torque_scale_rel_sd: float) -> RigidResult:
+def _result(
+    found: list[BentFit], constraint: ViscousConstraint, confidence: float, torque_scale_rel_sd: float
+) -> RigidResult:
     """As of a rigid shaft; ``viscous`` is the slope of friction between the two mean speeds, Coulomb's is not told."""
     best = found[0]
     own = estimate(best.fitted, INERTIA, confidence)
     inertia = inertia_of(found, own, confidence)
     speed_lag, torque_lag, skew = lags_of(best.fitted, confidence)
-    chord = tie.slope - tie.slope_per_inertia * inertia.value
-    half = student_quantile(confidence, tie.dof) * tie.sd
+    chord = constraint.slope - constraint.slope_per_inertia * inertia.value
+    half = student_quantile(confidence, constraint.dof) * constraint.sd
     return RigidResult(
         inertia=inertia,
         viscous=Estimate(chord, chord - half, chord + half),

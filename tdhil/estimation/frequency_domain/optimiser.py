@@ -103,7 +103,7 @@ _SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
 _PROPOSALS = 3
 _NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
 
-Held = dict[int, float]
+Fixed = dict[int, float]
 
 
 @dataclass(frozen=True)
@@ -129,37 +129,37 @@ def rough_inertia_of(problem: Likelihood) -> float:
     return float(np.median(ratio))
 
 
-def minimise(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
-    """A descent, and another from beside a lag of zero; the parameters in ``held`` keep the value that stands there.
+def minimise(problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed) -> Fit:
+    """A descent, and another from beside a lag of zero; the parameters in ``fixed`` keep the value that stands there.
 
     At no lag at all descents stand still, a minimum or not: a short lag whose delay the skew takes back is felt through
     its square only, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and the slope of that is zero at τ = 0.
     """
-    fit = _descent(problem, limits, start, held)
-    for begin in _beside_no_lag(problem, fit.theta, held):
-        other = _descent(problem, limits, begin, held)
+    fit = _descent(problem, limits, start, fixed)
+    for begin in _beside_no_lag(problem, fit.theta, fixed):
+        other = _descent(problem, limits, begin, fixed)
         fit = other if other.objective < fit.objective else fit
     return fit
 
 
-def _descent(problem: Likelihood, limits: Box, start: FloatArray, held: Held) -> Fit:
+def _descent(problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed) -> Fit:
     free = np.ones(len(start), dtype=np.bool_)
     begin = np.array(start, dtype=np.float64)
-    for index, value in held.items():
+    for index, value in fixed.items():
         free[index], begin[index] = False, value
     return descend(problem.linearised, problem.residuals, begin, free, limits)
 
 
-def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterator[FloatArray]:
+def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
     """Starts with a lag of some size instead of hardly any, and the skew that makes up for its delay."""
     at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
-    if at(signal_filters.SKEW) in held:
+    if at(signal_filters.SKEW) in fixed:
         return
     for lag, shape, sign in (
         (signal_filters.SPEED_LAG, signal_filters.SPEED_SHAPE, 1.0),
         (signal_filters.TORQUE_LAG, signal_filters.TORQUE_SHAPE, -1.0),
     ):
-        if at(lag) in held or theta[at(lag)] * fastest > _NO_LAG:
+        if at(lag) in fixed or theta[at(lag)] * fastest > _NO_LAG:
             continue
         begin = theta.copy()
         begin[at(lag)] = _SOME_LAG / fastest
@@ -169,10 +169,10 @@ def _beside_no_lag(problem: Likelihood, theta: FloatArray, held: Held) -> Iterat
 
 
 def best_fit(
-    problem: Likelihood, limits: Box, held: Held, starts: Iterable[FloatArray], apart: Apart | None = None
+    problem: Likelihood, limits: Box, fixed: Fixed, starts: Iterable[FloatArray], apart: Apart | None = None
 ) -> Fit:
     """The `lowest` of several descents."""
-    return lowest([minimise(problem, limits, start, held) for start in starts], apart)
+    return lowest([minimise(problem, limits, start, fixed) for start in starts], apart)
 
 
 def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:

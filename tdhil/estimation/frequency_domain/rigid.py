@@ -8,7 +8,7 @@ import numpy as np
 from tdhil.estimation.case import Case, Finding, Words
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousTie, coulomb_level
+from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
     REJECT_P,
     budget_of,
@@ -21,7 +21,7 @@ from tdhil.estimation.frequency_domain.inference import (
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
-from tdhil.estimation.frequency_domain.optimiser import Held, rigid_rivals, rigid_starts
+from tdhil.estimation.frequency_domain.optimiser import Fixed, rigid_rivals, rigid_starts
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.estimation.frequency_domain.signal_filters import (
     AVERAGE,
@@ -65,14 +65,14 @@ def lag_priors(
 
 def known_structure(prior: LagPrior) -> dict[int, float]:
     """A stated lag is a first-order one. What the manual states of both reports leaves no room for an average."""
-    held = {}
+    fixed = {}
     if prior.speed_lag_s is not None:
-        held[_AT(SPEED_SHAPE)] = 0.0
+        fixed[_AT(SPEED_SHAPE)] = 0.0
     if prior.torque_lag_s is not None:
-        held[_AT(TORQUE_SHAPE)] = 0.0
-    if len(held) == 2:
-        held[_AT(AVERAGE)] = 0.0
-    return held
+        fixed[_AT(TORQUE_SHAPE)] = 0.0
+    if len(fixed) == 2:
+        fixed[_AT(AVERAGE)] = 0.0
+    return fixed
 
 
 def unfiltered() -> dict[int, float]:
@@ -80,34 +80,34 @@ def unfiltered() -> dict[int, float]:
     return {_AT(index): 0.0 for index in (SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW)}
 
 
-def with_skew(priors: tuple[GaussianPrior, ...], lines: int, tie: ViscousTie | None, sd_s: float) -> tuple[
-    GaussianPrior, ...
-]:
+def with_skew(
+    priors: tuple[GaussianPrior, ...], lines: int, constraint: ViscousConstraint | None, sd_s: float
+) -> tuple[GaussianPrior, ...]:
     """If only the skew is missing from the count, and both lags are known: torque and speed come in one frame."""
-    known = len(priors) + (tie is not None) + 2 * lines
+    known = len(priors) + (constraint is not None) + 2 * lines
     if known < UNKNOWNS and len(priors) == 2:
         return (*priors, GaussianPrior(_AT(SKEW), 0.0, max(sd_s, _LEAST_SD_S)))
     return priors
 
 
 def known_of(
-    prior: LagPrior, lines: int, tie: ViscousTie | None
+    prior: LagPrior, lines: int, constraint: ViscousConstraint | None
 ) -> tuple[tuple[GaussianPrior, ...], dict[int, float]]:
     """What is known of a rigid shaft's reports beforehand: the priors, and what is held."""
-    return with_skew(lag_priors(prior), lines, tie, prior.skew_sd_s), known_structure(prior)
+    return with_skew(lag_priors(prior), lines, constraint, prior.skew_sd_s), known_structure(prior)
 
 
-def refuse_count(lines: int, tie: ViscousTie | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:
+def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...]) -> Refusal | None:
     """A refusal that names equations, unknowns and the motion that would do."""
-    equations = 2 * lines + (tie is not None) + len(priors)
+    equations = 2 * lines + (constraint is not None) + len(priors)
     if equations >= UNKNOWNS:
         return None
     sources = [f"{lines} excited {'line gives' if lines == 1 else 'lines give'} {2 * lines} equations"]
-    if tie is not None:
+    if constraint is not None:
         sources.append("two mean speeds give one")
     if priors:
         sources.append(f"what is known of the lags gives {len(priors)}")
-    missing = "more lines (a multisine)" if tie is not None else "more lines about two mean speeds (a multisine)"
+    missing = "more lines (a multisine)" if constraint is not None else "more lines about two mean speeds (a multisine)"
     return Refusal(
         f"{', '.join(sources)}, but there are five unknowns: inertia, viscous friction, the lags of the reported speed "
         "and torque, and their skew",
@@ -189,15 +189,15 @@ class RigidResult:
 def fit_rigid(
     lines: tuple[Line, ...],
     levels: Levels,
-    tie: ViscousTie | None,
+    constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
-    held: Held,
+    fixed: Fixed,
     confidence: float,
     torque_scale_rel_sd: float = 0.0,
 ) -> RigidResult:
-    """Fit, test, and profile. ``held``: parameters of theta known for certain (see Model)."""
-    problem = Likelihood(lines, Model(), tie, priors)
-    fitted = fit_model(problem, held, rigid_starts(problem), rigid_rivals)
+    """Fit, test, and profile. ``fixed``: parameters of theta known for certain (see Model)."""
+    problem = Likelihood(lines, Model(), constraint, priors)
+    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
     residual = residual_of(fitted)
     if rejects(residual):            # then no interval will be shown, and none is sought
         return _bare(fitted, residual)
@@ -291,7 +291,7 @@ def _turned(estimate: Estimate, value: float) -> Estimate:
 
 
 def _words(result: RigidResult, as_paper: bool, what: str) -> Words:
-    tied = result.fitted.problem.tie is not None
+    tied = result.fitted.problem.constraint is not None
     return Words(
         "the paper's model, without lags," if as_paper else what,
         if_rejected="identify with the rigid model, which includes reporting lags" if as_paper else
@@ -324,7 +324,7 @@ def of_reports(prior: LagPrior) -> list[str]:
 
 def _caveats(result: RigidResult, as_paper: bool) -> tuple[str, ...]:
     found = []
-    if result.fitted.problem.tie is None:
+    if result.fitted.problem.constraint is None:
         found.append("only one mean speed: viscous friction rests on the lines, not on levels")
     if not as_paper and not result.first_order:
         found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")

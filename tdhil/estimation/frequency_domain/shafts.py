@@ -252,10 +252,10 @@ def string_resonances(m: FloatArray) -> tuple[float, float]:
     def zero(x: float) -> float:
         return motor * pole(x) + beta * math.cos(x) + math.sin(x) / x
 
-    held = float(brentq(pole, 1e-12, 0.5 * math.pi + 1e-12))
+    fixed = float(brentq(pole, 1e-12, 0.5 * math.pi + 1e-12))
     # just above the pole Z_s/s is −∞; it has risen through −J_r before it is 0, at or before π
-    free = float(brentq(zero, held, math.pi))
-    return held / delay, free / delay
+    free = float(brentq(zero, fixed, math.pi))
+    return fixed / delay, free / delay
 
 
 def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:

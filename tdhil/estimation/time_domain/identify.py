@@ -18,7 +18,7 @@ from tdhil.estimation.result import Estimate, Options, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.solve import Solved, solve
-from tdhil.estimation.time_domain.windows import Run, joined, measure, runs, thinned, windows
+from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
 from tdhil.recording.recording import FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -65,7 +65,7 @@ def check_signals(recording: Recording, samples: Samples) -> None:
             raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice)
 
 
-def refuse_open(samples: Samples, found: tuple[Run, ...]) -> NoReturn:
+def refuse_open(samples: Samples, found: tuple[OneWayStretch, ...]) -> NoReturn:
     """Raise Refused, the inertia being open: with which motion it was, and which would do."""
     if not found:
         raise Refused("the shaft never turned one way long enough without holes in the record", ADVICE)
@@ -149,9 +149,9 @@ def identify_record(case: Case) -> Finding:
     return replace(_finding(solved, case), samples_used=used)
 
 
-def _runs(samples: Samples, recording: Recording) -> tuple[Run, ...]:
+def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
     """What turns; a machine that stops every few seconds would have nothing left of it but for a shorter wait."""
-    found: tuple[Run, ...] = ()
+    found: tuple[OneWayStretch, ...] = ()
     for hidden in (_HIDDEN_S, 0.4 * _HIDDEN_S, 0.1 * _HIDDEN_S):
         found = runs(samples, recording.speed_resolution_rad_s, hidden)
         moving = sum(run.length_s for run in runs(samples, recording.speed_resolution_rad_s, 0.0))
@@ -160,7 +160,8 @@ def _runs(samples: Samples, recording: Recording) -> tuple[Run, ...]:
     return found
 
 
-def _solved(recording: Recording, samples: Samples, found: tuple[Run, ...], options: Options) -> Solved | None:
+def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, ...],
+    options: Options) -> Solved | None:
     """With what is known of the lags; if both are and it doesn't do, with the signals taken as simultaneous."""
     placed = windows(found)
     if not placed:

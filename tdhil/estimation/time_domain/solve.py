@@ -269,7 +269,7 @@ class Solved:
 
 
 @dataclass(frozen=True)
-class Shaft:
+class ShaftEquation:
     """One model of friction: its fit (structure of the filters free if ``shaped``), and J with its interval.
 
     ``scores`` (blocks, 10) are those of the fit with one-pole filters.
@@ -333,7 +333,7 @@ def solve(
 
 def _shaft(
     problem: Problem, fit: Fit, placed: tuple[Window, ...], stated: tuple[int, ...], confidence: float
-) -> Shaft:
+) -> ShaftEquation:
     """J's interval over every structure of the filters; its value with one pole each, unless that is contradicted."""
     scores = block_scores(problem, placed, fit.theta)
     own = spread(problem, fit, scores, INERTIA, confidence)
@@ -344,10 +344,10 @@ def _shaft(
     wide = profile(open_problem, best, INERTIA, reach, min(max(reach * own.sd, 1e-7 * scale), 0.5 * scale))
     value = float((best if shaped else fit).theta[INERTIA])
     inertia = Estimate(value, min(wide.low, value) + min(own.lean, 0.0), max(wide.high, value) + max(own.lean, 0.0))
-    return Shaft(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
+    return ShaftEquation(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
 
 
-def _estimate(shaft: Shaft, index: int, confidence: float) -> Estimate:
+def _estimate(shaft: ShaftEquation, index: int, confidence: float) -> Estimate:
     problem, fit = shaft.problem, shaft.fit
     own = spread(problem, fit, shaft.scores, index, confidence)
     reach, scale = own.factor * own.quantile, float(problem.box.scale[index])
@@ -371,7 +371,7 @@ def _coulomb(problem: Problem, fit: Fit, own: Spread) -> Estimate | None:
 
 
 def _budget(
-    shaft: Shaft, inertia: Estimate, shift: float, bent: bool, stated: tuple[int, ...]
+    shaft: ShaftEquation, inertia: Estimate, shift: float, bent: bool, stated: tuple[int, ...]
 ) -> tuple[BudgetLine, ...]:
     """Noise with the lags held; what unknown lags add, what unknown structures add; the rest."""
     problem, fit, own = shaft.problem, shaft.fit, shaft.spread

@@ -42,7 +42,7 @@ _LEAST_SAMPLES_OF_STRETCH = 32
 
 
 @dataclass(frozen=True)
-class Run:
+class OneWayStretch:
     """N samples while the shaft turns one way; ``direction`` is +1 or −1."""
 
     samples: Samples
@@ -71,7 +71,7 @@ def thinned(samples: Samples) -> Samples:
     return Samples(mean(samples.time_s - start) + start, mean(samples.speed_rad_s), mean(samples.torque_nm))
 
 
-def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[Run, ...]:
+def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[OneWayStretch, ...]:
     """The usable runs; ``hidden_s``: how long before a stop the reported speed may still show motion."""
     if len(samples) < _LEAST_SAMPLES_OF_STRETCH:
         return ()
@@ -88,7 +88,7 @@ def runs(samples: Samples, speed_quantum: float, hidden_s: float) -> tuple[Run, 
     for first, last in pairwise(edges.tolist()):
         if sign[first] != 0.0 and last - first >= _LEAST_SAMPLES_OF_STRETCH:
             part = Samples(time[first:last], speed[first:last], samples.torque_nm[first:last])
-            found.append(Run(part, float(sign[first])))
+            found.append(OneWayStretch(part, float(sign[first])))
     return tuple(found)
 
 
@@ -117,7 +117,7 @@ _LEAST_SAMPLES = 32
 class Window:
     """Where a window lies in its run: tapers of ``taper_s`` at both ends, ``hop_s`` from one window to the next."""
 
-    run: Run
+    run: OneWayStretch
     start_s: float
     hop_s: float
     taper_s: float
@@ -174,7 +174,7 @@ def joined(parts: list[Bins]) -> Bins:
                   for name in ("s", "speed", "torque", "level", "bend", "energy", "window")))
 
 
-def windows(found: tuple[Run, ...]) -> tuple[Window, ...]:
+def windows(found: tuple[OneWayStretch, ...]) -> tuple[Window, ...]:
     """All windows of all runs, in the order of time."""
     placed: list[Window] = []
     for run in found:

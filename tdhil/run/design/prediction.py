@@ -164,13 +164,13 @@ class Fitted:
 
 def fit(evidence: Evidence, confidence: float) -> Fitted | None:
     """The estimator's own fit; None where it would refuse."""
-    tie = tie_viscous(evidence.levels)
+    constraint = tie_viscous(evidence.levels)
     lines = tuple(line for line in evidence.lines if line.excited and line.nu >= LEAST_NU)
-    priors, held = known_of(evidence.prior, len(lines), tie)
-    if not lines or refuse_count(len(lines), tie, priors) is not None:
+    priors, held = known_of(evidence.prior, len(lines), constraint)
+    if not lines or refuse_count(len(lines), constraint, priors) is not None:
         return None
     try:
-        found = fit_rigid(lines, evidence.levels, tie, priors, held, confidence)
+        found = fit_rigid(lines, evidence.levels, constraint, priors, held, confidence)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
     return _fitted(found)

@@ -211,7 +211,7 @@ def evidence_of(recording: Recording) -> Evidence | None:
     cut = stretches(samples, excitation.segments)
     fits = tuple(period_lines(stretch, samples) for stretch in cut)
     levels = measure_levels(cut, fits, samples, recording.levels, 0.0)
-    tie = tie_viscous(levels)
-    pooled = pooled_lines(fits, tie.slope if tie is not None else 0.0, levels.warming.own)
+    constraint = tie_viscous(levels)
+    pooled = pooled_lines(fits, constraint.slope if constraint is not None else 0.0, levels.warming.own)
     lines = tuple(line for line in pooled if line.excited and line.nu >= LEAST_NU)
     return Evidence(lines, levels, recording.lag_prior) if lines else None

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from drivers.drive import Command, Mode, Sample
 from tdhil.recording.recording import Excitation, Segment
 from tdhil.run.adaptive_duration import Decision, Enough
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import Plan, PlannedSegment, RigGuess
 from tdhil.run.excitation.pulses import CALM_S, SwingPlan, Way
 from tdhil.run.settings import ControlAssumptions, MachineLimits
@@ -65,47 +65,47 @@ class Follower:
 
     def __init__(
         self,
-        bench: Bench,
+        loop: ControlLoop,
         limits: MachineLimits,
         mode: Mode,
         control: MeanSpeedControl | None,
         beside: Callable[[float], float] | None = None,
     ) -> None:
-        self._bench = bench
+        self._loop = loop
         self._beside = beside
         self._limits = limits
         self._mode = mode
         self._control = control
-        last = bench.last
-        self.time_s = last.time_s if last else bench.now_s
+        last = loop.last
+        self.time_s = last.time_s if last else loop.now_s
         self.reported_rad_s = last.speed_rad_s if last else 0.0
         self.wanted_rad_s = self.reported_rad_s
 
     def follow(self, reference: Reference, duration_s: float) -> float:
         """Run ``reference`` for a duration from the next cycle on; the control time at which it began."""
-        start_s = self.time_s + self._bench.period_s
+        start_s = self.time_s + self._loop.period_s
         # By time, not by a number of cycles: a slow line keeps its period on average at best.
-        self.follow_until(reference, start_s, start_s + max(duration_s, self._bench.period_s))
+        self.follow_until(reference, start_s, start_s + max(duration_s, self._loop.period_s))
         return start_s
 
     def follow_until(self, reference: Reference, start_s: float, end_s: float) -> None:
         """Go on with a reference that began at ``start_s`` up to the last cycle before ``end_s``."""
-        while self.time_s + 1.5 * self._bench.period_s < end_s:
+        while self.time_s + 1.5 * self._loop.period_s < end_s:
             self.step(reference, start_s)
 
     def step(self, reference: Reference, start_s: float) -> None:
         """One cycle of a reference that began at ``start_s``."""
-        self._step(*reference(self.time_s + self._bench.period_s - start_s))
+        self._step(*reference(self.time_s + self._loop.period_s - start_s))
 
     def _step(self, speed_rad_s: float, torque_nm: float) -> None:
         limits = self._limits
         if self._control is not None:
-            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._bench.period_s)
+            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
         torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
         setpoint = speed_rad_s + (0.0 if self._beside is None else self._beside(self.time_s))
         wanted = max(lowest, min(limits.speed_max_rad_s, setpoint))
-        self.saw(self._bench.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+        self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:
         """Where the shaft is, after a cycle in which it was to have this speed."""
@@ -113,7 +113,7 @@ class Follower:
 
 
 def run_acquire(
-    bench: Bench,
+    loop: ControlLoop,
     limits: MachineLimits,
     plan: Plan,
     control: MeanSpeedControl | None,
@@ -128,13 +128,13 @@ def run_acquire(
     more is wanted so many periods more at its mean speed and then, settled anew, at the others. In speed mode a
     coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
     """
-    begun_s = bench.now_s
+    begun_s = loop.now_s
     beside = _beside(plan, speed_resolution_rad_s, begun_s)
-    course = _Course(bench, plan, Follower(bench, limits, Mode(plan.mode), control, beside), announce)
+    course = _Course(loop, plan, Follower(loop, limits, Mode(plan.mode), control, beside), announce)
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
-        more = enough.decided(course.ask(enough.question(bench.now_s - begun_s)))
+        more = enough.decided(course.ask(enough.question(loop.now_s - begun_s)))
         if more == 0:
             break
         course.go_on(more)
@@ -155,8 +155,8 @@ def _beside(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[fl
 class _Course:
     """Where stage 5 is: the segments that are done, and the one that the shaft is in."""
 
-    def __init__(self, bench: Bench, plan: Plan, follower: Follower, announce: Announce) -> None:
-        self._bench, self._plan, self._follower, self._announce = bench, plan, follower, announce
+    def __init__(self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce) -> None:
+        self._loop, self._plan, self._follower, self._announce = loop, plan, follower, announce
         self._done: list[Segment] = []
         self._index = 0
         self._segment: PlannedSegment = plan.segments[0]
@@ -174,7 +174,7 @@ class _Course:
             segment = replace(segment, periods=segment.settle_periods + counted)
         transition = self._plan.transition(follower.wanted_rad_s, index)
         follower.follow(transition.reference, transition.duration_s)
-        self._tell(segment.recorded(follower.time_s + self._bench.period_s))
+        self._tell(segment.recorded(follower.time_s + self._loop.period_s))
         self._start_s = follower.follow(segment.reference.reference, segment.duration_s)
         self._index, self._segment = index, segment
         self._done.append(self._recorded())
@@ -183,7 +183,7 @@ class _Course:
         """What has been run is announced; then the segment goes on for as long as the look takes (real time)."""
         self._announce(self.excitation)
         reference = self._segment.reference.reference
-        return self._bench.compute_while(work, lambda: self._follower.step(reference, self._start_s))
+        return self._loop.compute_while(work, lambda: self._follower.step(reference, self._start_s))
 
     def go_on(self, periods: int) -> None:
         """So many periods more where the shaft is."""
@@ -202,7 +202,7 @@ class _Course:
 
     def _recorded(self) -> Segment:
         # The last period is whole when its last sample is there: the one before the cycle that would begin the next.
-        return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._bench.period_s)
+        return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._loop.period_s)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ _LONGEST = 2.0            # times the planned coasting, at most: friction may ha
 
 
 def run_swings(
-    bench: Bench,
+    loop: ControlLoop,
     limits: MachineLimits,
     plan: SwingPlan,
     control: MeanSpeedControl | None,
@@ -226,11 +226,11 @@ def run_swings(
     """All of it. Raises what the bench raises. The slow loop stands still while the shaft coasts."""
     excitation = Excitation(plan.kind, plan.mode)
     announce(excitation)
-    follower = Follower(bench, limits, Mode(plan.mode), control)
+    follower = Follower(loop, limits, Mode(plan.mode), control)
     follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
     for way in plan.ways:
         if way.coasting:
-            _coast(bench, way, follower, assumptions)
+            _coast(loop, way, follower, assumptions)
             follower.follow(_calm(way.to_rad_s, plan.guess), CALM_S)
         else:
             follower.follow(way.reference, way.duration_s + CALM_S)
@@ -242,15 +242,15 @@ def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float,
     return lambda _: steady
 
 
-def _coast(bench: Bench, way: Way, follower: Follower, assumptions: ControlAssumptions) -> None:
+def _coast(loop: ControlLoop, way: Way, follower: Follower, assumptions: ControlAssumptions) -> None:
     """Zero torque down to the lower speed."""
     command = Command(Mode.TORQUE, way.to_rad_s, 0.0)
     # The report comes late, so that the shaft is slower already: by half of the longest plausible lag, say.
-    late_s = 0.5 * assumptions.largest_speed_lag_s + bench.period_s
+    late_s = 0.5 * assumptions.largest_speed_lag_s + loop.period_s
     stop_at = way.to_rad_s + late_s * way.guess.steady_torque_nm(way.to_rad_s) / way.guess.inertia_kg_m2
     end_s = follower.time_s + _LONGEST * way.duration_s
     while follower.time_s < end_s:
-        sample = bench.cycle(command)
+        sample = loop.cycle(command)
         follower.saw(sample, way.to_rad_s)
         if sample.fresh and sample.speed_rad_s <= stop_at:
             return

@@ -19,7 +19,7 @@ import numpy as np
 
 from drivers.drive import Command, Mode, Sample
 from drivers.errors import PreflightRefused
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.speed import mean_speeds
@@ -265,25 +265,26 @@ def slow_speed(limits: MachineLimits) -> float:
 
 
 def slow_down(
-    bench: Bench, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, from_rad_s: float,
+    loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, from_rad_s: float,
     speed_resolution_rad_s: float,
 ) -> tuple[Sample, ...]:
     """Down to the probe's speed in speed mode; the samples of steady rotation there. LimitHit if it gets none."""
     target = slow_speed(limits)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
     rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2)
-    steps = bench.cycles(abs(target - from_rad_s) / rate)
+    steps = loop.cycles(abs(target - from_rad_s) / rate)
     for step in range(1, steps + 1):
-        bench.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
+        loop.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
     command = Command(Mode.SPEED, target, 0.0)
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
-    bench.hold(command, assumptions.largest_speed_lag_s)
-    settled = wait_until_steady(bench, command, target, tolerance, timeout_s=60.0)
-    return tuple(settled[-bench.cycles(STEADY_S) :])
+    loop.hold(command, assumptions.largest_speed_lag_s)
+    settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
+    return tuple(settled[-loop.cycles(STEADY_S) :])
 
 
 def probe_braking(
-    bench: Bench, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, steady: Sequence[Sample],
+    loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions,
+    steady: Sequence[Sample],
     flowing_nm: float, speed_resolution_rad_s: float, where: str,
 ) -> list[Sample]:
     """Try it, in torque mode, at ``flowing_nm`` and the speed of ``steady``; its samples, none if no pulse is safe.
@@ -296,13 +297,13 @@ def probe_braking(
     for _ in range(TRIES):
         noise = speed_noise_rad_s(steady, speed_resolution_rad_s)
         before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise)
-        pulse = plan_pulse(limits, model, assumptions, before, bench.period_s)
+        pulse = plan_pulse(limits, model, assumptions, before, loop.period_s)
         if isinstance(pulse, NoPulse):
-            bench.guard.no_braking, bench.guard.to_brake = pulse.why, pulse.next_step
-            bench.log.event(bench.now_s, "probe", f"no braking torque in this run: {pulse.why}")
+            loop.guard.no_braking, loop.guard.to_brake = pulse.why, pulse.next_step
+            loop.log.event(loop.now_s, "probe", f"no braking torque in this run: {pulse.why}")
             return samples
-        listener = Listener(pulse, steady, bench.period_s)
-        answer, seen = _try(bench, pulse, listener, before.speed_rad_s, assumptions)
+        listener = Listener(pulse, steady, loop.period_s)
+        answer, seen = _try(loop, pulse, listener, before.speed_rad_s, assumptions)
         samples += seen
         if answer is Answer.FASTER:
             raise PreflightRefused(
@@ -312,13 +313,13 @@ def probe_braking(
                 " bit turn it round? Correct the profile or the drive's settings",
             )
         if answer is Answer.SLOWER:
-            bench.log.event(
-                bench.now_s, "probe",
+            loop.log.event(
+                loop.now_s, "probe",
                 f"the shaft slowed down: {listener.why}, reported torque down to {listener.lowest_nm:.1f} N·m",
             )
             return samples
         unclear = f"{-pulse.torque_nm:.1f} N·m did not slow it by {pulse.slowing_rad_s:.2f} rad/s: {listener.why}"
-        steady = samples[-bench.cycles(STEADY_S / 2.0) :]
+        steady = samples[-loop.cycles(STEADY_S / 2.0) :]
     raise PreflightRefused(
         f"a braking torque does not slow the shaft: {unclear}",
         where=f"braking probe, {where}",
@@ -328,21 +329,21 @@ def probe_braking(
 
 
 def _try(
-    bench: Bench, pulse: Pulse, listener: Listener, speed_rad_s: float, assumptions: ControlAssumptions
+    loop: ControlLoop, pulse: Pulse, listener: Listener, speed_rad_s: float, assumptions: ControlAssumptions
 ) -> tuple[Answer | None, list[Sample]]:
     """The pulse in full, then what flowed before it until the reports have caught up; cut short by a faster shaft."""
-    bench.log.event(
-        bench.now_s, "probe",
+    loop.log.event(
+        loop.now_s, "probe",
         f"braking torque tried at {speed_rad_s:.2f} rad/s: {pulse.torque_nm:.1f} N·m for"
-        f" {pulse.cycles * bench.period_s:.2g} s (taken for full torque forward it would lead to"
+        f" {pulse.cycles * loop.period_s:.2g} s (taken for full torque forward it would lead to"
         f" {pulse.highest_rad_s:.2f} rad/s at most)",
     )
-    bench.guard.no_braking = ""
+    loop.guard.no_braking = ""
     answer: Answer | None = None
     seen: list[Sample] = []
-    late = bench.cycles(2.0 * assumptions.largest_speed_lag_s + assumptions.reaction_s)
+    late = loop.cycles(2.0 * assumptions.largest_speed_lag_s + assumptions.reaction_s)
     for torque_nm in (*pulse.setpoints_nm(), *[pulse.flowing_nm] * late):
-        seen.append(bench.cycle(Command(Mode.TORQUE, speed_rad_s, torque_nm)))
+        seen.append(loop.cycle(Command(Mode.TORQUE, speed_rad_s, torque_nm)))
         heard = listener.hear(seen[-1])
         if heard is Answer.FASTER:
             return heard, seen

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from drivers.drive import Command, Mode
 from drivers.errors import LimitHit
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
@@ -65,7 +65,7 @@ class HoldResult:
 
 
 def run_hold(
-    bench: Bench,
+    loop: ControlLoop,
     limits: MachineLimits,
     model: RigGuess,
     control: MeanSpeedControl,
@@ -78,20 +78,20 @@ def run_hold(
     The wanted speed is ramped from where the shaft is, at a rate that takes a quarter of the torque limit.
     """
     tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s)
-    recent: deque[float] = deque(maxlen=bench.cycles(MEAN_S))
+    recent: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
     rate = min(0.25 * limits.torque_nm / model.inertia_kg_m2, (limits.speed_max_rad_s - limits.speed_min_rad_s) / 5.0)
-    begun_s = bench.now_s
+    begun_s = loop.now_s
     inside_since_s: float | None = None
     wanted = reported = start_rad_s
     correction = 0.0
     timeout_s = TIMEOUT_S + abs(target_rad_s - start_rad_s) / rate
-    for _ in range(bench.cycles(timeout_s)):
-        step = max(-rate * bench.period_s, min(rate * bench.period_s, target_rad_s - wanted))
+    for _ in range(loop.cycles(timeout_s)):
+        step = max(-rate * loop.period_s, min(rate * loop.period_s, target_rad_s - wanted))
         wanted += step
-        correction = control.update(wanted - reported, bench.period_s)
-        ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / bench.period_s
+        correction = control.update(wanted - reported, loop.period_s)
+        ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / loop.period_s
         torque = max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))
-        sample = bench.cycle(Command(Mode.TORQUE, wanted, torque))
+        sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
         reported = sample.speed_rad_s
         recent.append(reported)
         mean = sum(recent) / len(recent)

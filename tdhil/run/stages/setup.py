@@ -11,7 +11,7 @@ from collections import deque
 
 from drivers.drive import Command, Mode
 from drivers.errors import LimitHit, PreflightRefused
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import MachineLimits
 from tdhil.run.stages.steady import trace
 
@@ -20,9 +20,9 @@ RAMP_S = 5.0
 """The probe torque is reached after this long, if nothing moves before."""
 
 
-def measure_offsets(bench: Bench, limits: MachineLimits) -> tuple[float, float]:
+def measure_offsets(loop: ControlLoop, limits: MachineLimits) -> tuple[float, float]:
     """Mean reported speed and torque at standstill. Raises PreflightRefused if the shaft turns."""
-    held = trace(bench.hold(Command(Mode.SPEED, 0.0, 0.0), STANDSTILL_S))
+    held = trace(loop.hold(Command(Mode.SPEED, 0.0, 0.0), STANDSTILL_S))
     if len(held.time_s) == 0:
         raise PreflightRefused("no feedback from the drive", where="TPDO1", next_step="Is the node operational?")
     speed = float(held.speed_rad_s.mean())
@@ -33,24 +33,24 @@ def measure_offsets(bench: Bench, limits: MachineLimits) -> tuple[float, float]:
     return speed, float(held.torque_nm.mean())
 
 
-def probe_sign(bench: Bench, limits: MachineLimits, mode: Mode, speed_resolution_rad_s: float) -> float | None:
+def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resolution_rad_s: float) -> float | None:
     """Move the shaft a little; the torque at which it moved (None in speed mode).
 
     Raises PreflightRefused when it turns the wrong way, or not at all.
     """
     threshold_rad_s = max(6.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
-    recent: deque[float] = deque(maxlen=bench.cycles(0.1))
+    recent: deque[float] = deque(maxlen=loop.cycles(0.1))
     travel_rad = 0.0
     torque_nm = speed_rad_s = 0.0
-    before_s = bench.enable(mode, Command(mode, 0.0, 0.0)).time_s
-    for step in range(1, bench.cycles(RAMP_S + 2.0) + 1):
-        share = min(1.0, step * bench.period_s / RAMP_S)
+    before_s = loop.enable(mode, Command(mode, 0.0, 0.0)).time_s
+    for step in range(1, loop.cycles(RAMP_S + 2.0) + 1):
+        share = min(1.0, step * loop.period_s / RAMP_S)
         if mode is Mode.TORQUE:
             torque_nm = share * limits.probe_torque_nm
         else:
             speed_rad_s = share * 0.1 * limits.speed_max_rad_s
         try:
-            sample = bench.cycle(Command(mode, speed_rad_s, torque_nm))
+            sample = loop.cycle(Command(mode, speed_rad_s, torque_nm))
         except LimitHit as error:
             if recent and sum(recent) < 0.0:
                 raise _wrong_way(sum(recent) / len(recent)) from error

@@ -16,7 +16,7 @@ from drivers.errors import DriveFault
 from tdhil.estimation.rough_inertia import RoughInertia, rough_inertia
 from tdhil.estimation.samples import Samples
 from tdhil.recording.recording import FloatArray, Level, Ramp
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.speed_check import Onlooker, SpeedLook
@@ -67,7 +67,7 @@ def mean_speeds(limits: MachineLimits) -> tuple[float, float]:
 
 
 def run_speed(
-    bench: Bench,
+    loop: ControlLoop,
     limits: MachineLimits,
     assumptions: ControlAssumptions,
     speed_resolution_rad_s: float,
@@ -81,17 +81,17 @@ def run_speed(
     low_rad_s, high_rad_s = mean_speeds(limits)
     tolerance_rad_s = max(2.0 * speed_resolution_rad_s, 0.01 * high_rad_s)
     rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
-    start = bench.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(bench) else None
+    start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(loop) else None
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
-    look = SpeedLook(bench, limits, assumptions, speed_resolution_rad_s, onlooker)
+    look = SpeedLook(loop, limits, assumptions, speed_resolution_rad_s, onlooker)
     look.ramp(speed_now, low_rad_s, rate)
-    low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions, before_level=look.level)
+    low_samples = _settle_and_hold(loop, low_rad_s, tolerance_rad_s, assumptions, before_level=look.level)
     look.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
     for _ in range(TRIES):
-        between = _ramp(bench, low_rad_s, high_rad_s, rate)
+        between = _ramp(loop, low_rad_s, high_rad_s, rate)
         ramped = len(between)
-        high_samples = _settle_and_hold(bench, high_rad_s, tolerance_rad_s, assumptions, between)
-        held = bench.cycles(LEVEL_S)
+        high_samples = _settle_and_hold(loop, high_rad_s, tolerance_rad_s, assumptions, between)
+        held = loop.cycles(LEVEL_S)
         low, high = steady_level(low_samples[-held:]), steady_level(high_samples[-held:])
         moved = trace([*low_samples[-held:], *between, *high_samples[-held:]])
         rough = rough_inertia(
@@ -100,9 +100,9 @@ def run_speed(
         if rough is not None and rough.rel_error <= GOOD_ENOUGH:
             break
         rate *= 4.0
-        bench.log.event(bench.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
-        _ramp(bench, high_rad_s, low_rad_s, rate)
-        low_samples = _settle_and_hold(bench, low_rad_s, tolerance_rad_s, assumptions)
+        loop.log.event(loop.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
+        _ramp(loop, high_rad_s, low_rad_s, rate)
+        low_samples = _settle_and_hold(loop, low_rad_s, tolerance_rad_s, assumptions)
     if rough is None or not rough.inertia_kg_m2 > 0.0:
         found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
         raise DriveFault(
@@ -116,14 +116,14 @@ def run_speed(
         max(0.0, rough.friction.coulomb_nm),
         min(0.8, max(GOOD_ENOUGH, rough.rel_error)),
     )
-    bench.guard.model = model
+    loop.guard.model = model
     return SpeedResult(
         low,
         high,
         model,
         rough,
         Ramp(low.level.end_s, high.level.start_s),
-        tuple(high_samples[-bench.cycles(0.5) :]),
+        tuple(high_samples[-loop.cycles(0.5) :]),
         tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
         _course(low_samples[-held:], between[:ramped], [*between[ramped:], *high_samples[-held:]], mean_speeds(limits)),
     )
@@ -146,18 +146,18 @@ def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:
     return Samples(fresh.time_s, fresh.speed_rad_s, fresh.torque_nm - torque_offset_nm)
 
 
-def _in_torque(bench: Bench) -> bool:
-    return bench.last is not None and bench.last.mode is Mode.TORQUE
+def _in_torque(loop: ControlLoop) -> bool:
+    return loop.last is not None and loop.last.mode is Mode.TORQUE
 
 
-def _ramp(bench: Bench, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
-    steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / bench.period_s))
+def _ramp(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
+    steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / loop.period_s))
     span = end_rad_s - start_rad_s
-    return [bench.cycle(Command(Mode.SPEED, start_rad_s + span * step / steps, 0.0)) for step in range(1, steps + 1)]
+    return [loop.cycle(Command(Mode.SPEED, start_rad_s + span * step / steps, 0.0)) for step in range(1, steps + 1)]
 
 
 def _settle_and_hold(
-    bench: Bench,
+    loop: ControlLoop,
     speed_rad_s: float,
     tolerance_rad_s: float,
     assumptions: ControlAssumptions,
@@ -166,9 +166,9 @@ def _settle_and_hold(
 ) -> list[Sample]:
     """Settle, let the reporting lags run out, then the level; the settling is appended to ``into``."""
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
-    settling = wait_until_steady(bench, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
-    settling += bench.hold(command, 2.0 * assumptions.largest_speed_lag_s)
+    settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
+    settling += loop.hold(command, 2.0 * assumptions.largest_speed_lag_s)
     if into is not None:
         into += settling
     before_level()
-    return bench.hold(command, LEVEL_S)
+    return loop.hold(command, LEVEL_S)

@@ -10,7 +10,7 @@ import numpy as np
 from drivers.drive import Command, Sample
 from drivers.errors import LimitHit
 from tdhil.recording.recording import FloatArray, Level
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ BLOCKS = 4
 
 
 def wait_until_steady(
-    bench: Bench, command: Command, target_rad_s: float, tolerance_rad_s: float, timeout_s: float
+    loop: ControlLoop, command: Command, target_rad_s: float, tolerance_rad_s: float, timeout_s: float
 ) -> list[Sample]:
     """Hold a command until the mean speed of four half-second blocks in a row is at the target.
 
@@ -66,17 +66,17 @@ def wait_until_steady(
     seen: list[Sample] = []
     good = 0
     for _ in range(max(BLOCKS, round(timeout_s / BLOCK_S))):
-        block = bench.hold(command, BLOCK_S)
+        block = loop.hold(command, BLOCK_S)
         seen += block
         mean = sum(sample.speed_rad_s for sample in block) / len(block)
         good = good + 1 if abs(mean - target_rad_s) <= tolerance_rad_s else 0
         if good >= BLOCKS:
             return seen
     torque_nm = sum(sample.torque_nm for sample in block) / len(block)
-    torque, helps = bench.guard.torque_told(torque_nm, block[-1].limit_active)
+    torque, helps = loop.guard.torque_told(torque_nm, block[-1].limit_active)
     raise LimitHit(
         f"the speed did not settle at {target_rad_s:.3f} rad/s within {timeout_s:g} s (last {mean:.3f} rad/s);"
         f" {torque}",
-        where=f"at {bench.now_s:.1f} s",
+        where=f"at {loop.now_s:.1f} s",
         next_step=helps,
     )

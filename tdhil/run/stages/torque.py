@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from drivers.drive import Command, Mode, Sample
 from tdhil.estimation.rough_inertia import RoughInertia, rough_inertia
 from tdhil.recording.recording import Level, Ramp
-from tdhil.run.control_loop import Bench
+from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.brake_test import probe_braking, slow_speed
 from tdhil.run.stages.speed import SpeedResult
@@ -41,7 +41,8 @@ class TorqueResult:
 
 
 def run_torque(
-    bench: Bench, limits: MachineLimits, assumptions: ControlAssumptions, speed: SpeedResult, slow: Sequence[Sample],
+    loop: ControlLoop, limits: MachineLimits, assumptions: ControlAssumptions, speed: SpeedResult,
+    slow: Sequence[Sample],
     torque_offset_nm: float, speed_resolution_rad_s: float, setpoint_where: str,
 ) -> TorqueResult:
     """Switch, try to brake, ramp, let the speed drift. ``slow``: steady rotation in speed mode, where it begins.
@@ -53,30 +54,30 @@ def run_torque(
     flowing_nm = _within(float(before.torque_nm.mean()) - torque_offset_nm, limits.torque_nm)
     keep_rad_s = slow_speed(limits)
     # Seeded for a few cycles before the switch, so that the target is there when the mode is.
-    samples = [*slow, *bench.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * bench.period_s)]
-    samples.append(bench.switch_mode(Command(Mode.TORQUE, keep_rad_s, flowing_nm)))
-    bench.log.event(bench.now_s, "mode", f"torque mode confirmed, seeded with {flowing_nm:.1f} N·m")
+    samples = [*slow, *loop.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * loop.period_s)]
+    samples.append(loop.switch_mode(Command(Mode.TORQUE, keep_rad_s, flowing_nm)))
+    loop.log.event(loop.now_s, "mode", f"torque mode confirmed, seeded with {flowing_nm:.1f} N·m")
     samples += probe_braking(
-        bench, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where
+        loop, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where
     )
     target_nm = _within(speed.model.steady_torque_nm(speed.high.speed_rad_s), limits.torque_nm)
-    steps = max(1, bench.cycles(abs(target_nm - flowing_nm) / (SLOPE_SHARE_PER_S * limits.torque_nm)))
-    start_s = bench.now_s
+    steps = max(1, loop.cycles(abs(target_nm - flowing_nm) / (SLOPE_SHARE_PER_S * limits.torque_nm)))
+    start_s = loop.now_s
     samples += [
-        bench.cycle(Command(Mode.TORQUE, keep_rad_s, flowing_nm + (target_nm - flowing_nm) * step / steps))
+        loop.cycle(Command(Mode.TORQUE, keep_rad_s, flowing_nm + (target_nm - flowing_nm) * step / steps))
         for step in range(1, steps + 1)
     ]
-    samples += bench.hold(Command(Mode.TORQUE, keep_rad_s, target_nm), DRIFT_S)
+    samples += loop.hold(Command(Mode.TORQUE, keep_rad_s, target_nm), DRIFT_S)
     drift = trace(samples)
     rough = rough_inertia(
         drift.time_s,
         drift.speed_rad_s,
         drift.torque_nm - torque_offset_nm,
         Level(float(before.time_s[0]), float(before.time_s[-1])),
-        Level(bench.now_s - END_S, bench.now_s),
+        Level(loop.now_s - END_S, loop.now_s),
         speed.rough.friction,
     )
-    return TorqueResult(target_nm, Ramp(start_s, bench.now_s), rough, float(drift.speed_rad_s[-1]))
+    return TorqueResult(target_nm, Ramp(start_s, loop.now_s), rough, float(drift.speed_rad_s[-1]))
 
 
 def _within(torque_nm: float, limit_nm: float) -> float:

@@ -125,7 +125,7 @@ _LEAST_DELAY_S = 0.005
 
 
 @dataclass(frozen=True)
-class Shaft:
+class SimulatedShaft:
     """What truly happened, (steps, runs): speed in rad/s, torque at the shaft in N·m; row n at n·step_s."""
 
     speed: FloatArray
@@ -151,7 +151,7 @@ def coloured(white: FloatArray, step_s: float, time_s: float) -> FloatArray:
     return found
 
 
-def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatArray) -> Shaft:
+def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatArray) -> SimulatedShaft:
     """Step the shaft; ``load`` and ``ripple`` (steps, runs), N·m. Raises ValueError if the speed reaches zero."""
     step = motion.step_s
     keep, early, late = lag_weights(step, plant.inertia_kg_m2 / plant.viscous_nm_s_rad)
@@ -194,7 +194,7 @@ def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatAr
         speed[n + 1] = omega
     if speed.min() <= 0.0:
         raise ValueError(f"{plant.name}: the speed reaches zero, where Coulomb friction is not constant")
-    return Shaft(speed, torque, step)
+    return SimulatedShaft(speed, torque, step)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -213,12 +213,12 @@ def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -
     speed = lagged(sensed, plant.speed_report, shaft.step_s)
     torque = lagged(shaft.torque, plant.torque_report, shaft.step_s)
     return [
-        read(plant, asked, run, Shaft(speed[:, run], torque[:, run], shaft.step_s), stream)
+        read(plant, asked, run, SimulatedShaft(speed[:, run], torque[:, run], shaft.step_s), stream)
         for run, stream in enumerate(streams)
     ]
 
 
-def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[Motion, Shaft]:
+def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[Motion, SimulatedShaft]:
     """What would happen without any noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
     asked = motion(plant, [rough_guess(plant, np.array([share, 0.0])) for share in shares], periods)
     return asked, turn(plant, asked, np.zeros_like(asked.target), np.zeros_like(asked.target))
@@ -255,7 +255,9 @@ def shown(signal: FloatArray, report: Report, step_s: float, at_s: FloatArray) -
     return mean
 
 
-def read(plant: CoveragePlant, asked: Motion, run: int, shaft: Shaft, stream: np.random.Generator) -> Recording:
+def read(
+    plant: CoveragePlant, asked: Motion, run: int, shaft: SimulatedShaft, stream: np.random.Generator
+) -> Recording:
     """Sample one run as its host would; ``shaft`` holds that run's signals (steps,) behind the poles of the reports."""
     reading, noise, step = plant.reading, plant.noise, shaft.step_s
     end = (len(shaft.speed) - 1) * step - 0.1
@@ -300,7 +302,7 @@ GROUP = 20     # runs simulated together: some 200 MB
 
 
 @dataclass(frozen=True)
-class Run:
+class SimulatedRun:
     """What identification said of one run; ``value``, ``low``, ``high`` in kg·m², None where it gave no number."""
 
     plant: str
@@ -336,7 +338,7 @@ def tasks(
     ]
 
 
-def run_task(task: Task) -> tuple[Run, ...]:
+def run_task(task: Task) -> tuple[SimulatedRun, ...]:
     """Simulate and identify one group."""
     own = zlib.crc32(task.plant.name.encode())      # by name: a plant's runs don't depend on which others there are
     numbers = range(task.first, task.first + task.count)
@@ -346,19 +348,19 @@ def run_task(task: Task) -> tuple[Run, ...]:
     for number, recording in zip(numbers, recordings, strict=True):
         said = identify(recording, options)
         seconds = float(recording.time_s[-1] - recording.time_s[0])
-        run = Run(task.plant.name, number, seconds, said.verdict.value, said.reason)
+        run = SimulatedRun(task.plant.name, number, seconds, said.verdict.value, said.reason)
         if said.inertia is not None:
             inertia = said.inertia
-            run = Run(*_head(run), float(inertia.value), float(inertia.low), float(inertia.high))
+            run = SimulatedRun(*_head(run), float(inertia.value), float(inertia.low), float(inertia.high))
         found.append(run)
     return tuple(found)
 
 
-def _head(run: Run) -> tuple[str, int, float, str, str]:
+def _head(run: SimulatedRun) -> tuple[str, int, float, str, str]:
     return run.plant, run.number, run.seconds, run.verdict, run.reason
 
 
-def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[Run, ...]]:
+def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
     """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
     if processes <= 1:
         return map(run_task, wanted)

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from profiles.model import DataModel, Finding, refuse_if
 from tdhil.studies.coverage.bound import cramer_rao
 from tdhil.studies.coverage.plants import FLEET, CoveragePlant
-from tdhil.studies.coverage.simulate import Run, run_all, tasks
+from tdhil.studies.coverage.simulate import SimulatedRun, run_all, tasks
 from tdhil.studies.field.tone import tidy
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
@@ -84,7 +84,7 @@ def clopper_pearson(hits: int, tries: int, one_sided: float = ONE_SIDED) -> tupl
     return low, high
 
 
-def figures_of(plant: CoveragePlant, runs: Sequence[Run], bound_kg_m2: float | None) -> PlantFigures:
+def figures_of(plant: CoveragePlant, runs: Sequence[SimulatedRun], bound_kg_m2: float | None) -> PlantFigures:
     """Added up in the order of the runs' numbers, so that the same runs give the same bits."""
     ordered = sorted(runs, key=lambda run: run.number)
     told = [
@@ -363,7 +363,7 @@ class CoverageStudy:
         """
         plants = settings.chosen
         wanted = tasks(plants, settings.seeds, settings.seed, settings.periods, settings.confidence)
-        runs: dict[str, list[Run]] = {plant.name: [] for plant in plants}
+        runs: dict[str, list[SimulatedRun]] = {plant.name: [] for plant in plants}
         total, done = settings.seeds * len(plants), 0
         progress(0.0, "first runs")
         begun_s, interrupted = time.monotonic(), False
