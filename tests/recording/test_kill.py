@@ -74,7 +74,8 @@ def test_in_stepped_time_the_queue_bounds_what_a_kill_costs(tmp_path):
 def test_in_stepped_time_the_default_queue_keeps_to_half_a_second_too(tmp_path, cycle_s):
     """Whatever the rate: at 10 Hz the queue alone could hold minutes. One cycle may be printed and not yet taken."""
     script = STEPPED.replace("queue_size=256", "queue_size=None").replace("0.004", str(cycle_s))
-    script = script.replace("from log_runs", f"import log_runs; log_runs.PERIOD_S = {cycle_s}\nfrom log_runs")
+    first = f"from tests.recording import log_runs; log_runs.PERIOD_S = {cycle_s}\n"
+    script = script.replace("from tests.recording", f"{first}from tests.recording")
     last_s = run_and_kill(tmp_path / "run.mcap", 2000 * cycle_s, script)
     time_s = read_run(tmp_path / "run.mcap").recording.time_s
     assert last_s - time_s[-1] <= 0.4 + 2 * cycle_s
