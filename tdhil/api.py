@@ -107,6 +107,7 @@ class Result:
 
     @property
     def verdict(self) -> Verdict:
+        """Does the number stand?"""
         return self.identification.verdict
 
     @property
@@ -119,6 +120,7 @@ class Result:
 
     @property
     def reason(self) -> str:
+        """Why the verdict is what it is, in words."""
         return self.identification.reason
 
     def to_dict(self) -> dict[str, Any]:

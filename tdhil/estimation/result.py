@@ -43,7 +43,7 @@ _OPEN = 0.5     # half-width, of the value, beyond which an interval says nothin
 class Verdict(Enum):
     """Does the number stand?"""
 
-    VALID = "valid"
+    VALID = "valid"                            # stands, as tight as was asked for
     VALID_WIDE = "valid_wide"                  # stands, but the interval is wider than was asked for
     NOT_IDENTIFIABLE = "not_identifiable"      # the data can't tell; `reason` names what, `advice` the motion
     MODEL_REJECTED = "model_rejected"          # the data contradict every model tried

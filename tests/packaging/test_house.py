@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 HEAVY = ("numpy", "scipy", "can", "canopen", "rich", "pydantic", "google.protobuf", "mcap", "pymodbus", "yaml")
 HOME = re.compile(rb"(?<![\w.~$}/*])/(?:home|Users|root|work)/[\w.]+")
-SKIPPED = {"__pycache__", "build", "dist", "node_modules"}
+SKIPPED = {"__pycache__", "build", "dist", "site", "node_modules"}
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,71 @@
+"""The pages that are made of README, docs/ and the docstrings; building them is a step of .ci/run."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed (pip install '.[docs]'); .ci/run has it")
+    import mkdocs_hooks
+
+    return mkdocs_hooks
+
+
+def test_the_front_door_is_documented_name_by_name():
+    from tdhil import api
+
+    page = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^::: tdhil\.api\.(\w+)$", page, re.MULTILINE)) == set(api.__all__)
+
+
+def test_contributing_names_what_is_there():
+    """Every path and every test, but for those in which VENDOR, MODEL, NAME or BUS stands."""
+    rooms = "tdhil|drivers|sim_bus|profiles|tests|benchmarks|docs|examples"
+    names = [name for name in re.findall(rf"`((?:{rooms})/[^`\s]*)`", CONTRIBUTING) if not re.search("[A-Z]{3}", name)]
+    assert len(names) > 80
+    for name in names:
+        path, _, test = name.partition("::")
+        assert (ROOT / path).exists(), name
+        assert not test or f"def {test.partition('[')[0]}(" in (ROOT / path).read_text(encoding="utf-8"), name
+
+
+def test_a_link_to_a_file_of_the_repository_leads_to_its_page(hooks):
+    assert hooks.relinked("[a](docs/rig.md#bus)", "", "index.md") == "[a](rig.md#bus)"
+    assert hooks.relinked("[a](../README.md)", "docs", "rig.md") == "[a](index.md)"
+    assert hooks.relinked("[a](../../examples/rig.yaml)", "docs/api", "api/index.md") == (
+        "[a](../repository/examples/rig.yaml.md)")
+    for same in ("[a](https://example.org/x)", "[a](no-such-file.md)", "[a](#here)", "```\n[a](docs/rig.md)\n```\n"):
+        assert hooks.relinked(same, "", "index.md") == same
+
+
+def test_a_link_to_a_folder_ends_the_build(hooks):
+    from mkdocs.exceptions import PluginError
+
+    with pytest.raises(PluginError, match="folder tests"):
+        hooks.relinked("[a](tests)", "", "index.md")
+
+
+@pytest.mark.parametrize("text", [
+    '<script src="https://cdn.example/x.js"></script>', "<img alt=x src='//cdn.example/x.png'>",
+    '<link rel="stylesheet" href="https://fonts.example/css">', '@import "https://fonts.example/css";',
+    "a { background: url(https://cdn.example/x.png) }",
+])
+def test_what_would_be_loaded_from_elsewhere_is_found(hooks, text):
+    assert hooks.loaded_from_elsewhere(text)
+
+
+def test_links_to_follow_are_not_loaded(hooks):
+    assert hooks.loaded_from_elsewhere('<a href="https://example.org">x</a><script src="assets/x.js"></script>') == []
+
+
+def test_blocks_and_comments_of_docstrings(hooks):
+    assert hooks.plain_blocks("A.\n\n::\n\n    x = 1\n") == "A.\n\n\n    x = 1\n"
+    assert hooks.plain_blocks("One cycle::\n\n    x\n") == "One cycle:\n\n    x\n"
