@@ -57,6 +57,7 @@ class _Point:
     time_s: float
     angle_rad: float
     way_rad: float
+    half_width_s: float
 
 
 class Angles:
@@ -104,7 +105,7 @@ class Angles:
             if step != 0.0:
                 self.count_rad = abs(step) if self.count_rad is None else min(self.count_rad, abs(step))
         self._raw_rad = reading.position_rad
-        point = self._last = _Point(reading.time_s, angle, self._way_rad)
+        point = self._last = _Point(reading.time_s, angle, self._way_at(reading.time_s), reading.half_width_s)
         self._recent.append(point)
         while len(self._recent) > LEAST_WINDOW + 1 and point.time_s - self._recent[1].time_s >= WINDOW_S:
             del self._recent[0]
@@ -113,6 +114,12 @@ class Angles:
         elif last is not None and angle != last.angle_rad:
             self._changed = self._changed or point
             self._changed_last = point
+
+    def _way_at(self, time_s: float) -> float:
+        """The reported way at the moment of a reading: a late host reads the angle well after its last sample."""
+        if self._before is None:
+            return self._way_rad
+        return self._way_rad + self._before.speed_rad_s * (time_s - self._before.time_s)
 
     def speed_rad_s(self) -> tuple[float, float] | None:
         """By the angle alone, how fast the shaft has been just now: at least, at most (magnitudes); None too early."""
@@ -143,7 +150,7 @@ class Angles:
             return None
         # At a change the angle is known to one count, and to what it moves between two readings.
         between = abs(turned) * self._every_s() / spent_s
-        half = 2.0 * min(count, between) / abs(turned)
+        half = 2.0 * min(count, between) / abs(turned) + (start.half_width_s + end.half_width_s) / spent_s
         if half > EXACT:
             return None
         if abs(way_rad) < 1e-3 * abs(turned):
@@ -173,6 +180,8 @@ EVERY_S, EVERY_CYCLES, SELDOM_S = 0.05, 3, 0.25
 """How often the angle is read: this often, or each third cycle of a slower line, or at least so often."""
 LEVEL_EVERY_S = 0.25
 """Of a level, which is longer."""
+TIMED_S = 0.02
+"""A reading that is known less well in time than this, and than is usual on its line, is none: the host was late."""
 SILENT = 5
 """So many readings in a row without an answer: the drive tells no angle."""
 SEEN_S = 3.0
@@ -228,6 +237,7 @@ class SpeedLook:
         self._next_s = -math.inf
         self._every_s = 0.0
         self._silent = 0
+        self._usual_half_s = math.inf              # of a reading's time
         self._highest_rad_s = 0.0                  # asked for so far
         self._done = False
         self._lost = ""                            # why no angle tells
@@ -308,6 +318,9 @@ class SpeedLook:
                 self._lost = "the drive no longer tells the angle of its shaft"
             return
         self._silent = 0
+        self._usual_half_s = min(self._usual_half_s, reading.half_width_s)
+        if reading.half_width_s > max(TIMED_S, 2.0 * self._usual_half_s):
+            return                                 # nobody knows well enough when that was: the next one will do
         angles.read(reading, max(self._highest_rad_s, abs(sample.speed_rad_s)))
         self._wraps_rad = reading.wraps_rad
         self._refuse_fastest(command, sample)
