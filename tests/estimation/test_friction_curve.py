@@ -78,6 +78,7 @@ def test_the_spread_of_the_slope_is_of_the_size_that_the_bend_makes():
     assert 0.4 * worst < found < 2.5 * worst
 
 
+@pytest.mark.heavy
 def test_on_a_whole_run_every_point_covers_and_a_straight_line_is_left_straight():
     covered = points = bent = 0
     for recording in usual_runs()[:100]:

@@ -163,6 +163,7 @@ def test_a_resonance_just_above_the_band_is_no_rigid_shaft():
         assert may_swing(rigid)
 
 
+@pytest.mark.heavy
 def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line():
     """At 0.08 Hz the load takes the motor's motion away: two lines have torque and hardly speed, the other nine fit a
     rigid shaft, with an inertia that is neither the motor's nor the whole's."""

@@ -74,6 +74,7 @@ def test_row(case, rehearse, tmp_path):
     run.assert_log_whole()
 
 
+@pytest.mark.heavy
 def test_replies_that_are_lost_now_and_then(rehearse):
     """Seeded, in stepped time: the run goes on, and again the same way."""
     first, second = (rehearse("--drive", "modbus", "--fault", "bad-crc@speed+15s=20%/2s") for _ in range(2))
@@ -97,6 +98,7 @@ def test_the_list_names_those_of_both_buses():
     assert all(name in done.out for name in (*KINDS, "heartbeat-lost", "--drive canopen", "--drive modbus"))
 
 
+@pytest.mark.heavy
 def test_a_connection_that_is_reset_in_motion(tmp_path):
     """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
     trace, rig = tmp_path / "shaft.csv", tmp_path / "rig.yaml"

@@ -163,6 +163,7 @@ def test_a_connection_that_dies(bench, fault, seen):
     seen(43, f"{fault}: {error['message']}", standstill_s, code=8)
 
 
+@pytest.mark.heavy
 def test_a_foreign_transaction_id_costs_a_sample_and_the_connection(bench, seen):
     with Relay(bench.port) as relay:
         bench.start(relay.port)

@@ -127,6 +127,7 @@ def test_stepped_time_is_refused(tmp_path, drive, rig):
     assert not shaft.events("heartbeat supervision began")
 
 
+@pytest.mark.heavy
 def test_yes_replaces_the_prompt(tmp_path, drive, rig):
     with host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err

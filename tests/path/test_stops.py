@@ -106,6 +106,7 @@ def assert_stopped(shaft, done):
         assert replayed.document["stages"] == done.document["stages"] or replayed.document["complete"]
 
 
+@pytest.mark.heavy
 def test_ctrl_c_in_real_time(tmp_path):
     """The embedded simulator against the wall clock; a slow cycle and a long watchdog bear a loaded machine."""
     rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"

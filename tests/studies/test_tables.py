@@ -10,7 +10,7 @@ from tdhil.studies.paper.published import published
 from tdhil.studies.paper.tables import Table6Settings, Table7Settings, published_for
 from tdhil.studies.registry import simulated_studies
 
-pytestmark = pytest.mark.one_worker
+pytestmark = [pytest.mark.one_worker, pytest.mark.heavy]
 
 L9_RUNS = [898.36, 898.30, 898.15, 892.95, 892.88, 891.03, 885.96, 885.24, 885.52]
 L16_RUNS = [
