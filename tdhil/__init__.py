@@ -12,6 +12,7 @@ from tdhil.version import __version__
 if TYPE_CHECKING:
     from tdhil.api import CoastDown as CoastDown
     from tdhil.api import DriveHandle as DriveHandle
+    from tdhil.api import Motion as Motion
     from tdhil.api import Multisine as Multisine
     from tdhil.api import Pulses as Pulses
     from tdhil.api import Result as Result
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
     from tdhil.errors import TdhilError as TdhilError
 
 _API = (
-    "CoastDown", "DriveHandle", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify", "open_drive",
-    "read", "run", "simulate",
+    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify",
+    "open_drive", "read", "run", "simulate",
 )
 __all__ = ["TdhilError", "__version__", *_API]  # noqa: PLE0604 - strings, by the line above
 

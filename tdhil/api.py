@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import ExitCode, UsageError
 from tdhil.session.recorded import RunRecord, read
@@ -39,14 +39,14 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class Multisine:
-    """Several tones at once, of a low crest factor: the default. None: chosen to fit the rig.
+class Motion:
+    """What stage 5 can be asked for: any excitation of `tdhil.config.registry`, by name. None: chosen to fit the rig.
 
-    ``frequency_hz``: the lowest line; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
-    ``periods``: at each mean speed, those that settle included.
+    The classes below are those that ship. ``amplitude_rad_s``: greatest deviation of the speed from its mean;
+    ``offset_rad_s``: mean speed; ``periods``: at each mean speed, or ways up and down.
     """
 
-    kind: ClassVar[str] = "multisine"
+    kind: str
     frequency_hz: float | None = None
     amplitude_rad_s: float | None = None
     offset_rad_s: float | None = None
@@ -54,38 +54,43 @@ class Multisine:
 
 
 @dataclass(frozen=True)
+class Multisine(Motion):
+    """Several tones at once, of a low crest factor: the default. None: chosen to fit the rig.
+
+    ``frequency_hz``: the lowest line; ``amplitude_rad_s``: peak of the speed; ``offset_rad_s``: mean speed;
+    ``periods``: at each mean speed, those that settle included.
+    """
+
+    kind: str = field(default="multisine", init=False)
+
+
+@dataclass(frozen=True)
 class Sine(Multisine):
     """One tone (equation 8 of the paper)."""
 
-    kind: ClassVar[str] = "sine"
+    kind: str = field(default="sine", init=False)
 
 
 @dataclass(frozen=True)
 class Step(Multisine):
     """A square wave of speed (equation 9 of the paper)."""
 
-    kind: ClassVar[str] = "step"
+    kind: str = field(default="step", init=False)
 
 
 @dataclass(frozen=True)
-class Pulses:
+class Pulses(Motion):
     """Torque pulses between steady speeds: no line, no period."""
 
-    kind: ClassVar[str] = "pulses"
-    amplitude_rad_s: float | None = None
-    offset_rad_s: float | None = None
-    periods: int | None = None
+    kind: str = field(default="pulses", init=False)
+    frequency_hz: None = field(default=None, init=False)
 
 
 @dataclass(frozen=True)
 class CoastDown(Pulses):
     """Without torque from one speed to another, and back up under power. Never with a drill string."""
 
-    kind: ClassVar[str] = "coast-down"
-
-
-Motion = Multisine | Pulses
-"""What stage 5 can be asked for."""
+    kind: str = field(default="coast-down", init=False)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -199,7 +204,7 @@ def simulate(
     *,
     seed: int | None = None,
     plant: str | Path | None = None,
-    drive: Literal["canopen", "modbus"] = "canopen",
+    drive: str = "canopen",
     profile: str | None = None,
     rig: str | Path | None = None,
     faults: Sequence[str] = (),
@@ -287,8 +292,9 @@ def _request(
     from tdhil.session.run_session import Consent, RunRequest
     from tdhil.session.task import suited
 
-    given = {name: value for name, value in asdict(motion).items() if value is not None}
-    cli = {**drive.options, **asked, "excitation": motion.kind, **given}
+    given = {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()
+             if value is not None}
+    cli = {**drive.options, **asked, **given}
     options, connection = connection_of(cli, drive.rig, resolve(cli, drive.rig))
     check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
     check_log_path(Path(options.log), "log")

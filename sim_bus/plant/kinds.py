@@ -7,10 +7,13 @@
 A state is an immutable tuple: keeping it is copying it. The motor's speed and angle are in every one.
 """
 
-from functools import partial
-from typing import Annotated, Any, Protocol, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial, reduce
+from operator import or_
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, PlainSerializer, PlainValidator
 
 from profiles.model import refuse_if
 from sim_bus.plant import rigid, two_mass
@@ -58,16 +61,26 @@ class TwoMass:
         self.step = partial(two_mass.step, params)
 
 
-def build(params: Params | TwoMassParams | StringParams) -> Plant[Any]:
-    """The plant that ``params`` describe."""
-    if isinstance(params, TwoMassParams):
-        return TwoMass(params)
-    if isinstance(params, StringParams):
-        return DrillString(params)
-    return Rigid(params)
+@dataclass(frozen=True)
+class PlantKind:
+    """Of one ``kind``: the model of its section in plant.yaml, what makes a plant of it, and can it be wound up?"""
+
+    params: type[BaseModel]
+    plant: Callable[[Any], Plant[Any]]
+    winds_up: bool = False
 
 
-_KINDS: dict[str, type[BaseModel]] = {"rigid": Params, "two_mass": TwoMassParams, "string": StringParams}
+PLANTS: dict[str, PlantKind] = {
+    "rigid": PlantKind(Params, Rigid),
+    "two_mass": PlantKind(TwoMassParams, TwoMass, winds_up=True),
+    "string": PlantKind(StringParams, DrillString, winds_up=True),
+}
+"""Every kind of plant; plant.yaml takes these, and what a file may say is read off their models."""
+
+
+def build(params: Any) -> Plant[Any]:
+    """The plant that ``params``, of one of `PLANTS`, describe."""
+    return PLANTS[params.kind].plant(params)
 
 
 def _rigid_unless_said(section: Any) -> Any:
@@ -75,19 +88,31 @@ def _rigid_unless_said(section: Any) -> Any:
     if not isinstance(section, dict):
         return section
     kind = section.get("kind", "rigid")
-    if not isinstance(kind, str) or kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in PLANTS:
+        *first, last = PLANTS
         shown = kind if isinstance(kind, str | int | float) else "a list or section"
-        refuse_if([("kind", f"rigid, two_mass or string is wanted, not {shown}")])
+        refuse_if([("kind", f"{', '.join(first)} or {last} is wanted, not {shown}")])
     foreign = {
-        key: [other for other, model in _KINDS.items() if key in model.model_fields]
-        for key in section if key not in _KINDS[kind].model_fields
+        key: [other for other, one in PLANTS.items() if key in one.params.model_fields]
+        for key in section if key not in PLANTS[kind].params.model_fields
     }
     refuse_if([(key, f"belongs to kind: {' or '.join(kinds)}, and this plant is {kind}")
                for key, kinds in foreign.items() if kinds])
     return {"kind": kind, **section}
 
 
-AnyPlantParams = Annotated[
-    Params | TwoMassParams | StringParams, Field(discriminator="kind"), BeforeValidator(_rigid_unless_said)
-]
+def _read(section: Any) -> Any:
+    """The section as the model of its kind has it. Raises what that model raises."""
+    if isinstance(section, tuple(kind.params for kind in PLANTS.values())):
+        return section
+    section = _rigid_unless_said(section)
+    name = section["kind"] if isinstance(section, dict) else "rigid"
+    return PLANTS[name].params.model_validate(section)
+
+
+if TYPE_CHECKING:
+    AnyPlantParams = Params | TwoMassParams | StringParams
+else:
+    _ANY = reduce(or_, (kind.params for kind in PLANTS.values()))
+    AnyPlantParams = Annotated[_ANY, PlainValidator(_read), PlainSerializer(lambda one: one.model_dump())]
 """The section ``plant`` of plant.yaml."""

@@ -11,17 +11,7 @@ from pathlib import Path
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Which shafts may be asked for, and which motions of stage 5.
-#
-# They are `tdhil.estimation.result.MODELS` and the kinds of `tdhil.run.settings`, without what importing those
-# costs.
-
-
-MODELS = ("auto", "rigid", "two-mass", "string", "paper")
-EXCITATIONS = ("multisine", "sine", "step", "pulses", "coast-down")
-
+from tdhil.config.registry import BUSES
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -48,7 +38,7 @@ share = amount(SHARE)
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Which drive; the group, for what a command has to add to it."""
     drive = parser.add_argument_group("drive")
-    drive.add_argument("--drive", choices=("canopen", "modbus"),
+    drive.add_argument("--drive", choices=tuple(BUSES),
                        help="how the drive is spoken to (default: as the profile is, else canopen)")
     drive.add_argument("--profile", metavar="NAME",
                        help="vendor/model, or a .yaml file (default generic/cia402, generic/modbus)")

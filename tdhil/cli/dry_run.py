@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tdhil.run.excitation import Plan
     from tdhil.run.planning import Planned
     from tdhil.run.settings import MachineLimits
 
@@ -49,29 +48,12 @@ def dry_run(
 
 def document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
     """The plan as plain data."""
-    from tdhil.run.excitation import SwingPlan
-
     plan, stopping = planned.plan, planned.stopping
     return {
         "dry_run": True,
         "excitation": plan.kind,
         "mode": plan.mode,
-        "segments": [
-            {
-                "offset_rad_s": one.reference.offset_rad_s,
-                "period_s": one.reference.period_s,
-                "periods": one.periods,
-                "settle_periods": one.settle_periods,
-                "lines_hz": list(one.reference.lines_hz),
-                "amplitudes_rad_s": list(one.reference.amplitudes_rad_s),
-            }
-            for one in plan.segments
-        ] if not isinstance(plan, SwingPlan) else [],
-        "ways": [
-            {"from_rad_s": way.from_rad_s, "to_rad_s": way.to_rad_s, "duration_s": way.duration_s,
-             "coasting": way.coasting}
-            for way in plan.ways
-        ] if isinstance(plan, SwingPlan) else [],
+        **plan.plain(),
         "duration_s": planned.duration_s,
         "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
         "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
@@ -91,21 +73,16 @@ def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, c
     """Tables for people, in 80 columns."""
     from rich.text import Text
 
-    from tdhil.run.excitation import SwingPlan
-
     console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
     console.print(_motion_table(planned, limits))
-    if not isinstance(planned.plan, SwingPlan):
-        console.print(_lines_table(planned.plan))
+    if lines := planned.plan.lines():
+        console.print(_lines_table(lines))
     console.print(_figures_table(figures))
     for text in _conclusions(planned):
         console.print(Text(text))
 
 
 def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
-    from tdhil.run.excitation import SwingPlan
-    from tdhil.run.excitation.pulses import CALM_S
-
     plan, table = planned.plan, _table(f"stage 5: {planned.plan.kind} in {planned.plan.mode} mode")
     for heading in ("", "planned", "limit"):
         table.add_column(heading, overflow="fold")
@@ -118,21 +95,16 @@ def _motion_table(planned: Planned, limits: MachineLimits) -> Table:
         "torque, N·m", f"{plan.torque_min_nm:.3g} to {plan.torque_max_nm:.3g}", f"±{limits.torque_nm:g}"
     )
     table.add_row("time, s", f"{planned.duration_s:.0f} (+ about {BEFORE_ACQUIRE_S:.0f})", f"{limits.time_s:g}")
-    if isinstance(plan, SwingPlan):
-        ways = f"{len(plan.ways)} ways up and down, each with {CALM_S:g} s of calm behind it"
-        table.add_row(f"{plan.speed_min_rad_s:.3g} to {plan.speed_max_rad_s:.3g} rad/s", ways, "")
-        return table
-    for one in plan.segments:
-        counted = f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle"
-        table.add_row(f"at {one.reference.offset_rad_s:.3g} rad/s", counted, "")
+    for where, what in plan.parts():
+        table.add_row(where, what, "")
     return table
 
 
-def _lines_table(plan: Plan) -> Table:
-    reference, table = plan.segments[0].reference, _table("lines")
+def _lines_table(lines: list[tuple[float, float]]) -> Table:
+    table = _table("lines")
     table.add_column("Hz", justify="right")
     table.add_column("amplitude, rad/s", justify="right")
-    for hertz, amplitude in zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True):
+    for hertz, amplitude in lines:
         table.add_row(f"{hertz:.4g}", f"{amplitude:.3g}")
     return table
 

@@ -59,7 +59,8 @@ _PREFIX = {"canopen": "bus", "modbus": "line"}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
     from profiles.quantities import FREQUENCY, SPEED, TIME
-    from tdhil.cli.arguments import EXCITATIONS, MODELS, add_drive_arguments, add_line_arguments, amount, share
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount, share
+    from tdhil.config.registry import EXCITATIONS, MODELS
 
     drive = add_drive_arguments(parser)
     drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
@@ -79,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="take the profile's unit of speed without seeing the shaft turn as fast as it says")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
     motion = parser.add_argument_group("motion")
-    motion.add_argument("--excitation", choices=EXCITATIONS, help="stage 5 (default multisine)")
+    motion.add_argument("--excitation", choices=tuple(EXCITATIONS), help="stage 5 (default multisine)")
     motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
     motion.add_argument("--frequency", dest="frequency_hz", type=amount(FREQUENCY), metavar="HZ",
                         help="lowest line or the tone")
@@ -96,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument("--tolerance", type=share, metavar="SHARE",
                         help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
     result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
-    result.add_argument("--model", choices=MODELS, help="of the shaft (default auto: the simplest that fits)")
+    result.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default auto: the simplest that fits)")
     result.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
     result.add_argument("--report", type=Path, metavar="FILE",
                         help="the result with pictures in one file: report.html, or report.pdf on A4")

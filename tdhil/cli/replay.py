@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
-from tdhil.cli.arguments import MODELS, amount, share
+from tdhil.cli.arguments import amount, share
 from tdhil.cli.results import print_result, save_report
+from tdhil.config.registry import MODELS
 from tdhil.errors import ExitCode, UsageError
 from tdhil.session.recorded import is_log, read, stated_lags
 
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
     parser.add_argument("--operator", metavar="NAME", help="who ran it, for the report (default: as the log says)")
     parser.add_argument("--note", metavar="TEXT", help="what else the report shall say (default: as the log says)")
-    parser.add_argument("--model", choices=MODELS, help="of the shaft (default: the run's, or auto)")
+    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: the run's, or auto)")
     parser.add_argument("--confidence", type=share, metavar="P", help="of the interval (default: the run's, or 0.95)")
     parser.add_argument("--tolerance", type=share, metavar="SHARE",
                         help="half-width of the interval that is enough (default: the run's, or 0.05)")

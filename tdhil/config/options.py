@@ -9,7 +9,8 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from profiles.yaml_loader import messages_of
-from tdhil.config.rig import ExcitationKind, Rig
+from tdhil.config.registry import DEFAULT_EXCITATION
+from tdhil.config.rig import Rig
 from tdhil.errors import UsageError
 
 
@@ -68,12 +69,12 @@ class RunOptions:
     None as a value: chosen by the drive's profile or by the plan of the run.
     """
 
-    drive: Literal["canopen", "modbus"] = _option("--drive", "drive", "canopen")
+    drive: str = _option("--drive", "drive", "canopen")
     node: int | None = _option("--node", "node")
     profile: str = _option("--profile", "profile", "generic/cia402", beside_rig=True)
     accept_unverified: tuple[str, ...] = _option("--accept-unverified", "accept_unverified", (), joined=True)
     rate_hz: float | None = _option("--rate", "rate_hz")
-    excitation: ExcitationKind = _option("--excitation", "run.excitation", "multisine")  # noqa: RUF009 - a field
+    excitation: str = _option("--excitation", "run.excitation", DEFAULT_EXCITATION)
     mode: Literal["torque", "speed"] | None = _option("--mode", "run.mode")
     frequency_hz: float | None = _option("--frequency", "run.frequency_hz")
     amplitude_rad_s: float | None = _option("--amplitude", "run.amplitude_rad_s")

@@ -13,19 +13,48 @@ motor shaft. It is frozen, and knows from which line of which file each of its k
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr, ValidationError
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
+from pydantic_core import PydanticKnownError, core_schema
 
 from drivers.errors import DataFileError, PreflightRefused, Problem
 from profiles.model import DataModel, Finding
 from profiles.yaml_loader import Conversion, load_with_lines, messages_of
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
     """A number that some machine could have: what lies beyond is a slip, and no arithmetic is to choke on it."""
     return Field(ge=0.0 if zero else low, le=high)
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """For pydantic: one of a registry's names. What isn't is refused with all that there are, as by a Literal.
+
+    ``periodic``: of the excitations, those with lines alone.
+    """
+
+    registry: Mapping[str, Entry]
+    periodic: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_before_validator_function(self._check, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"type": "string", "enum": names(self.registry, periodic=self.periodic)}
+
+    def _check(self, value: Any) -> Any:
+        known = names(self.registry, periodic=self.periodic)
+        if value in known:
+            return value
+        *first, last = map(repr, known)
+        raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}" if first else last})
 
 
 Positive = Annotated[float, _within(1e-9, 1e9)]
@@ -171,9 +200,6 @@ _OPERATORS = {
     "accept_speed_unit": "--accept-speed-unit",
     "reset_fault": "--reset-fault",
 }
-ExcitationKind = Literal["multisine", "sine", "step", "pulses", "coast-down"]
-"""What stage 5 can do."""
-
 _ONLY_THE_OPERATOR = {
     key: f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the command line"
     for key, flag in _OPERATORS.items()
@@ -185,7 +211,7 @@ class RunSection(DataModel):
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
-    excitation: ExcitationKind | None = None
+    excitation: Annotated[str, Registered(EXCITATIONS)] | None = None
     mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
     frequency_hz: Frequency | None = Field(default=None, description="Hz; base frequency of the excitation")
     amplitude_rad_s: Amplitude | None = Field(default=None, description="rad/s; amplitude of the speed")
@@ -193,7 +219,7 @@ class RunSection(DataModel):
     periods: int | None = Field(default=None, ge=1, le=10_000)
     tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
     max_time_s: Time | None = Field(default=None, description="s; longest stage 5")
-    model: Literal["auto", "rigid", "two-mass", "string", "paper"] | None = Field(
+    model: Annotated[str, Registered(MODELS)] | None = Field(
         default=None, description="of the shaft; auto: the simplest that fits"
     )
     confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
@@ -219,7 +245,7 @@ class Rig(DataModel):
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     name: str | None = Field(default=None, min_length=1, max_length=200, description="of the rig, for reports and logs")
-    drive: Literal["canopen", "modbus"] | None = None
+    drive: Annotated[str, Registered(BUSES)] | None = None
     bus: Bus = Bus()
     node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
     modbus: Modbus = Modbus()

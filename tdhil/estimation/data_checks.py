@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from tdhil.config.registry import has_plateaus
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, excited_window, usual_interval
 from tdhil.recording.recording import Excitation, FloatArray, Recording, Segment
@@ -58,7 +59,7 @@ def check_limited(
         if saturated > LIMIT_SHARE:
             reason = f"the torque was at its limit of {limit:g} N·m for {saturated:.1%} of the excitation"
             raise Refused(reason, _ADVICE)
-    if kind == "step":
+    if has_plateaus(kind):
         return
     for segment, part in parts:
         for name, signal, quantum in (

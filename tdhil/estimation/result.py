@@ -3,14 +3,11 @@
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal, get_args
+
+from tdhil.config.registry import MODELS
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What may be asked of identification.
-
-
-Model = Literal["auto", "rigid", "two-mass", "string", "paper"]
-MODELS: tuple[Model, ...] = get_args(Model)
 
 
 @dataclass(frozen=True)
@@ -24,7 +21,7 @@ class Options:
 
     confidence: float = 0.95
     tolerance: float = 0.02
-    model: Model = "auto"
+    model: str = "auto"     # of `tdhil.config.registry.MODELS`
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.confidence < 1.0:
@@ -32,7 +29,8 @@ class Options:
         if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
             raise ValueError(f"tolerance must be a positive number: {self.tolerance!r}")
         if self.model not in MODELS:
-            raise ValueError(f"model must be {', '.join(MODELS[:-1])} or {MODELS[-1]}: {self.model!r}")
+            *first, last = MODELS
+            raise ValueError(f"model must be {', '.join(first)} or {last}: {self.model!r}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

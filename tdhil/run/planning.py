@@ -15,7 +15,6 @@ from tdhil.run.design.prediction import Evidence, half_width, longer, predicted
 from tdhil.run.design.stopping_rule import MARGIN, interval_confidence, least_scale
 from tdhil.run.excitation import (
     LEAST_COUNTED,
-    ExcitationKind,
     ExcitationWish,
     MachineLimits,
     Plan,
@@ -23,9 +22,11 @@ from tdhil.run.excitation import (
     RigGuess,
     SwingKind,
     SwingPlan,
+    excitation_kind,
     fit_following,
     held_back_to,
     make_swings,
+    periodic_kind,
 )
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.stages.speed import Course
@@ -98,9 +99,10 @@ class Planned:
 
 
 def wish_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
-    """The request as the excitation room takes it."""
+    """The request as the excitation room takes it. Raises PlanRefused where it isn't periodic."""
+    periodic_kind(request.kind)
     return ExcitationWish(
-        kind=_periodic(request.kind),
+        kind=request.kind,
         mode="speed" if mode == "speed" else "torque",
         frequency_hz=request.frequency_hz,
         amplitude_rad_s=request.amplitude_rad_s,
@@ -111,7 +113,7 @@ def wish_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
 
 def adaptive(request: ExcitationRequest) -> bool:
     """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor without several lines."""
-    return request.tolerance is not None and request.periods is None and request.kind in ("multisine", "step")
+    return request.tolerance is not None and request.periods is None and excitation_kind(request.kind).adaptive
 
 
 def as_followed(
@@ -129,9 +131,8 @@ def plan_acquisition(
     request: ExcitationRequest, mode: str, limits: MachineLimits, guess: RigGuess, known: Knowledge, left_s: float
 ) -> Planned:
     """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
-    match request.kind:
-        case "pulses" | "coast-down" as kind:
-            return _swings(kind, request, mode, limits, guess, known, left_s)
+    if isinstance(excitation_kind(request.kind), SwingKind):
+        return _swings(request, mode, limits, guess, known, left_s)
     wish = wish_of(request, mode)
     allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
     if not adaptive(request):
@@ -155,6 +156,7 @@ def refuse_hopeless(
     The words are those of the assumed rig. What depends on the rig is left to be planned once that is known.
     """
     first: PlanRefused | None = None
+    swings = isinstance(excitation_kind(request.kind), SwingKind)
     for inertia, friction in RIGS:
         rig = replace(
             guess, inertia_kg_m2=inertia * guess.inertia_kg_m2, viscous_nm_s_rad=friction * guess.viscous_nm_s_rad,
@@ -162,7 +164,7 @@ def refuse_hopeless(
         )
         for mode in modes:
             try:
-                if request.kind in ("pulses", "coast-down"):
+                if swings:
                     plan_acquisition(request, mode, limits, rig, known, math.inf)
                 else:
                     refuse_unfit(limits, rig, wish_of(request, mode), known, request.max_time_s)
@@ -173,16 +175,7 @@ def refuse_hopeless(
         raise first
 
 
-def _periodic(kind: str) -> ExcitationKind:
-    match kind:
-        case "multisine" | "sine" | "step":
-            return kind
-        case _:
-            raise PlanRefused(f"{kind} is no periodic excitation")
-
-
 def _swings(
-    kind: SwingKind,
     request: ExcitationRequest,
     mode: str,
     limits: MachineLimits,
@@ -190,13 +183,14 @@ def _swings(
     known: Knowledge,
     left_s: float,
 ) -> Planned:
-    """Pulses and coast-down: there is no line to predict, and no scatter of periods to stop by."""
+    """From speed to speed: there is no line to predict, and no scatter of periods to stop by."""
     if request.frequency_hz is not None:
         raise PlanRefused(
-            f"{kind} has no frequency; use --amplitude, --offset, --periods or --max-time", "Leave --frequency out"
+            f"{request.kind} has no frequency; use --amplitude, --offset, --periods or --max-time",
+            "Leave --frequency out",
         )
     plan = make_swings(
-        kind,
+        request.kind,
         limits,
         guess,
         "speed" if mode == "speed" else "torque",
@@ -207,7 +201,7 @@ def _swings(
     )
     if plan.duration_s > left_s:
         raise PlanRefused(
-            f"time: {kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            f"time: {request.kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
             "Raise limits.time_s in rig.yaml, or ask for less with --periods or --max-time",
         )
     return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)

@@ -14,6 +14,7 @@ from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
 from drivers.preflight import ACCEPTED_BY, ANY_CLIENT, NO_WATCHDOG_FLAG, NOTHING_STOPS_IT, SHARED_FLAG
 from tdhil.recording.recording import LagPrior
+from tdhil.run.excitation import excitation_kind
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -225,9 +226,9 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
     """
     if limits.load != "string":
         return
-    if request.kind == "coast-down":
+    if not excitation_kind(request.kind).with_string:
         raise PreflightRefused(
-            "coast-down was asked for, and a drill string hangs on the shaft: it would turn the motor back",
+            f"{request.kind} was asked for, and a drill string hangs on the shaft: it would turn the motor back",
             where="--excitation",
             next_step="Use --excitation multisine",
         )
@@ -298,15 +299,16 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
             next_step="Use --mode speed",
         )
     mode = Mode.SPEED if wanted == Mode.SPEED.value or not can_torque else Mode.TORQUE
-    if request.kind == "coast-down" and limits.load != "none":
+    kind = excitation_kind(request.kind)
+    if not kind.with_string and limits.load != "none":
         raise PreflightRefused(
-            f"coast-down was asked for, but a {limits.load} hangs on the shaft and would drive it back",
+            f"{request.kind} was asked for, but a {limits.load} hangs on the shaft and would drive it back",
             where="--excitation and load in rig.yaml",
             next_step="Use --excitation multisine",
         )
-    if request.kind == "coast-down" and mode is Mode.SPEED:
+    if kind.needs_torque_mode and mode is Mode.SPEED:
         raise PreflightRefused(
-            f"coast-down was asked for, but {no_torque(wanted, preflight)}: a shaft under speed control never coasts",
+            f"{request.kind} was asked for, but {no_torque(wanted, preflight)}: {kind.why_torque_mode}",
             where="--excitation",
             next_step="Use --excitation pulses or multisine",
         )

@@ -17,7 +17,7 @@ from tdhil.recording.run_log import RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
 from tdhil.run.control_loop import ControlLoop
-from tdhil.run.excitation import RigGuess, SwingPlan
+from tdhil.run.excitation import RigGuess
 from tdhil.run.guard import Guard
 from tdhil.run.preconditions import (
     choose_mode,
@@ -34,7 +34,7 @@ from tdhil.run.settings import StopRequest
 from tdhil.run.speed_check import Onlooker
 from tdhil.run.stage_log import StageBook
 from tdhil.run.stage_planner import StagePlanner
-from tdhil.run.stages.acquire import run_acquire, run_swings
+from tdhil.run.stages.acquire import run_plan
 from tdhil.run.stages.brake_test import NOT_YET, slow_down
 from tdhil.run.stages.hold import MeanSpeedControl, run_hold
 from tdhil.run.stages.setup import measure_offsets, probe_sign
@@ -173,19 +173,18 @@ class Runner:
         if drifted is not None:
             with self._book.stage("hold", 15.0):
                 control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
-                target = plan.start_rad_s if isinstance(plan, SwingPlan) else plan.segments[0].reference.offset_rad_s
-                run_hold(loop, limits, model, control, target, drifted.speed_rad_s, preflight.speed_resolution_rad_s)
+                run_hold(
+                    loop, limits, model, control, plan.start_rad_s, drifted.speed_rad_s,
+                    preflight.speed_resolution_rad_s,
+                )
         else:
             self._book.skip("hold", f"{why}: the drive's own speed control holds the mean speed")
         with self._book.stage("acquire", planned.duration_s + 10.0):
             announced = self._announcer(speed, ramps)
-            if isinstance(plan, SwingPlan):
-                run_swings(loop, limits, plan, control, assumptions, announced)
-            else:
-                run_acquire(
-                    loop, limits, plan, control, announced, planner.enough(planned),
-                    preflight.speed_resolution_rad_s,
-                )
+            run_plan(
+                loop, limits, plan, control, assumptions, announced, planner.enough(planned),
+                preflight.speed_resolution_rad_s,
+            )
 
     def _prepare(self) -> tuple[Task, ControlLoop, Preflight]:
         identity = self._drive.connect()

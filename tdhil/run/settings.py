@@ -1,7 +1,8 @@
 """What a run is allowed to do and asked to do: plain numbers, SI at the motor shaft."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+
+from tdhil.config.registry import DEFAULT_EXCITATION
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class MachineLimits:
 class ExcitationRequest:
     """What stage 5 shall do; None = the default, scaled to the rig."""
 
-    kind: Literal["multisine", "sine", "step", "pulses", "coast-down"] = "multisine"
+    kind: str = DEFAULT_EXCITATION     # of `tdhil.config.registry.EXCITATIONS`
     mode: str | None = None            # torque, speed; None = torque where the drive has it
     frequency_hz: float | None = None
     amplitude_rad_s: float | None = None

@@ -27,8 +27,12 @@ RAMP_S = 40.0
 
 
 def suited(rig: Rig | None, plant: Any) -> Rig | None:
-    """``rig`` as it is, unless ``plant`` (`sim_bus.params.RigParams`) has a string and ``rig`` has no limits."""
-    if plant is None or plant.plant.kind == "rigid" or (rig is not None and rig.limits is not None):
+    """``rig`` as it is, unless ``plant`` (`sim_bus.params.RigParams`) can be wound up and ``rig`` has no limits."""
+    if plant is None or (rig is not None and rig.limits is not None):
+        return rig
+    from sim_bus.plant.kinds import PLANTS
+
+    if not PLANTS[plant.plant.kind].winds_up:
         return rig
     most_nm = plant.drive.torque_limit_nm
     data = simulated_default_rig(rig).model_dump(by_alias=True)

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from tdhil.cli.arguments import MODELS as OFFERED
 from tdhil.estimation import Options, Verdict, identify
 from tdhil.estimation.frequency_domain.compliant import Chosen, choose, may_swing
 from tdhil.estimation.frequency_domain.compliant_fit import (
@@ -22,7 +21,7 @@ from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousCon
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
 from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, resonances, stiffness
 from tdhil.estimation.frequency_domain.spectrum import Line
-from tdhil.estimation.result import MODELS, Refusal
+from tdhil.estimation.result import Refusal
 from tdhil.recording.recording import LagPrior
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
 
@@ -183,7 +182,3 @@ def test_too_few_lines_are_counted_and_refused():
     assert "9 unknowns" in found.reason
     assert "at least 4 lines" in found.advice
     assert isinstance(choose("two-mass", *synthetic(TwoMass(), 0, 20.0), (), {}), Chosen)
-
-
-def test_the_command_line_offers_what_identification_takes():
-    assert OFFERED == MODELS

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from tdhil.config.registry import has_plateaus
 from tdhil.estimation.samples import Samples
 from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
 
@@ -317,7 +318,7 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
 def periodic_segments(recording: Recording) -> tuple[Segment, ...]:
     """Segments taken by whole periods; the plateaus of a square wave are calm enough to be knots themselves."""
     excitation = recording.excitation
-    if excitation is None or excitation.kind == "step":
+    if excitation is None or has_plateaus(excitation.kind):
         return ()
     return tuple(s for s in excitation.segments if s.period_s > 0.0 and s.end_s - s.start_s >= 2.0 * s.period_s)
 

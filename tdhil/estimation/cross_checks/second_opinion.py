@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tdhil.config.registry import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum import Balances, Kind, balances
@@ -100,7 +101,7 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> tuple[SecondOpin
     density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
     delay = known_delay(recording, finding)
     resolution = _resolution(recording, case.samples, found)
-    steps = recording.excitation is not None and recording.excitation.kind == "step"
+    steps = recording.excitation is not None and has_plateaus(recording.excitation.kind)
     opinions = []
     for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
         if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):

@@ -34,15 +34,18 @@ from tdhil.estimation.frequency_domain.shafts import (
     INERTIA,
     LOAD,
     LOAD_VISCOUS,
+    STRING,
     STRING_SHARE,
     SWING,
+    TWO_MASS,
     VISCOUS,
+    ShaftModel,
     StringShaft,
     TwoMassShaft,
+    shaft_model,
 )
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import BudgetLine, Compliant, Estimate, Refusal
-from tdhil.estimation.result import Model as Asked
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Two masses, or the string? The simplest that the residuals allow stands; what can't be told apart is not assumed.
@@ -90,17 +93,20 @@ def _clear(line: Line) -> bool:
 
 
 def choose(
-    asked: Asked, lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...],
+    asked: str, lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...],
     fixed: Fixed
 ) -> Chosen | Refusal:
-    """``priors`` and ``fixed`` as with a rigid shaft."""
-    refusal = _refuse_count(StringShaft() if asked == "string" else TwoMassShaft(), lines, constraint, priors)
+    """``asked``: by its name, a compliant shaft; or two masses and the string are tried. ``priors`` and ``fixed`` as
+    with a rigid shaft.
+    """
+    model = shaft_model(asked)
+    compliant = model.compliant
+    refusal = _refuse_count(TWO_MASS if compliant is None else model, lines, constraint, priors)
     if refusal is not None:
         return refusal
 
-    if asked != "auto":
-        shaft = TwoMassShaft() if asked == "two-mass" else StringShaft()
-        forced = fit_compliant(shaft, lines, constraint, priors, fixed)
+    if compliant is not None:
+        forced = fit_compliant(compliant(), lines, constraint, priors, fixed)
         return Chosen(forced, rejected=rejects(forced.residual))
     two = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
     if two.residual is None:      # a shaft taken in place of one that was contradicted must be one that could be, too
@@ -108,7 +114,7 @@ def choose(
             f"{len(lines)} excited lines leave nothing to test two masses on a spring with",
             "excite more lines about two mean speeds, from well below the resonance to well above it",
         )
-    if _refuse_count(StringShaft(), lines, constraint, priors) is not None:
+    if _refuse_count(STRING, lines, constraint, priors) is not None:
         return Chosen(two, rejected=rejects(two.residual) or not plausible(two))
     string = fit_compliant(StringShaft(), lines, constraint, priors, fixed, two)
     if not rejects(two.residual) and not _outdoes(string, two):
@@ -134,7 +140,7 @@ def may_swing(rigid: RigidResult) -> bool:
         return True
     if rigid.first_order or rigid.residual is None or rigid.residual.p_value > _DOUBT:
         return False
-    if _refuse_count(TwoMassShaft(), problem.lines, problem.constraint, problem.priors) is not None:
+    if _refuse_count(TWO_MASS, problem.lines, problem.constraint, problem.priors) is not None:
         return False
     try:
         two = fit_compliant(TwoMassShaft(), problem.lines, problem.constraint, problem.priors, fitted.fixed)
@@ -152,20 +158,21 @@ def plausible(fit: CompliantFit) -> bool:
 
 
 def _refuse_count(
-    shaft: TwoMassShaft | StringShaft,
+    model: ShaftModel,
     lines: tuple[Line, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
 ) -> Refusal | None:
     """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft."""
-    equations, unknowns = 2 * len(lines) + (constraint is not None) + len(priors), len(shaft.names) + _REPORTS
+    assert model.compliant is not None
+    equations = 2 * len(lines) + (constraint is not None) + len(priors)
+    unknowns = len(model.compliant().names) + _REPORTS
     if equations >= unknowns:
         return None
-    name = "a string" if isinstance(shaft, StringShaft) else "two masses on a spring"
     wanted = math.ceil(0.5 * (unknowns - (constraint is not None) - len(priors)))
     return Refusal(
-        f"{len(lines)} excited lines, mean speeds and known lags give {equations} equations, but {name} behind a "
-        f"drive's reports {'has' if isinstance(shaft, StringShaft) else 'have'} {unknowns} unknowns",
+        f"{len(lines)} excited lines, mean speeds and known lags give {equations} equations, but "
+        f"{model.have or model.text + ' has'} {unknowns} unknowns",
         f"excite at least {wanted} lines, from well below the resonance to well above it",
     )
 
@@ -272,10 +279,6 @@ _OPEN = Refusal(
     "excite with more amplitude, for longer, on both sides of the resonance",
 )
 _WIDE = "state the drive's speed and torque filters, or excite with more amplitude above the resonance"
-_WORDS = {
-    "two-mass": Words("two masses on a spring", f"{_LOOK_FOR}; try --model auto", _WIDE, "explain the data"),
-    "string": Words("a string with a mass at its end", f"{_LOOK_FOR}; try --model auto", _WIDE),
-}
 
 
 def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = None) -> Finding | Refusal:
@@ -298,8 +301,8 @@ def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = Non
         return replace(contradicted, words=replace(contradicted.words, if_rejected=advice))
     if told is None:
         if contradicted is None:
-            name = name_of(chosen.fit)
-            return rigid or Finding(name, _WORDS[name], chosen.fit.residual)
+            name = name_of(chosen.fit, case.options.model)
+            return rigid or Finding(name, _words(name), chosen.fit.residual)
         words = replace(contradicted.words, if_rejected=_LOOK_FOR)
         return replace(contradicted, words=words, remark=", and two masses or a string do no better")
     if told.inertia.bounded or _told(told.shaft.total_inertia):
@@ -311,10 +314,10 @@ def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = Non
 def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Finding | Refusal | None) -> Finding:
     """What is told of the shaft; without J where only the sum of both inertias is."""
     fit = chosen.fit
-    name = name_of(fit)
+    name = name_of(fit, case.options.model)
     finding = Finding(
         model=name,
-        words=_WORDS[name],
+        words=_words(name),
         residual=fit.residual,
         conditions=(*_conditions(chosen), *of_reports(case.recording.lag_prior)),
         viscous_nm_s_rad=told.viscous,
@@ -349,9 +352,16 @@ def _together(total: Estimate | None) -> str:
     return f"; together they are {total.value:.4g} kg·m² ({total.low:.4g} to {total.high:.4g})"
 
 
-def name_of(fit: CompliantFit) -> str:
-    """As ``--model`` has it."""
+def name_of(fit: CompliantFit, asked: str) -> str:
+    """As ``--model`` has it: what was asked for, or which of the two that are tried."""
+    if shaft_model(asked).compliant is not None:
+        return asked
     return "string" if fit.is_string else "two-mass"
+
+
+def _words(name: str) -> Words:
+    model = shaft_model(name)
+    return Words(model.text, f"{_LOOK_FOR}; try --model auto", _WIDE, model.explain)
 
 
 def _conditions(chosen: Chosen) -> tuple[str, ...]:

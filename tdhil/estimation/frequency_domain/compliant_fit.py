@@ -22,8 +22,6 @@ from tdhil.estimation.frequency_domain.shafts import (
     VISCOUS,
     RigidShaft,
     Shaft,
-    StringShaft,
-    TwoMassShaft,
     string_resonances,
 )
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
@@ -312,7 +310,7 @@ class CompliantIntervals:
 
 
 def fit_compliant(
-    shaft: TwoMassShaft | StringShaft,
+    shaft: Shaft,
     lines: tuple[Line, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],

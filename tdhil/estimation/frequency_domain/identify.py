@@ -25,6 +25,7 @@ from tdhil.estimation.frequency_domain.rigid import (
     rigid_finding,
     unfiltered,
 )
+from tdhil.estimation.frequency_domain.shafts import shaft_model
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.estimation.result import Refusal, Refused
 from tdhil.estimation.samples import Stretch, log_warnings, stretches
@@ -84,22 +85,22 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
 
 def identify_lines(case: PeriodicCase) -> Finding:
     """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J."""
-    asked = case.options.model
+    asked = shaft_model(case.options.model)
     rigid = None
-    if asked in ("two-mass", "string"):
+    if asked.compliant is not None:
         finding = identify_compliant(case)
     else:
         rigid = _rigid(case, case.lines)
         weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
         if rigid is not None and contradicted(rigid.fitted.problem, rigid.fitted.whole.theta, weak):
-            rigid, doubted = _rigid(case, case.usable), asked == "auto"
+            rigid, doubted = _rigid(case, case.usable), asked.widened
         else:
-            doubted = asked == "auto" and rigid is not None and may_swing(rigid)
+            doubted = asked.widened and rigid is not None and may_swing(rigid)
         finding = rigid_finding(rigid, case)
         finding = identify_compliant(case, finding) if doubted else finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, finding.advice)
-    if finding.rejected and rigid is not None and asked != "paper":
+    if finding.rejected and rigid is not None and asked.lags:
         return identify_bent(case, rigid) or finding
     return finding
 
@@ -111,7 +112,7 @@ def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:
     options, scale = case.options, case.recording.torque_scale_rel_sd
     priors, fixed = known_of(case.recording.lag_prior, len(lines), case.constraint)
     refusal = refuse_count(len(lines), case.constraint, priors)
-    if options.model == "paper":
+    if not shaft_model(options.model).lags:
         priors, fixed = (), unfiltered()
         refusal = None if len(lines) > 1 else _ONE_LINE
     if refusal is not None:

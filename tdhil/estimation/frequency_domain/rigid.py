@@ -22,7 +22,7 @@ from tdhil.estimation.frequency_domain.inference import (
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Fixed, rigid_rivals, rigid_starts
-from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, shaft_model
 from tdhil.estimation.frequency_domain.signal_filters import (
     AVERAGE,
     SKEW,
@@ -269,10 +269,10 @@ def rigid_finding(
     """What a rigid shaft is found to be; the refusal where its inertia stays open. ``what``: it, for the reader."""
     if result is None or not (rejects(result.residual) or result.inertia.bounded):
         return _OPEN
-    as_paper = case.options.model == "paper"
+    as_paper = not shaft_model(case.options.model).lags
     lines = fitted_points(result.fitted, case.options.confidence)
-    bare = Finding("paper" if as_paper else RIGID, _words(result, as_paper, what), result.residual, lines=lines,
-                   warnings=_caveats(result, as_paper))
+    bare = Finding(case.options.model if as_paper else RIGID, _words(result, as_paper, what), result.residual,
+                   lines=lines, warnings=_caveats(result, as_paper))
     if bare.rejected:
         return bare
     found = replace(bare, inertia=result.inertia, conditions=_conditions(result, case), viscous_nm_s_rad=result.viscous,

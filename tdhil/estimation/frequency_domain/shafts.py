@@ -4,10 +4,13 @@ About a mean speed that keeps its sign Coulomb friction is constant, and the sha
 """
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from tdhil.config.registry import MODELS, load
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray
 from tdhil.recording.recording import FloatArray
 
@@ -268,3 +271,38 @@ def _q(x: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         small, -1.0 / 3.0 + 4.0 * x / 15.0 - 17.0 * x**2 / 105.0, (1.0 - safe * q**2 - q) / (2.0 * safe)
     )
     return q, slope
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class ShaftModel:
+    """What a shaft may be taken for, by name in `tdhil.config.registry.MODELS`.
+
+    ``compliant``: makes the shaft whose swing is fitted, whose m begins as that of two masses does; None: a rigid one.
+    ``text``: of a compliant shaft, what it is, for the reader; ``explain``: what it does with the data, if so;
+    ``have``: what has the unknowns of its fit. ``lags``: are the reports taken to lag? ``widened``: where a rigid
+    shaft is contradicted or in doubt, are others tried?
+    """
+
+    compliant: Callable[[], Shaft] | None = None
+    text: str = ""
+    explain: str = "explains the data"
+    have: str = ""
+    lags: bool = True
+    widened: bool = False
+
+
+AUTO = ShaftModel(widened=True)
+RIGID = ShaftModel()
+TWO_MASS = ShaftModel(
+    TwoMassShaft, "two masses on a spring", "explain the data", "two masses on a spring behind a drive's reports have"
+)
+STRING = ShaftModel(StringShaft, "a string with a mass at its end", have="a string behind a drive's reports has")
+PAPER = ShaftModel(lags=False)
+
+
+def shaft_model(name: str) -> ShaftModel:
+    """The model of that name. KeyError where there is none."""
+    found: ShaftModel = load(MODELS, name)
+    return found

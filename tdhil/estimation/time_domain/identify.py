@@ -13,6 +13,7 @@ from tdhil.estimation.case import Case, Finding, Words
 from tdhil.estimation.frequency_domain.inference import torque_scale_line
 from tdhil.estimation.frequency_domain.model import GaussianPrior
 from tdhil.estimation.frequency_domain.rigid import lag_priors
+from tdhil.estimation.frequency_domain.shafts import shaft_model
 from tdhil.estimation.frequency_domain.signal_filters import LAG_BOUND_S, SKEW_BOUND_S
 from tdhil.estimation.result import Estimate, Options, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
@@ -133,7 +134,7 @@ def recorded(case: Case) -> Case:
 
 def identify_record(case: Case) -> Finding:
     """What a record without periodic excitation tells of a rigid shaft. Raises Refused where it leaves J open."""
-    if case.options.model == "paper":
+    if not shaft_model(case.options.model).lags:
         raise Refused(
             "the paper's method takes the reported signals as they are; without periodic excitation nothing tests that",
             "identify with the rigid model, which includes reporting lags",

@@ -20,6 +20,8 @@ from pydantic import Field, model_validator
 from drivers.errors import DataFileError, Problem
 from profiles.model import DataModel, refuse_if
 from profiles.yaml_loader import load_with_lines
+from tdhil.config.registry import DEFAULT_EXCITATION, EXCITATIONS
+from tdhil.config.rig import Registered
 from tdhil.recording.recording import Excitation, FloatArray, Level, Segment
 
 _MOST_PERIODS = 100_000
@@ -96,7 +98,9 @@ class LevelFile(DataModel):
 class ExcitationFile(DataModel):
     """The whole file."""
 
-    kind: Literal["multisine", "sine", "step"] = Field(default="multisine", description="multisine, sine or step")
+    kind: Annotated[str, Registered(EXCITATIONS, periodic=True)] = Field(
+        default=DEFAULT_EXCITATION, description="a periodic excitation: multisine, sine or step"
+    )
     mode: Literal["torque", "speed"] = Field(default="torque", description="what the drive regulated: torque or speed")
     segments: tuple[SegmentFile, ...] = Field(min_length=1, max_length=100, description="in the order of time")
     levels: tuple[LevelFile, ...] = Field(default=(), max_length=100, description="stretches of steady speed, if any")

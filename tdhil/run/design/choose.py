@@ -17,7 +17,15 @@ from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.shafts import VISCOUS
 from tdhil.recording.recording import FloatArray, LagPrior
 from tdhil.run.design.prediction import RIGID, SPEED_LAG_S, TORQUE_LAG_S, Noise, assumed_theta, expected_half_width
-from tdhil.run.excitation import LEAST_COUNTED, ExcitationWish, Plan, PlanRefused, make_plan, settling_periods
+from tdhil.run.excitation import (
+    LEAST_COUNTED,
+    ExcitationWish,
+    Plan,
+    PlanRefused,
+    make_plan,
+    periodic_kind,
+    settling_periods,
+)
 from tdhil.run.excitation.reference import DriveMode, MachineLimits, RigGuess
 from tdhil.run.excitation.signals import Shape, unit_peak
 
@@ -231,7 +239,7 @@ def choose(
     def width(plan: Plan) -> float:
         return expected_half_width(plan, theta, known.noise, known.prior, confidence)
 
-    given = wish.kind != "multisine" or wish.frequency_hz is not None or wish.periods is not None
+    given = not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
     usual = make_plan(limits, guess, wish)
     if given:
         usual = _in_time(usual, wish, time_s)
@@ -267,7 +275,7 @@ def refuse_unfit(
     try:
         _in_time(make_plan(limits, guess, wish), wish, time_s)
     except PlanRefused:
-        given = wish.kind != "multisine" or wish.frequency_hz is not None or wish.periods is not None
+        given = not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
         if given or time_s is None:
             raise
         if not any(True for slope in SLOPES for _ in _candidates(limits, guess, wish, known, time_s, slope)):

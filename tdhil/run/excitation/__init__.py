@@ -2,24 +2,26 @@
 
 from tdhil.run.excitation.plan import (
     LEAST_COUNTED,
-    ExcitationKind,
     ExcitationWish,
     Plan,
     PlannedSegment,
     make_plan,
+    periodic_kind,
     settling_periods,
 )
-from tdhil.run.excitation.pulses import SwingKind, SwingPlan, make_swings
+from tdhil.run.excitation.pulses import SwingKind, SwingPlan, Way, make_swings
 from tdhil.run.excitation.reference import (
     DriveMode,
+    ExcitationKind,
     MachineLimits,
     PeriodicReference,
     PlanRefused,
     RigGuess,
     Transition,
+    excitation_kind,
     make_transition,
 )
-from tdhil.run.excitation.signals import Shape
+from tdhil.run.excitation.signals import PeriodicKind, Shape
 from tdhil.run.excitation.speed_loop import Following, fit_following, held_back_to
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "ExcitationWish",
     "Following",
     "MachineLimits",
+    "PeriodicKind",
     "PeriodicReference",
     "Plan",
     "PlanRefused",
@@ -38,10 +41,13 @@ __all__ = [
     "SwingKind",
     "SwingPlan",
     "Transition",
+    "Way",
+    "excitation_kind",
     "fit_following",
     "held_back_to",
     "make_plan",
     "make_swings",
     "make_transition",
+    "periodic_kind",
     "settling_periods",
 ]

@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.config.registry import DEFAULT_EXCITATION
 from tdhil.recording.recording import Segment
 from tdhil.run.excitation import signals
 from tdhil.run.excitation.reference import (
@@ -16,11 +17,10 @@ from tdhil.run.excitation.reference import (
     PlanRefused,
     RigGuess,
     Transition,
+    excitation_kind,
     make_transition,
 )
-from tdhil.run.excitation.signals import Shape, begun_at_rest
-
-ExcitationKind = Literal["multisine", "sine", "step"]
+from tdhil.run.excitation.signals import PeriodicKind, Shape, begun_at_rest
 
 _OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
 LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
@@ -40,7 +40,7 @@ class ExcitationWish:
     far apart two mean speeds of the plan's own choice are at least (friction's lever).
     """
 
-    kind: ExcitationKind = "multisine"
+    kind: str = DEFAULT_EXCITATION
     mode: DriveMode = "torque"
     frequency_hz: float | None = None
     amplitude_rad_s: float | None = None
@@ -87,11 +87,46 @@ class PlannedSegment:
 class Plan:
     """The whole of stage 5's motion, in order; transitions lead from each segment to the next."""
 
-    kind: ExcitationKind
+    kind: str
     mode: DriveMode
     segments: tuple[PlannedSegment, ...]
     limits: MachineLimits
     guess: RigGuess
+
+    @property
+    def start_rad_s(self) -> float:
+        """The mean speed that it begins at."""
+        return self.segments[0].reference.offset_rad_s
+
+    def plain(self) -> dict[str, Any]:
+        """Its motion as plain data."""
+        return {
+            "segments": [
+                {
+                    "offset_rad_s": one.reference.offset_rad_s,
+                    "period_s": one.reference.period_s,
+                    "periods": one.periods,
+                    "settle_periods": one.settle_periods,
+                    "lines_hz": list(one.reference.lines_hz),
+                    "amplitudes_rad_s": list(one.reference.amplitudes_rad_s),
+                }
+                for one in self.segments
+            ],
+            "ways": [],
+        }
+
+    def parts(self) -> list[tuple[str, str]]:
+        """(where, what) for people: one for each mean speed."""
+        return [
+            (f"at {one.reference.offset_rad_s:.3g} rad/s",
+             f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle")
+            for one in self.segments
+        ]
+
+    def lines(self) -> list[tuple[float, float]]:
+        """(Hz, rad/s) of every line; the same at each mean speed."""
+        reference = self.segments[0].reference
+        return list(zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True))
 
     @property
     def speed_min_rad_s(self) -> float:
@@ -251,20 +286,21 @@ class _Fit:
 
 
 def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
-    shapes = {
-        "multisine": (signals.multisine_shape, signals.MULTISINE_FREQUENCY_HZ),
-        "sine": (signals.sine_shape, signals.SINE_FREQUENCY_HZ),
-        "step": (signals.step_shape, signals.STEP_FREQUENCY_HZ),
-    }
-    if wish.kind not in shapes:
-        raise PlanRefused(f"unknown excitation {wish.kind!r}; there are {', '.join(shapes)}")
-    make, default = shapes[wish.kind]
-    frequency = default if wish.frequency_hz is None else wish.frequency_hz
+    kind = periodic_kind(wish.kind)
+    frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
     if not (math.isfinite(frequency) and frequency > 0.0):
         raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
     if wish.shape is not None:
         return wish.shape, frequency
-    return make(), frequency
+    return kind.shape(), frequency
+
+
+def periodic_kind(name: str) -> PeriodicKind:
+    """The periodic kind of that name. Raises PlanRefused where it is none."""
+    kind = excitation_kind(name)
+    if not isinstance(kind, PeriodicKind):
+        raise PlanRefused(f"{name} is no periodic excitation")
+    return kind
 
 
 def settling_periods(period_s: float) -> int:
@@ -279,7 +315,7 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
                 f"{wish.periods} periods are too few: {settle} go to settling", f"Give --periods {settle + 1} or more"
             )
         return wish.periods
-    if wish.kind == "sine":
+    if periodic_kind(wish.kind).single_tone:
         return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))
     # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
     counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
@@ -312,7 +348,7 @@ def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
     """
     low, high = fit.limits.usable_low_rad_s, fit.limits.usable_high_rad_s
     span = (fit.foreseen + fit.down) * fit.swing
-    if wish.kind == "sine":
+    if periodic_kind(wish.kind).single_tone:
         return (low + (high - low) * fit.down / (fit.foreseen + fit.down),)
     share = _OFFSET_SHARE if wish.offset_share is None else wish.offset_share
     amplitude = (1.0 - share) * (high - low) / span

@@ -15,14 +15,19 @@ foresees (`limits.foresight_s`) while the torque pushes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from itertools import islice
-from typing import Literal
+from typing import Any
 
-from tdhil.run.excitation.reference import DriveMode, MachineLimits, PlanRefused, RigGuess
-
-SwingKind = Literal["pulses", "coast-down"]
+from tdhil.run.excitation.reference import (
+    DriveMode,
+    ExcitationKind,
+    MachineLimits,
+    PlanRefused,
+    RigGuess,
+    excitation_kind,
+)
 
 CALM_S = 3.5              # at every speed: momentum's balances want 2 s and more, behind the lags
 TOTAL_S = 210.0           # about as long as the usual multisine
@@ -60,10 +65,21 @@ class Way:
 
 
 @dataclass(frozen=True)
+class SwingKind(ExcitationKind):
+    """Ways from one steady speed to another.
+
+    ``ways``: makes them without end, from the lowest and the highest speed, rad/s, the steepest that a powered way may
+    be, rad/s², and the rough rig. The first begins at the lowest speed.
+    """
+
+    ways: Callable[[float, float, float, RigGuess], Iterator[Way]] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
 class SwingPlan:
     """The whole of stage 5's motion: calm at ``start_rad_s``, then every way with the calm behind it."""
 
-    kind: SwingKind
+    kind: str
     mode: DriveMode
     start_rad_s: float
     ways: tuple[Way, ...]
@@ -78,9 +94,29 @@ class SwingPlan:
     def duration_s(self) -> float:
         return CALM_S + sum(way.duration_s + CALM_S for way in self.ways)
 
+    def plain(self) -> dict[str, Any]:
+        """Its motion as plain data."""
+        return {
+            "segments": [],
+            "ways": [
+                {"from_rad_s": way.from_rad_s, "to_rad_s": way.to_rad_s, "duration_s": way.duration_s,
+                 "coasting": way.coasting}
+                for way in self.ways
+            ],
+        }
+
+    def parts(self) -> list[tuple[str, str]]:
+        """(where, what) for people."""
+        ways = f"{len(self.ways)} ways up and down, each with {CALM_S:g} s of calm behind it"
+        return [(f"{self.speed_min_rad_s:.3g} to {self.speed_max_rad_s:.3g} rad/s", ways)]
+
+    def lines(self) -> list[tuple[float, float]]:
+        """It has none."""
+        return []
+
 
 def make_swings(
-    kind: SwingKind,
+    kind: str,
     limits: MachineLimits,
     guess: RigGuess,
     mode: DriveMode,
@@ -93,11 +129,12 @@ def make_swings(
 
     ``amplitude_rad_s``: half of the way from the lower to the upper speed, about ``offset_rad_s``.
     """
-    if kind == "coast-down" and mode != "torque":
-        raise PlanRefused("coast-down needs a drive in torque mode: under speed control a shaft does not coast")
+    asked = swing_kind(kind)
+    if asked.needs_torque_mode and mode != "torque":
+        raise PlanRefused(f"{kind} needs a drive in torque mode: {asked.why_torque_mode}")
     room = _Room(limits, guess, mode)
     low, high, rate = room.swing(amplitude_rad_s, offset_rad_s)
-    endless = _pulses(low, high, rate, guess) if kind == "pulses" else _coasts(low, high, rate, guess)
+    endless = asked.ways(low, high, rate, guess)
     total = TOTAL_S if time_s is None else time_s
     if swings is not None:
         ways = list(islice(endless, swings))
@@ -116,8 +153,16 @@ def make_swings(
         )
     torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
                way.reference(0.999999 * way.duration_s)[1])]
-    lowest = 0.0 if kind == "coast-down" else min(torques)
-    return SwingPlan(kind, mode, low, tuple(ways), low, high, min(lowest, *torques), max(torques), limits, guess)
+    lowest = min(torques) if all(not way.coasting for way in ways) else min(0.0, *torques)
+    return SwingPlan(kind, mode, low, tuple(ways), low, high, lowest, max(torques), limits, guess)
+
+
+def swing_kind(name: str) -> SwingKind:
+    """The kind of that name that goes from speed to speed. Raises PlanRefused where it is none."""
+    kind = excitation_kind(name)
+    if not isinstance(kind, SwingKind):
+        raise PlanRefused(f"{name} is a periodic excitation")
+    return kind
 
 
 def _again(ways: list[Way], rest: Iterator[Way]) -> Iterator[Way]:
@@ -157,6 +202,15 @@ def coasting_s(from_rad_s: float, to_rad_s: float, guess: RigGuess) -> float:
         raise PlanRefused("coast-down: there is no friction to slow the shaft down; use --excitation pulses")
     mean = upper if math.isclose(upper, lower, rel_tol=1e-9) else (upper - lower) / math.log(upper / lower)
     return guess.inertia_kg_m2 * (from_rad_s - to_rad_s) / mean
+
+
+PULSES = SwingKind(ways=_pulses)
+COAST_DOWN = SwingKind(
+    ways=_coasts,
+    needs_torque_mode=True,
+    why_torque_mode="a shaft under speed control never coasts",
+    with_string=False,
+)
 
 
 class _Room:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from tdhil.config.registry import EXCITATIONS, load
 from tdhil.run.excitation.speed_loop import Following
 
 DriveMode = Literal["torque", "speed"]
@@ -24,6 +25,33 @@ class PlanRefused(ValueError):
     def __init__(self, what: str, next_step: str = USUAL_STEP) -> None:
         super().__init__(what)
         self.next_step = next_step
+
+
+@dataclass(frozen=True)
+class ExcitationKind:
+    """What there is to know of an excitation before it is planned; `tdhil.config.registry` lists them by name.
+
+    A kind is one of two families: `PeriodicKind` has lines, `SwingKind` goes from one steady speed to another.
+    ``needs_torque_mode``: it can't be had under the drive's speed control, and ``why_torque_mode`` says why in words.
+    ``with_string``: may it be run with a drill string on the shaft?
+    """
+
+    needs_torque_mode: bool = False
+    why_torque_mode: str = ""
+    with_string: bool = True
+
+    @property
+    def adaptive(self) -> bool:
+        """Can a tolerance end it, by the scatter from period to period?"""
+        return False
+
+
+def excitation_kind(name: str) -> ExcitationKind:
+    """The kind of that name. Raises PlanRefused where there is none."""
+    if name not in EXCITATIONS:
+        raise PlanRefused(f"unknown excitation {name!r}; there are {', '.join(EXCITATIONS)}")
+    found: ExcitationKind = load(EXCITATIONS, name)
+    return found
 
 
 @dataclass(frozen=True)

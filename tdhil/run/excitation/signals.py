@@ -1,11 +1,13 @@
 """A periodic motion before it is scaled: lines with relative amplitudes and phases, and the peaks they add up to."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.run.excitation.reference import ExcitationKind
 from tdhil.run.excitation.speed_loop import Following
 
 _GRID = 1024
@@ -64,6 +66,25 @@ class Shape:
         return wave
 
 
+@dataclass(frozen=True)
+class PeriodicKind(ExcitationKind):
+    """The same motion again and again about a mean speed, or two.
+
+    ``shape``: makes its lines. ``frequency_hz``: of the first of them where nobody asks for another. ``single_tone``:
+    one line tells nothing of friction's slope, so that it has one mean speed and as many periods as 100 s hold, and its
+    scatter decides nothing. ``tuned``: the design may choose other lines, fitted to the shaft's noise and lags.
+    """
+
+    shape: Callable[[], Shape] = field(kw_only=True)
+    frequency_hz: float = field(kw_only=True)
+    single_tone: bool = False
+    tuned: bool = False
+
+    @property
+    def adaptive(self) -> bool:
+        return not self.single_tone
+
+
 def unit_peak(shape: Shape) -> Shape:
     """The shape scaled so that its greatest deviation is 1."""
     peak = float(np.max(np.abs(shape.deviation())))
@@ -113,6 +134,9 @@ def multisine_shape() -> Shape:
     )
 
 
+MULTISINE = PeriodicKind(shape=multisine_shape, frequency_hz=MULTISINE_FREQUENCY_HZ, tuned=True)
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Sine: the paper's equation 8, ω₁(t) = A sin(2π f t) + B, one line about one offset.
 #
@@ -126,6 +150,9 @@ SINE_FREQUENCY_HZ = 0.1   # lowest tone of the paper's field test (section 5.2)
 def sine_shape() -> Shape:
     """One line, amplitude 1; a sine is a cosine that is a quarter late."""
     return Shape(harmonics=(1,), amplitudes=(1.0,), phases_rad=(1.5 * math.pi,))
+
+
+SINE = PeriodicKind(shape=sine_shape, frequency_hz=SINE_FREQUENCY_HZ, single_tone=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -151,3 +178,6 @@ def step_shape() -> Shape:
             phases_rad=(1.5 * math.pi,) * len(_HARMONICS),
         )
     )
+
+
+STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)

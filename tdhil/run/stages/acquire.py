@@ -254,3 +254,21 @@ def _coast(loop: ControlLoop, way: Way, follower: Follower, assumptions: Control
         follower.saw(sample, way.to_rad_s)
         if sample.fresh and sample.speed_rad_s <= stop_at:
             return
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+def run_plan(
+    loop: ControlLoop,
+    limits: MachineLimits,
+    plan: Plan | SwingPlan,
+    control: MeanSpeedControl | None,
+    assumptions: ControlAssumptions,
+    announce: Announce,
+    enough: Enough | None,
+    speed_resolution_rad_s: float,
+) -> AcquireResult:
+    """Run a plan of either family, whatever the excitation. Raises what the bench raises."""
+    if isinstance(plan, SwingPlan):
+        return run_swings(loop, limits, plan, control, assumptions, announce)
+    return run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s)

@@ -1,0 +1,70 @@
+"""What there is to choose from, each in one list: excitations, models of the shaft, buses.
+
+The command line's choices, rig.yaml's schema, `tdhil.api` and the code that acts read these. An entry is a name, where
+the object behind it stands and a line for people; the object is imported when it is asked for, so that ``--help``
+loads none of them. Plants of the simulator, which knows nothing of us, have their own list: `sim_bus.plant.kinds`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Entry:
+    """``at``: ``module:attribute`` of the object; ``text``: what it is.
+
+    What a recording's excitation is to those who can't import it: ``periodic``, it has lines and whole periods;
+    ``plateaus``, the speed rests at levels within a period, so that it is calm there, and flat without being cut off.
+    """
+
+    at: str
+    text: str
+    periodic: bool = False
+    plateaus: bool = False
+
+
+EXCITATIONS: dict[str, Entry] = {
+    "multisine": Entry("tdhil.run.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
+    "sine": Entry("tdhil.run.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
+    "step": Entry("tdhil.run.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True, True),
+    "pulses": Entry("tdhil.run.excitation.pulses:PULSES", "torque pulses between steady speeds"),
+    "coast-down": Entry("tdhil.run.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
+}
+"""What stage 5 can do; each a `tdhil.run.excitation.ExcitationKind`."""
+
+DEFAULT_EXCITATION = "multisine"
+
+MODELS: dict[str, Entry] = {
+    "auto": Entry("tdhil.estimation.frequency_domain.shafts:AUTO", "the simplest that fits"),
+    "rigid": Entry("tdhil.estimation.frequency_domain.shafts:RIGID", "one inertia, with reporting lags"),
+    "two-mass": Entry("tdhil.estimation.frequency_domain.shafts:TWO_MASS", "two masses on a spring"),
+    "string": Entry("tdhil.estimation.frequency_domain.shafts:STRING", "a string with a mass at its end"),
+    "paper": Entry("tdhil.estimation.frequency_domain.shafts:PAPER", "rigid, by the paper's method: no lags"),
+}
+"""What the shaft is taken for."""
+
+BUSES: dict[str, Entry] = {
+    "canopen": Entry("tdhil.session.buses.canopen:open_canopen", "CANopen, CiA 402"),
+    "modbus": Entry("tdhil.session.buses.modbus:open_modbus", "Modbus TCP or RTU"),
+}
+"""How a drive is spoken to; each opens one."""
+
+
+def load(registry: Mapping[str, Entry], name: str) -> Any:
+    """Import what stands behind a name. KeyError where there is none of that name."""
+    module, _, attribute = registry[name].at.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def names(registry: Mapping[str, Entry], *, periodic: bool = False) -> list[str]:
+    """What there is, in its order; of the excitations, the periodic ones alone where asked."""
+    return [name for name, entry in registry.items() if entry.periodic or not periodic]
+
+
+def has_plateaus(excitation: str) -> bool:
+    """Does the speed rest at levels within a period? Not of an excitation that nobody knows any more."""
+    return excitation in EXCITATIONS and EXCITATIONS[excitation].plateaus

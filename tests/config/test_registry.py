@@ -1,0 +1,240 @@
+"""What can be chosen stands in one list each: a toy that is put into the list is there for everybody.
+
+Everything that a toy needs stands in this file, and one line puts it in; nothing else of the tree is touched.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+import tdhil
+from drivers.errors import DataFileError
+from profiles.model import Positive
+from profiles.yaml_loader import parse_model
+from sim_bus.params import RigParams
+from sim_bus.plant import kinds as plants
+from sim_bus.plant.friction.shaft import Shaft
+from tdhil.cli.main import build_parser, main
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, load, names
+from tdhil.config.rig import Registered, Rig, load_rig
+from tdhil.errors import UsageError
+from tdhil.estimation import Options, identify
+from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
+from tdhil.recording.csv.excitation import ExcitationFile
+from tdhil.run.excitation import ExcitationKind, MachineLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
+from tdhil.run.excitation.pulses import SwingKind, SwingPlan
+from tdhil.run.excitation.signals import unit_peak
+from tdhil.run.planning import adaptive, plan_acquisition, refuse_hopeless
+from tdhil.run.preconditions import refuse_by_plan
+from tdhil.run.settings import ExcitationRequest
+from tdhil.run.settings import MachineLimits as RunLimits
+from tests.estimation.compliant_bench import TwoMass, run
+from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
+from tests.estimation.test_two_mass import MILD
+from tests.run.test_design import KNOWN
+
+ROOT = Path(__file__).parents[2]
+LIMITS, GUESS = MachineLimits(0.5, 10.0, 400.0, 0.9), RigGuess(104.0, 8.0, 60.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# An excitation: one file (its lines, or its ways), and one line in the list
+
+
+def two_tones() -> Shape:
+    return unit_peak(Shape(harmonics=(1, 3), amplitudes=(1.0, 0.4), phases_rad=(0.0, 1.0)))
+
+
+def stairs(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+    levels = (low, 0.5 * (low + high), high, 0.5 * (low + high))
+    number = 0
+    while True:
+        at, to = levels[number % 4], levels[(number + 1) % 4]
+        yield Way(at, to, max(0.5, abs(to - at) / rate), guess)
+        number += 1
+
+
+TWO_TONES = PeriodicKind(shape=two_tones, frequency_hz=0.1)
+STAIRS = SwingKind(ways=stairs, needs_torque_mode=True, why_torque_mode="for the test's sake", with_string=False)
+
+
+@pytest.fixture
+def toys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(EXCITATIONS, "two-tones", Entry(f"{__name__}:TWO_TONES", "two tones", periodic=True))
+    monkeypatch.setitem(EXCITATIONS, "stairs", Entry(f"{__name__}:STAIRS", "up and down in steps"))
+
+
+@pytest.mark.usefixtures("toys")
+def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
+    with tdhil.simulate(seed=7) as drive:
+        recording = tdhil.run(drive, tdhil.Motion("two-tones", periods=5), log=tmp_path / "run.mcap")
+    excitation = recording.recording.excitation
+    assert excitation is not None and excitation.kind == "two-tones"
+    assert all(segment.lines_hz == pytest.approx((0.1, 0.3)) for segment in excitation.segments)
+    inertia = tdhil.identify(recording).inertia
+    assert inertia is not None and inertia.low < 104.0 < inertia.high
+
+
+@pytest.mark.usefixtures("toys")
+@pytest.mark.parametrize(("kind", "motion"), [("two-tones", "segments"), ("stairs", "ways")])
+def test_a_toy_excitation_is_taken_by_the_command_line_and_rig_yaml(kind, motion, tmp_path, capsys):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"run: {{excitation: {kind}}}\n")
+    assert load_rig(rig).run.excitation == kind
+    for words in (["--excitation", kind], ["--rig", str(rig)]):
+        assert main(["identify", "--simulate", "--dry-run", "--json", *words]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["excitation"] == kind and found[motion]
+
+
+@pytest.mark.usefixtures("toys")
+def test_what_a_toy_excitation_says_of_itself_is_heeded():
+    assert adaptive(ExcitationRequest("two-tones", tolerance=0.01))
+    assert not adaptive(ExcitationRequest("stairs", tolerance=0.01))
+    planned = plan_acquisition(ExcitationRequest("stairs"), "torque", LIMITS, GUESS, KNOWN, math.inf)
+    assert isinstance(planned.plan, SwingPlan)
+    with pytest.raises(PlanRefused, match="stairs needs a drive in torque mode: for the test's sake"):
+        refuse_hopeless(ExcitationRequest("stairs"), ("speed",), LIMITS, GUESS, KNOWN)
+    string = RunLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)
+    refuse_by_plan(string, ExcitationRequest("two-tones"), lets_go=False)
+    with pytest.raises(tdhil.TdhilError, match="stairs was asked for, and a drill string"):
+        refuse_by_plan(string, ExcitationRequest("stairs"), lets_go=False)
+
+
+@pytest.mark.usefixtures("toys")
+def test_a_trace_may_have_been_excited_by_a_toy_that_is_periodic():
+    segment = "\nsegments: [{start_s: 0, periods: 3, period_s: 10, offset_rad_s: 2, lines_hz: [0.1, 0.3]}]\n"
+    assert parse_model(f"kind: two-tones{segment}", "excitation.yaml", ExcitationFile).kind == "two-tones"
+    with pytest.raises(DataFileError, match="'multisine', 'sine', 'step' or 'two-tones' is wanted"):
+        parse_model(f"kind: stairs{segment}", "excitation.yaml", ExcitationFile)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A model of the shaft: its mechanics in a file of their own, and one line in the list
+
+
+class StiffJoint(TwoMassShaft):
+    """Two masses on a spring that a joint makes stiffer: another shaft, with its own name."""
+
+    def scales(self, rough_inertia: float, s: Any) -> Any:
+        return np.multiply(super().scales(rough_inertia, s), 1.0)
+
+
+STIFF_JOINT = ShaftModel(StiffJoint, "a stiff joint")
+
+
+def test_a_toy_shaft_is_fitted_by_name(monkeypatch):
+    with pytest.raises(ValueError, match="model must be auto, rigid, two-mass, string or paper: 'stiff-joint'"):
+        Options(model="stiff-joint")
+    monkeypatch.setitem(MODELS, "stiff-joint", Entry(f"{__name__}:STIFF_JOINT", "a stiff joint"))
+    recording = run(TwoMass(), [3], noise=MILD, lag_prior=KNOWN_LAGS)[0]
+    toy, two = (identify(recording, Options(model=name)) for name in ("stiff-joint", "two-mass"))
+    assert toy.model == "stiff-joint" and "a stiff joint explains the data" in toy.reason
+    assert toy.inertia is not None and two.inertia is not None
+    assert toy.inertia.value == pytest.approx(two.inertia.value)
+    assert Rig.model_validate({"run": {"model": "stiff-joint"}}).run.model == "stiff-joint"
+    for command in ("identify", "replay"):
+        words = [command, *(["run.mcap"] if command == "replay" else []), "--model", "stiff-joint"]
+        assert build_parser(command).parse_args(words).model == "stiff-joint"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A plant of the simulator: its file, and one line in the list
+
+
+class FlywheelParams(Shaft):
+    """The toy's section in plant.yaml."""
+
+    kind: Literal["flywheel"] = "flywheel"
+    wheel_kg_m2: Positive = 10.0
+
+
+class Flywheel(plants.Rigid):
+    """More inertia on a rigid shaft."""
+
+    def __init__(self, params: FlywheelParams) -> None:
+        same = {name: getattr(params, name) for name in Shaft.model_fields}
+        super().__init__(plants.Params(**same | {"inertia_kg_m2": params.inertia_kg_m2 + params.wheel_kg_m2}))
+
+
+def test_a_toy_plant_is_read_and_turned(monkeypatch):
+    monkeypatch.setitem(plants.PLANTS, "flywheel", plants.PlantKind(FlywheelParams, Flywheel))
+    text = "plant: {kind: flywheel, wheel_kg_m2: 900, coulomb_nm: 0, viscous_nm_s_rad: 0}\n"
+    params = parse_model(text, "plant.yaml", RigParams).plant
+    assert isinstance(params, FlywheelParams) and params.wheel_kg_m2 == 900.0
+    plant = plants.build(params)
+    turned = plant.step(plant.rest(), 100.0, 1.0)
+    assert turned.speed_rad_s == pytest.approx(100.0 / (params.inertia_kg_m2 + 900.0))
+    with pytest.raises(DataFileError, match=r"plant\.wheel_kg_m2: belongs to kind: flywheel, and this plant is rigid"):
+        parse_model("plant: {wheel_kg_m2: 3}\n", "plant.yaml", RigParams)
+    with pytest.raises(DataFileError, match="rigid, two_mass, string or flywheel is wanted, not fly"):
+        parse_model("plant: {kind: fly}\n", "plant.yaml", RigParams)
+    with pytest.raises(DataFileError, match="wheel_kg_m2: must be greater than 0, not -1"):
+        parse_model("plant: {kind: flywheel, wheel_kg_m2: -1.0}\n", "plant.yaml", RigParams)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The lists themselves
+
+
+@pytest.mark.parametrize("registry", [EXCITATIONS, MODELS, BUSES], ids=["excitations", "models", "buses"])
+def test_every_entry_stands_where_it_says(registry):
+    assert all(load(registry, name) is not None and entry.text for name, entry in registry.items())
+
+
+def test_every_excitation_is_what_its_entry_says():
+    for name, entry in EXCITATIONS.items():
+        kind = load(EXCITATIONS, name)
+        assert isinstance(kind, ExcitationKind)
+        assert isinstance(kind, PeriodicKind) == entry.periodic
+
+
+@pytest.mark.parametrize("registry", [EXCITATIONS, MODELS, BUSES], ids=["excitations", "models", "buses"])
+@pytest.mark.parametrize("wrong", ["multisin", "", 3, None, ["sine"], {}, True])
+def test_a_wrong_name_is_refused_as_a_literal_is(registry, wrong):
+    ours = TypeAdapter(Annotated[str, Registered(registry)])
+    theirs: TypeAdapter[Any] = TypeAdapter(Literal[tuple(registry)])    # type: ignore[valid-type]
+    found = []
+    for adapter in (ours, theirs):
+        with pytest.raises(ValidationError) as caught:
+            adapter.validate_python(wrong)
+        found.append(caught.value.errors(include_url=False))
+    assert found[0] == found[1]
+    assert ours.json_schema()["enum"] == theirs.json_schema()["enum"] == names(registry)
+
+
+def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("run:\n  excitation: multisin\n")
+    with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: 'multisine', .* or 'coast-down' is wanted, "
+                                            r"not the text 'multisin'; did you mean 'multisine'\?"):
+        load_rig(rig)
+    wanted = r"--excitation: 'multisine', .* or 'coast-down' is wanted"
+    with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match=wanted):
+        tdhil.run(drive, tdhil.Motion("noise"), log=tmp_path / "run.mcap")
+    with pytest.raises(SystemExit):
+        main(["identify", "--excitation", "noise"])
+    assert "invalid choice: 'noise' (choose from 'multisine', 'sine', 'step', 'pulses', 'c" in capsys.readouterr().err
+
+
+def test_no_chain_of_excitations_or_models_is_left():
+    chains = []
+    for path in sorted((ROOT / "tdhil").rglob("*.py")):
+        if "studies" in path.parts:     # the paper's own signals, whatever a run can do
+            continue
+        apart = set(EXCITATIONS) | (set(MODELS) if "estimation" in path.parts else set())
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Compare | ast.MatchValue | ast.MatchOr):
+                told = {one.value for one in ast.walk(node) if isinstance(one, ast.Constant)
+                        and isinstance(one.value, str)} & apart
+                chains += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in told]
+    assert chains == []
