@@ -37,6 +37,18 @@ def test_contributing_names_what_is_there():
         assert not test or f"def {test.partition('[')[0]}(" in (ROOT / path).read_text(encoding="utf-8"), name
 
 
+@pytest.mark.parametrize("option", ["excitation", "model", "mode"])
+def test_the_page_on_rig_yaml_names_every_choice(option):
+    from tdhil.cli.main import build_parser
+
+    parser = build_parser("identify")
+    (commands,) = [action for action in parser._actions if action.dest == "command"]
+    (choices,) = [action.choices for action in commands.choices["identify"]._actions if action.dest == option]
+    text = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| `run\.{option}` .*$", text, re.MULTILINE)
+    assert [name for name in choices if f"`{name}`" not in row] == []
+
+
 def test_a_link_to_a_file_of_the_repository_leads_to_its_page(hooks):
     assert hooks.relinked("[a](docs/rig.md#bus)", "", "index.md") == "[a](rig.md#bus)"
     assert hooks.relinked("[a](../README.md)", "docs", "rig.md") == "[a](index.md)"

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tdhil.config.registry import EXCITATIONS, names
 from tdhil.run.excitation import ExcitationWish, MachineLimits, PlanRefused, RigGuess, make_plan, make_transition
 
 LIMITS = MachineLimits(0.5, 10.0, 400.0)
 GUESS = RigGuess(104.0, 8.0, 60.0)
-KINDS = ("multisine", "sine", "step")
+KINDS = names(EXCITATIONS, periodic=True)
 MODES = ("torque", "speed")
 
 
