@@ -20,7 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tdhil.estimation.identify import identify
+from tdhil.estimation.identification import identify
 from tdhil.estimation.result import Identification, Options
 from tdhil.recording.recording import LagPrior, Recording
 from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate

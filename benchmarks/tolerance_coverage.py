@@ -29,7 +29,7 @@ from sim_bus.params import RigParams
 from tdhil.run.runner import Runner
 from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
 from tdhil.run.task import Task
-from tdhil.session.conclude import conclude
+from tdhil.session.conclusion import conclude
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 3600.0, probe_torque_nm=200.0)

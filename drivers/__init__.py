@@ -1,1 +1,53 @@
 """Talks to drives; knows nothing of tests, logs or estimation."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from drivers.clock import (
+        Clock as Clock, LOWER_THE_RATE as LOWER_THE_RATE, MonotonicClock as MonotonicClock,
+        SteppedClock as SteppedClock, quantile as quantile,
+    )
+    from drivers.drive import (
+        Check as Check, Command as Command, Counters as Counters, Drive as Drive, DriveLimits as DriveLimits,
+        FrameTap as FrameTap, Identity as Identity, KeptAlive as KeptAlive, Mode as Mode, Outcome as Outcome,
+        Paced as Paced, Polled as Polled, PositionReading as PositionReading, Positioned as Positioned,
+        PowerState as PowerState, Preflight as Preflight, RawFrame as RawFrame, Rehearsed as Rehearsed,
+        ReportingFilters as ReportingFilters, Sample as Sample, StopsFeeding as StopsFeeding, Telling as Telling,
+        Timed as Timed,
+    )
+    from drivers.errors import (
+        CommandRejected as CommandRejected, CommunicationLost as CommunicationLost, DataFileError as DataFileError,
+        DriveFault as DriveFault, LimitHit as LimitHit, ModeNotConfirmed as ModeNotConfirmed,
+        ObjectRefused as ObjectRefused, PreflightRefused as PreflightRefused, Problem as Problem,
+        StopNotConfirmed as StopNotConfirmed, TdhilError as TdhilError,
+    )
+    from drivers.preflight import (
+        ACCEPTED_BY as ACCEPTED_BY, ANY_CLIENT as ANY_CLIENT, NOTHING_STOPS_IT as NOTHING_STOPS_IT,
+        NO_WATCHDOG_FLAG as NO_WATCHDOG_FLAG, SHARED_FLAG as SHARED_FLAG, Table as Table,
+    )
+    from drivers.quick_stop import (
+        BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "clock": ("Clock", "LOWER_THE_RATE", "MonotonicClock", "SteppedClock", "quantile"),
+            "drive": (
+                "Check", "Command", "Counters", "Drive", "DriveLimits", "FrameTap", "Identity", "KeptAlive",
+                "Mode", "Outcome", "Paced", "Polled", "PositionReading", "Positioned", "PowerState", "Preflight",
+                "RawFrame", "Rehearsed", "ReportingFilters", "Sample", "StopsFeeding", "Telling", "Timed",
+            ),
+            "errors": (
+                "CommandRejected", "CommunicationLost", "DataFileError", "DriveFault", "LimitHit",
+                "ModeNotConfirmed", "ObjectRefused", "PreflightRefused", "Problem", "StopNotConfirmed",
+                "TdhilError",
+            ),
+            "preflight": (
+                "ACCEPTED_BY", "ANY_CLIENT", "NOTHING_STOPS_IT", "NO_WATCHDOG_FLAG", "SHARED_FLAG", "Table",
+            ),
+            "quick_stop": ("BareStopReport", "Ended", "Target", "bare_stop"),
+        },
+    )

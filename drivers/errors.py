@@ -17,7 +17,7 @@ Those of one bus only are leaves of these (`drivers.modbus.pdu`). `tdhil.errors`
 exit code.
 """
 
-from profiles.errors import DataFileError, Problem, TdhilError
+from profiles import DataFileError, Problem, TdhilError
 
 __all__ = [
     "CommandRejected",

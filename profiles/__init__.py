@@ -1,1 +1,57 @@
 """Drive profiles as data: the schema, a strict YAML loader, and what ships."""
+
+from typing import TYPE_CHECKING
+
+from profiles.face import lazy_face as lazy_face
+
+if TYPE_CHECKING:
+    from profiles.eds_import import begin_profile as begin_profile
+    from profiles.eds_reader import read_eds as read_eds
+    from profiles.entry import Confidence as Confidence, Entry as Entry, Require as Require
+    from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError
+    from profiles.face import lazy_face as lazy_face
+    from profiles.library import (
+        Profile as Profile, eds_path as eds_path, load_canopen_profile as load_canopen_profile,
+        load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
+        profile_names as profile_names,
+    )
+    from profiles.model import (
+        DataModel as DataModel, Finding as Finding, NonNegative as NonNegative, Positive as Positive,
+        Validated as Validated, refuse_if as refuse_if,
+    )
+    from profiles.simulator_marker import (
+        CYCLES_END as CYCLES_END, CYCLE_ANSWER as CYCLE_ANSWER, CYCLE_ASKED as CYCLE_ASKED, CYCLE_ID as CYCLE_ID,
+        CYCLE_OVER as CYCLE_OVER, LAST_CYCLE_OVER as LAST_CYCLE_OVER, MARKER_INDEX as MARKER_INDEX,
+        MARKER_REGISTER as MARKER_REGISTER, MARKER_REGISTERS as MARKER_REGISTERS, MARKER_STAGE as MARKER_STAGE,
+        MARKER_STAGE_REGISTER as MARKER_STAGE_REGISTER, MARKER_TEXT as MARKER_TEXT, STAGE_NUMBERS as STAGE_NUMBERS,
+    )
+    from profiles.visible_text import visible as visible
+    from profiles.yaml_loader import (
+        Conversion as Conversion, load_model as load_model, load_with_lines as load_with_lines,
+        messages_of as messages_of, parse_model as parse_model,
+    )
+    from profiles.yaml_tree import read_tree as read_tree
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "eds_import": ("begin_profile",),
+            "eds_reader": ("read_eds",),
+            "entry": ("Confidence", "Entry", "Require"),
+            "errors": ("DataFileError", "Problem", "TdhilError"),
+            "face": ("lazy_face",),
+            "library": (
+                "Profile", "eds_path", "load_canopen_profile", "load_modbus_profile", "load_profile",
+                "matching_names", "profile_names",
+            ),
+            "model": ("DataModel", "Finding", "NonNegative", "Positive", "Validated", "refuse_if"),
+            "simulator_marker": (
+                "CYCLES_END", "CYCLE_ANSWER", "CYCLE_ASKED", "CYCLE_ID", "CYCLE_OVER", "LAST_CYCLE_OVER",
+                "MARKER_INDEX", "MARKER_REGISTER", "MARKER_REGISTERS", "MARKER_STAGE", "MARKER_STAGE_REGISTER",
+                "MARKER_TEXT", "STAGE_NUMBERS",
+            ),
+            "visible_text": ("visible",),
+            "yaml_loader": ("Conversion", "load_model", "load_with_lines", "messages_of", "parse_model"),
+            "yaml_tree": ("read_tree",),
+        },
+    )

@@ -6,7 +6,7 @@ draws the whole tree.
 
 from dataclasses import dataclass
 
-from profiles.visible import visible
+from profiles.visible_text import visible
 
 
 class TdhilError(Exception):

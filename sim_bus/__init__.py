@@ -1,1 +1,19 @@
 """Pretends to be the drive and the shaft: plant, inverter, and their face on the bus."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from sim_bus.command import add_kinds as add_kinds
+    from sim_bus.params import RigParams as RigParams
+    from sim_bus.trace import check_trace_path as check_trace_path
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "command": ("add_kinds",),
+            "params": ("RigParams",),
+            "trace": ("check_trace_path",),
+        },
+    )

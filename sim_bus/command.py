@@ -11,11 +11,10 @@ _KINDS = {
 
 def add_kinds(parser: argparse.ArgumentParser) -> None:
     """A sub-command for each kind; the chosen one's ``run`` is left in the namespace."""
-    from sim_bus.canopen import command as canopen_command
-    from sim_bus.modbus import command as modbus_command
+    from sim_bus import canopen, modbus
 
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
-    for name, module in (("canopen", canopen_command), ("modbus", modbus_command)):
+    for name, module in (("canopen", canopen), ("modbus", modbus)):
         kind = kinds.add_parser(name, help=_KINDS[name], description=f"Simulates {_KINDS[name]}.")
         module.add_arguments(kind)
         kind.set_defaults(run=module.run)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 
-from profiles.errors import TdhilError
+from profiles import TdhilError
 
 EXIT_OK = 0
 EXIT_USAGE = 2

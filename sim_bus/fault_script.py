@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Generic, Protocol, TypeVar
 
-from profiles.errors import TdhilError
-from profiles.simulator_marker import STAGE_NUMBERS
+from profiles import STAGE_NUMBERS, TdhilError
 
 _NUMBER = r"\d+(?:\.\d+)?"
 _FAULT = re.compile(

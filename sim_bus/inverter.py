@@ -17,9 +17,9 @@ from math import copysign, exp, expm1, inf, pi, sqrt
 import numpy as np
 
 from sim_bus.params import DriveParams, NoiseParams, RigParams
-from sim_bus.plant.kinds import MotorState, build
-from sim_bus.plant.rigid import Params as RigidParams
-from sim_bus.plant.rigid import State as RigidState
+from sim_bus.plant import MotorState, build
+from sim_bus.plant import Params as RigidParams
+from sim_bus.plant import State as RigidState
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Seeded disturbances: white sensor and torque noise, and a load that wanders (Ornstein–Uhlenbeck).

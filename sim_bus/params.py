@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pydantic import Field
 
-from profiles.model import NonNegative, Positive, Validated
-from sim_bus.plant.kinds import AnyPlantParams
-from sim_bus.plant.rigid import Params as PlantParams
+from profiles import NonNegative, Positive, Validated
+from sim_bus.plant import AnyPlantParams
+from sim_bus.plant import Params as PlantParams
 
 
 class DriveParams(Validated):
@@ -70,6 +70,6 @@ FAITHFUL = ReportingParams(
 
 def load_rig(path: Path) -> RigParams:
     """Reads ``plant.yaml``; raises `profiles.errors.DataFileError` with every problem and its line."""
-    from profiles.yaml_loader import load_model
+    from profiles import load_model
 
     return load_model(path, RigParams)

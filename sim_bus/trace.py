@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from profiles.errors import TdhilError
+from profiles import TdhilError
 
 HEADER = "time_s,speed_rad_s,torque_nm,state,event\n"
 ROW_PERIOD_US = 10_000

@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session.recorded import RunRecord, read
+from tdhil.session import RunRecord, read
 
 if TYPE_CHECKING:
-    from tdhil.config.rig import Rig
+    from tdhil.config import Rig
     from tdhil.estimation import Identification, InertiaEstimate, Verdict
-    from tdhil.session.run_session import Attendant, Consent, RunRequest
+    from tdhil.session import Attendant, Consent, RunRequest
 
 __all__ = [
     "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify",
@@ -118,7 +118,7 @@ class Result:
     @property
     def exit_code(self) -> ExitCode:
         """How ``tdhil replay`` would end: 0 where there is a number to quote, 9 where not."""
-        from tdhil.estimation.result import Verdict
+        from tdhil.estimation import Verdict
 
         stands = self.identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
         return ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
@@ -134,18 +134,18 @@ class Result:
 
     def save_report(self, path: str | Path) -> Path:
         """Write the report, HTML or PDF by its name, and say where it went. Raises UsageError (extra `report`)."""
-        from tdhil.report.html import check_report_path, write_report
+        from tdhil.report import check_report_path, write_report
 
         check_report_path(Path(path), Path(self.record.log), "save_report")
         return write_report(self.document, self.record.recording, Path(path))
 
     def __str__(self) -> str:
-        from tdhil.report.card import card_text
+        from tdhil.report import card_text
 
         return card_text(self.document)
 
     def _repr_html_(self) -> str:
-        from tdhil.report.card import card_html
+        from tdhil.report import card_html
 
         return card_html(self.document)
 
@@ -163,7 +163,7 @@ def identify(
     half-width that is enough for `valid`. None: as the run had it. Raises UsageError for values that can't be, and
     NothingRecorded where the run in a log ended before anything moved.
     """
-    from tdhil.session.conclude import conclude
+    from tdhil.session import conclude
 
     recorded.require_motion()
     asked = {"model": model, "confidence": confidence, "tolerance": tolerance}
@@ -192,7 +192,7 @@ def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
 
     Raises DataFileError with every problem and its line, and UsageError for options that can't be.
     """
-    from tdhil.config.rig import load_rig
+    from tdhil.config import load_rig
 
     handle = DriveHandle(load_rig(Path(rig)), dict(options))
     _request(handle, Multisine(), {})
@@ -211,7 +211,7 @@ def simulate(
     real_time: bool = False,
 ) -> Iterator[DriveHandle]:
     """The embedded simulated drive and rig, in stepped time; ``plant``: a plant.yaml; ``faults`` as of ``--fault``."""
-    from tdhil.config.rig import load_rig
+    from tdhil.config import load_rig
 
     asked = {
         "simulate": True, "seed": seed, "plant": None if plant is None else str(plant), "drive": drive,
@@ -245,8 +245,8 @@ def run(
     Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
     where it was not seen at rest: use the hard-wired stop then.
     """
-    from tdhil.run.stop import not_confirmed
-    from tdhil.session.run_session import Consent, RunSession
+    from tdhil.run import not_confirmed
+    from tdhil.session import Consent, RunSession
 
     unknown = set(consent) - {one.name for one in fields(Consent)}
     if unknown:
@@ -283,14 +283,19 @@ def _request(
     note: str | None = None,
 ) -> RunRequest:
     """The same checks, in the same order, as the command line's. Raises UsageError, DataFileError, PreflightRefused."""
-    from tdhil.config.options import resolve
-    from tdhil.session.connection import can_torque, connection_of
-    from tdhil.session.consent import check_names
-    from tdhil.session.log_place import check_log_path
-    from tdhil.session.open_drive import plan_peer, with_faults
-    from tdhil.session.plan_ahead import refuse_hopeless
-    from tdhil.session.run_session import Consent, RunRequest
-    from tdhil.session.task import suited
+    from tdhil.config import resolve
+    from tdhil.session import (
+        Consent,
+        RunRequest,
+        can_torque,
+        check_log_path,
+        check_names,
+        connection_of,
+        plan_peer,
+        refuse_hopeless,
+        suited,
+        with_faults,
+    )
 
     given = {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()
              if value is not None}
@@ -305,8 +310,8 @@ def _request(
 
 
 def _attendant(request: RunRequest, confirm: Callable[[str], bool] | None) -> Attendant:
-    from tdhil.report.live import stderr_console
-    from tdhil.session.confirm import AskingAttendant, TerminalAttendant
+    from tdhil.report import stderr_console
+    from tdhil.session import AskingAttendant, TerminalAttendant
 
     gear_ratio = 1.0 if request.rig is None else request.rig.gear.ratio
     if confirm is None:

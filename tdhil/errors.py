@@ -27,7 +27,7 @@ A class or an instance may carry an attribute ``exit_code``, which goes before t
 import signal
 from enum import IntEnum
 
-from drivers.errors import (
+from drivers import (
     CommunicationLost,
     DataFileError,
     DriveFault,

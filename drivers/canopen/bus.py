@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from drivers.clock import Clock
 from drivers.drive import FrameTap, RawFrame
 from drivers.errors import CommunicationLost
-from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
+from profiles import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 
 if TYPE_CHECKING:
     import can

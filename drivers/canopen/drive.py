@@ -36,8 +36,8 @@ from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, Pr
 from drivers.left_behind import LeftBehind
 from drivers.own_limits import OwnLimits
 from drivers.preflight import Table
+from profiles import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.canopen import CanopenProfile
-from profiles.simulator_marker import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 
 if TYPE_CHECKING:
     import can

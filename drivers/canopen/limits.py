@@ -11,8 +11,8 @@ from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import Table
+from profiles import Require
 from profiles.canopen import CanopenProfile, Parameter
-from profiles.entry import Require
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Settings of the drive that the profile names: read, held against what they must be, and used as scales.

@@ -24,8 +24,8 @@ from drivers.canopen.state_machine import (
 )
 from drivers.drive import Mode, PowerState, Sample
 from drivers.errors import CommandRejected, ObjectRefused
+from profiles import CYCLES_END, LAST_CYCLE_OVER
 from profiles.canopen import CanopenProfile, ObjectType
-from profiles.simulator_marker import CYCLES_END, LAST_CYCLE_OVER
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The CiA 402 objects that tdhil uses, and the pure codec between them and SI.

@@ -27,9 +27,8 @@ from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.left_behind import LeftBehind
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import Table, agreed_rated_torque
+from profiles import MARKER_INDEX, MARKER_TEXT, visible
 from profiles.canopen import CanopenProfile, ReportingFilter
-from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
-from profiles.visible import visible
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The smoothing that a drive puts on what it reports, read from the objects its profile names.

@@ -37,8 +37,8 @@ from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
 from drivers.preflight import Table
 from drivers.quick_stop import Seen
+from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile
-from profiles.simulator_marker import MARKER_INDEX
 
 if TYPE_CHECKING:
     import can

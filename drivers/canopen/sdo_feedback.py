@@ -13,8 +13,8 @@ from drivers.canopen.pdo import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
 from drivers.canopen.sdo import Objects, name
 from drivers.canopen.state_machine import State, Wish, controlword_towards, decode
 from drivers.errors import CommunicationLost, ObjectRefused
+from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, ObjectType
-from profiles.simulator_marker import MARKER_INDEX
 
 ANSWER_S = 0.1
 """Wall time for one answer, asked for once: whoever looks does so again."""

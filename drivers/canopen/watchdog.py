@@ -10,8 +10,8 @@ from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, w
 from drivers.canopen.sdo import Objects, name
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.preflight import DIES, Table, settle
+from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, Watchdog
-from profiles.simulator_marker import MARKER_INDEX
 
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 LEAST_CYCLES = 5

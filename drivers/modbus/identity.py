@@ -12,14 +12,14 @@ from drivers.modbus.access import Access
 from drivers.modbus.codec import register_name
 from drivers.modbus.pdu import NoReply, RegisterRefused
 from drivers.modbus.state_machine import decode, power_state
-from profiles.modbus import ModbusProfile
-from profiles.simulator_marker import (
+from profiles import (
     MARKER_REGISTER,
     MARKER_REGISTERS,
     MARKER_STAGE_REGISTER,
     MARKER_TEXT,
     STAGE_NUMBERS,
 )
+from profiles.modbus import ModbusProfile
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Telling a simulated peer which stage of the protocol begins: its scripted faults wait for it.

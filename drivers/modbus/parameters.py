@@ -16,7 +16,7 @@ from drivers.modbus.access import Access
 from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, to_counts
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
 from drivers.preflight import Table, agreed_rated_torque, spare
-from profiles.entry import Require
+from profiles import Require
 from profiles.modbus import ModbusProfile, Parameter, Register
 
 UNITS = {"rpm": "rpm", "rpm_s": "rpm/s", "nm": "N·m", "rated": "of rated torque", "s": "s", "hz": "Hz", "kw": "kW"}

@@ -1,1 +1,21 @@
 """The CANopen face of the simulated drive: a CiA 402 node with its objects, PDOs and services, and scripted faults."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from sim_bus.canopen.command import add_arguments as add_arguments, run as run
+    from sim_bus.canopen.faults import listing as listing, parse_all as parse_all
+    from sim_bus.canopen.inline import InlineSimulator as InlineSimulator
+    from sim_bus.canopen.simulator import EmbeddedSimulator as EmbeddedSimulator, Simulator as Simulator
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "command": ("add_arguments", "run"),
+            "faults": ("listing", "parse_all"),
+            "inline": ("InlineSimulator",),
+            "simulator": ("EmbeddedSimulator", "Simulator"),
+        },
+    )

@@ -49,7 +49,7 @@ def run(namespace: argparse.Namespace) -> int:
         return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
-        from profiles.library import load_canopen_profile
+        from profiles import load_canopen_profile
         from sim_bus.canopen.faults import parse_all
         from sim_bus.canopen.simulator import Simulator
         from sim_bus.params import RigParams, load_rig

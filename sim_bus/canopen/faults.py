@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from profiles.simulator_marker import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
+from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender

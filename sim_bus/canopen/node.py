@@ -13,8 +13,8 @@ from struct import error as StructError
 import numpy as np
 from canopen.objectdictionary import datatypes
 
+from profiles import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from profiles.canopen import CanopenProfile
-from profiles.simulator_marker import MARKER_INDEX, MARKER_STAGE, MARKER_TEXT
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.application_objects import ApplicationObjects
 from sim_bus.canopen.objects import ObjectStore, key_of

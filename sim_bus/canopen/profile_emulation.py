@@ -9,8 +9,8 @@ from math import isfinite
 
 from canopen.objectdictionary import datatypes
 
+from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, Parameter
-from profiles.simulator_marker import MARKER_INDEX
 from sim_bus.canopen.application_objects import TURN, ObjectUnits, clamped, counts_per_turn, profile_units, wrapped
 from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.canopen.services import LifeGuard

@@ -16,8 +16,8 @@ from typing import Self
 
 import can
 
+from profiles import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 from profiles.canopen import CanopenProfile
-from profiles.simulator_marker import CYCLE_ANSWER, CYCLE_ASKED, CYCLE_ID
 from sim_bus.canopen.faults import Faults
 from sim_bus.canopen.node import Cia402Node
 from sim_bus.canopen.sender import BUS_ERRORS, Sender

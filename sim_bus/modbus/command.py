@@ -47,7 +47,7 @@ def run(namespace: argparse.Namespace) -> int:
         return EXIT_OK
 
     def simulate(stop: threading.Event) -> None:
-        from profiles.library import load_modbus_profile
+        from profiles import load_modbus_profile
         from sim_bus.modbus.faults import Faults, parse_all, wrongs_of
         from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
         from sim_bus.modbus.machine import Machine

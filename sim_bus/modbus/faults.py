@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
+from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
-from profiles.simulator_marker import MARKER_STAGE_REGISTER
 from sim_bus.cia402 import Mode
 from sim_bus.fault_script import (
     Cast,

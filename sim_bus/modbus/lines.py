@@ -9,7 +9,7 @@ from contextlib import suppress
 from struct import Struct
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
-from profiles.errors import TdhilError
+from profiles import TdhilError
 from sim_bus.modbus.codec import Reply
 
 # ---------------------------------------------------------------------------------------------------------------------

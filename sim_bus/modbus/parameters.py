@@ -4,8 +4,7 @@
 from math import inf, pi
 from typing import Protocol
 
-from profiles.entry import Require
-from profiles.errors import TdhilError
+from profiles import Require, TdhilError
 from profiles.modbus import ModbusProfile, Parameter
 from sim_bus.inverter import RPM
 from sim_bus.modbus.codec import Layout

@@ -21,8 +21,8 @@ from math import floor, pi
 from struct import Struct
 from typing import NamedTuple
 
+from profiles import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
 from profiles.modbus import Echo, ModbusProfile, Register, Signal, Temperature
-from profiles.simulator_marker import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
 from sim_bus.cia402 import Application
 from sim_bus.modbus.codec import Layout
 from sim_bus.modbus.control_words import Words

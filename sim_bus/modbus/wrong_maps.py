@@ -19,7 +19,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from profiles.errors import TdhilError
+from profiles import TdhilError
 
 # ---------------------------------------------------------------------------------------------------------------------
 # How the drive refuses a request: a Modbus exception reply (Modbus application protocol, section 7).

@@ -31,9 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from profiles.model import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import advance_of
-from sim_bus.plant.friction.shaft import Shaft
+from profiles import NonNegative, Positive, refuse_if
+from sim_bus.plant.friction import Shaft, advance_of
 from sim_bus.plant.two_mass import Bottom
 
 LONGEST_TICK_S = 0.002

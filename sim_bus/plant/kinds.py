@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from pydantic import BaseModel, PlainSerializer, PlainValidator
 
-from profiles.model import refuse_if
+from profiles import refuse_if
 from sim_bus.plant import rigid, two_mass
 from sim_bus.plant.drill_string import DrillString, StringParams
 from sim_bus.plant.rigid import Params

@@ -10,8 +10,7 @@ is in `sim_bus.plant.two_mass` and `sim_bus.plant.drill_string`; `sim_bus.plant.
 
 from typing import Literal, NamedTuple
 
-from sim_bus.plant.friction import advance_of, coulomb, torque
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction import Shaft, advance_of, torque
 
 
 class Params(Shaft):
@@ -35,7 +34,7 @@ def step(params: Params, state: State, torque_nm: float, dt_s: float, load_nm: f
     """
     speed, angle, bristle = state
     drive = torque_nm - load_nm - params.load_nm
-    move = coulomb.advance if params.friction == "coulomb" else advance_of(params)
+    move = advance_of(params)
     speed, bristle, travel = move(params, speed, bristle, drive, dt_s)
     return State(speed, angle + travel, bristle)
 

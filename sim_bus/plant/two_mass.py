@@ -22,9 +22,8 @@ from typing import Literal, NamedTuple, Self
 
 from pydantic import model_validator
 
-from profiles.model import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import advance_of
-from sim_bus.plant.friction.shaft import Shaft
+from profiles import NonNegative, Positive, refuse_if
+from sim_bus.plant.friction import Shaft, advance_of
 
 FASTEST_RAD_S = 1000.0
 """Swings beyond this would take hundreds of pieces per step."""

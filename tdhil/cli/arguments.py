@@ -11,7 +11,7 @@ from pathlib import Path
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config.registry import BUSES
+from tdhil.config import BUSES
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.

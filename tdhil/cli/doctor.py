@@ -23,9 +23,8 @@ from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
     from tdhil.cli.buses.modbus_doctor import RegisterSeen
-    from tdhil.config.options import RunOptions
-    from tdhil.config.rig import Rig
-    from tdhil.session.connection import Connection
+    from tdhil.config import Rig, RunOptions
+    from tdhil.session import Connection
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -152,8 +151,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """0 when nothing is bad, else 4. Raises UsageError and DataFileError for options and a rig.yaml that are wrong."""
-    from tdhil.config.options import resolve
-    from tdhil.config.rig import load_rig
+    from tdhil.config import load_rig, resolve
     from tdhil.errors import ExitCode
 
     rig = load_rig(namespace.rig) if namespace.rig else None
@@ -180,9 +178,9 @@ def findings(
     cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[RegisterSeen]
 ) -> Iterator[Finding]:
     """From the computer to the drive; ``registers`` is filled with those of a Modbus drive."""
-    from drivers.errors import DataFileError
+    from drivers import DataFileError
     from tdhil.cli.finding import note, of_error
-    from tdhil.session.connection import connection_of
+    from tdhil.session import connection_of
 
     yield from host_findings(Path(options.log))
     yield from _left(Path(options.log).parent)
@@ -204,7 +202,7 @@ def findings(
 
 def _left(folder: Path) -> Iterator[Finding]:
     """What runs that died have left in their drives."""
-    from drivers.errors import TdhilError
+    from drivers import TdhilError
     from drivers.left_behind import PREFIX, SUFFIX, read
     from tdhil.cli.finding import bad, of_error
 
@@ -222,7 +220,7 @@ def _left(folder: Path) -> Iterator[Finding]:
 def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
     from tdhil.cli.finding import note, ok
     from tdhil.cli.profile_text import sure_text
-    from tdhil.session.consent import doubtful, is_accepted
+    from tdhil.session import doubtful, is_accepted
 
     profile = connection.profile
     yield ok("profile", f"{profile.name} ({options.source('profile')}): {sure_text(profile)}")
@@ -245,21 +243,19 @@ def _limits(rig: Rig | None) -> Iterator[Finding]:
 
 
 def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
-    from drivers.errors import TdhilError
+    from drivers import TdhilError
     from profiles.canopen import CanopenProfile
     from tdhil.cli.buses import canopen_doctor
     from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.config.rig import DriveData
-    from tdhil.session.buses import can_bus
-    from tdhil.session.buses.canopen import open_can, rated_torque_nm
-    from tdhil.session.open_drive import plan_peer
+    from tdhil.config import DriveData
+    from tdhil.session import link_report, open_can, plan_peer, rated_torque_nm
 
     profile, bus = connection.profile, connection.bus
     assert isinstance(profile, CanopenProfile)
     plan = plan_peer(options, connection)
     node = options.node if options.node is not None else profile.node
     if not plan.embedded and bus.interface == "socketcan" and bus.channel:
-        found = attempted("link", lambda: canopen_doctor.link_findings(can_bus.link_report(bus.channel), bus.channel))
+        found = attempted("link", lambda: canopen_doctor.link_findings(link_report(bus.channel), bus.channel))
         yield from found
         if found and found[-1].name == "link" and found[-1].grade == "bad":
             return                                     # there is no such link: opening it would say the same
@@ -277,13 +273,11 @@ def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> It
 def _modbus(
     options: RunOptions, connection: Connection, rig: Rig | None, registers: list[RegisterSeen]
 ) -> Iterator[Finding]:
-    from drivers.clock import Clock, MonotonicClock, SteppedClock
-    from drivers.errors import TdhilError
+    from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
     from tdhil.cli.buses import modbus_doctor
     from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.config.rig import DriveData
-    from tdhil.session.buses.modbus import open_line
-    from tdhil.session.open_drive import plan_peer
+    from tdhil.config import DriveData
+    from tdhil.session import open_line, plan_peer
 
     plan = plan_peer(options, connection)
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
@@ -308,7 +302,7 @@ def _show_registers(registers: list[RegisterSeen]) -> None:
         return
     from rich.table import Table
 
-    from tdhil.report.console import PlainConsole
+    from tdhil.report import PlainConsole
 
     table = Table(title="registers, as read; compare them with the drive's panel", title_justify="left")
     for heading in ("address", "counts", "is", "meaning"):

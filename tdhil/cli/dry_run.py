@@ -9,17 +9,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import RPM
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import Rig
-from tdhil.session.plan_ahead import BEFORE_ACQUIRE_S, Figure, plan_dry
+from tdhil.config import Rig, RunOptions
+from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_dry
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tdhil.run.planning import Planned
-    from tdhil.run.settings import MachineLimits
+    from tdhil.run import MachineLimits, Planned
 
 
 def dry_run(
@@ -37,7 +35,7 @@ def dry_run(
         json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
         sys.stdout.write("\n")
         return 0
-    from tdhil.report.console import PlainConsole
+    from tdhil.report import PlainConsole
 
     console = PlainConsole()
     show(planned, figures, limits, console)
@@ -122,7 +120,7 @@ def _figures_table(figures: tuple[Figure, ...]) -> Table:
 
 
 def _conclusions(planned: Planned) -> list[str]:
-    from tdhil.run.planning import NOT_PREDICTED, NOTHING_TO_EXPECT
+    from tdhil.run import NOT_PREDICTED, NOTHING_TO_EXPECT
 
     stopping = planned.stopping
     if not math.isfinite(planned.half_width):

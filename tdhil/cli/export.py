@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from drivers.drive import RawFrame
+    from drivers import RawFrame
 
 SUFFIXES: Final = {"candump": ".log", "asc": ".asc", "csv": ".csv", "parquet": ".parquet"}
 COLUMNS: Final = (
@@ -39,9 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: all of it; 3: the log is not whole, and what there is was written; 10: nothing can be read."""
     from tdhil.errors import LogError, NothingRecoverable
-    from tdhil.recording.log_reader import read_run
-    from tdhil.report.document import SIMULATED
-    from tdhil.report.live import stderr_console
+    from tdhil.recording import read_run
+    from tdhil.report import SIMULATED, stderr_console
 
     path: Path = namespace.log
     target: Path = namespace.output or path.with_suffix(SUFFIXES[namespace.to])
@@ -97,7 +96,7 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
 
 def _can_frames(path: Path) -> Iterator[RawFrame]:
     """Of a run on Modbus none: older logs have its bytes on the topic of CAN frames."""
-    from tdhil.recording.log_reader import read_frames, read_run
+    from tdhil.recording import read_frames, read_run
 
     if read_run(path).configuration.get("drive") == "modbus":
         return iter(())
@@ -105,7 +104,7 @@ def _can_frames(path: Path) -> Iterator[RawFrame]:
 
 
 def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:
-    from tdhil.recording.log_reader import read_cycles
+    from tdhil.recording import read_cycles
 
     for command, one in read_cycles(path):
         speed, torque = (None, None) if command is None else (command.speed_rad_s, command.torque_nm)

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.drive import Check, Outcome
-from drivers.errors import TdhilError
-from profiles.visible import visible
+from drivers import Check, Outcome, TdhilError
+from profiles import visible
 
 Grade = Literal["ok", "note", "bad"]
 

@@ -11,20 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from tdhil.session.connection import PeerPlan
+from tdhil.session import PeerPlan
 
 if TYPE_CHECKING:
-    from tdhil.config.options import RunOptions
-    from tdhil.config.rig import Rig
-    from tdhil.run.task import RunOutcome
-    from tdhil.session.connection import Connection
-    from tdhil.session.run_session import RunRequest
+    from tdhil.config import Rig, RunOptions
+    from tdhil.run import RunOutcome
+    from tdhil.session import Connection, RunRequest
 
 
 def list_faults() -> int:
     """Prints what there is; the exit code."""
-    from sim_bus.canopen.faults import listing
-    from sim_bus.modbus.faults import listing as listing_of_modbus
+    from sim_bus.canopen import listing
+    from sim_bus.modbus import listing as listing_of_modbus
 
     print(f"--drive canopen\n\n{listing()}\n\n--drive modbus\n\n{listing_of_modbus()}")  # noqa: T201
     return 0
@@ -60,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
     from profiles.quantities import FREQUENCY, SPEED, TIME
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount, share
-    from tdhil.config.registry import EXCITATIONS, MODELS
+    from tdhil.config import EXCITATIONS, MODELS
 
     drive = add_drive_arguments(parser)
     drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
@@ -121,15 +119,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
     from tdhil.cli.dry_run import dry_run
-    from tdhil.config.options import resolve
-    from tdhil.config.rig import load_rig
-    from tdhil.report.live import stderr_console
-    from tdhil.session.connection import can_torque, connection_of
-    from tdhil.session.consent import check_names
-    from tdhil.session.open_drive import plan_peer, with_faults
-    from tdhil.session.plan_ahead import refuse_hopeless
-    from tdhil.session.run_session import Consent, RunRequest
-    from tdhil.session.task import suited
+    from tdhil.config import load_rig, resolve
+    from tdhil.report import stderr_console
+    from tdhil.session import (
+        Consent,
+        RunRequest,
+        can_torque,
+        check_names,
+        connection_of,
+        plan_peer,
+        refuse_hopeless,
+        suited,
+        with_faults,
+    )
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -141,7 +143,7 @@ def run(namespace: argparse.Namespace) -> int:
     check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
     console = stderr_console()
     if namespace.report is not None:
-        from tdhil.report.html import check_report_path
+        from tdhil.report import check_report_path
 
         check_report_path(namespace.report, Path(options.log))
     _check_files(namespace, options)
@@ -168,11 +170,11 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
     """Before anything is opened: no file of this run is another's. UsageError names the option."""
-    from tdhil.session.log_place import check_log_path, check_names
+    from tdhil.session import check_different_files, check_log_path
 
     log, trace = Path(options.log), options.trace
     profile = options.profile
-    check_names({
+    check_different_files({
         "--rig": namespace.rig,
         "--profile": Path(profile) if profile.endswith((".yaml", ".yml")) else None,
         "--plant": None if options.plant is None else Path(options.plant),
@@ -182,7 +184,7 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
     })
     check_log_path(log, options.source("log") if options.given("log") else "--log")
     if trace is not None:
-        from sim_bus.trace import check_trace_path
+        from sim_bus import check_trace_path
 
         check_trace_path(Path(trace), "--trace")
 
@@ -190,8 +192,7 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
 def _run(request: RunRequest, console: Console, report: Path | None) -> int:
     from tdhil.cli.results import print_result, save_report
     from tdhil.errors import LogError, exit_code
-    from tdhil.session.confirm import TerminalAttendant
-    from tdhil.session.run_session import RunSession
+    from tdhil.session import RunSession, TerminalAttendant
 
     options = request.options
     attendant = TerminalAttendant(
@@ -231,7 +232,7 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     import traceback
 
     from tdhil.errors import ExitCode, TdhilError, exit_code
-    from tdhil.run.stop import not_confirmed
+    from tdhil.run import not_confirmed
 
     cause, stop = outcome.cause, outcome.stop
     code = exit_code(cause) if cause is not None else ExitCode.OK

@@ -8,10 +8,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from profiles.entry import Confidence, Entry, Require
-from profiles.library import Profile
+from profiles import Confidence, Entry, Profile, Require
 from profiles.modbus import ModbusProfile, Register
-from tdhil.session.connection import can_torque
+from tdhil.session import can_torque
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Every register that a Modbus profile names, with its meaning: for `profiles show` and for `doctor`. Pure.

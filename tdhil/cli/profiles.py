@@ -7,9 +7,8 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
+from profiles import Entry, Profile
 from profiles.canopen import CanopenProfile, Parameter
-from profiles.entry import Entry
-from profiles.library import Profile
 from profiles.modbus import ModbusProfile
 from profiles.modbus import Parameter as ModbusParameter
 from tdhil.cli.profile_text import (
@@ -21,8 +20,7 @@ from tdhil.cli.profile_text import (
     unit_text,
     watchdog_text,
 )
-from tdhil.session.connection import rated_torque_is_told_by_hand
-from tdhil.session.consent import UNVERIFIED_FLAG, doubtful
+from tdhil.session import UNVERIFIED_FLAG, doubtful, rated_torque_is_told_by_hand
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -220,7 +218,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
     """All, or those of ``names``."""
-    from profiles.library import load_profile, profile_names
+    from profiles import load_profile, profile_names
     from tdhil.cli.profile_text import row, sure_text
 
     profiles = [load_profile(name) for name in names or profile_names()]
@@ -245,8 +243,8 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
 
 
 def _show(name: str, as_json: bool) -> int:
-    from profiles.library import load_profile, matching_names
-    from tdhil.session.consent import doubtful
+    from profiles import load_profile, matching_names
+    from tdhil.session import doubtful
 
     meant = matching_names(name)
     if len(meant) > 1:
@@ -267,7 +265,7 @@ def _show(name: str, as_json: bool) -> int:
 
 
 def _check(files: list[str], as_json: bool) -> int:
-    from profiles.errors import DataFileError
+    from profiles import DataFileError
     from tdhil.cli.profile_text import counts, sure_text
     from tdhil.errors import ExitCode
 
@@ -295,11 +293,9 @@ def _check(files: list[str], as_json: bool) -> int:
 def _import(file: str, output: str | None, as_json: bool) -> int:
     from pathlib import Path
 
-    from profiles.eds_import import begin_profile
-    from profiles.eds_reader import read_eds
-    from profiles.errors import DataFileError, Problem
+    from profiles import DataFileError, Problem, begin_profile, read_eds
     from tdhil.cli.profile_text import row, sure_text
-    from tdhil.session.consent import doubtful
+    from tdhil.session import doubtful
 
     source = Path(file)
     target = Path(output) if output is not None else Path(f"{source.stem}.yaml")
@@ -334,7 +330,7 @@ def _as_path(target: Path) -> str:
 
 def _load(file: str) -> Profile:
     """As `load_profile`; and the EDS that it names is there."""
-    from profiles.library import eds_path, load_profile
+    from profiles import eds_path, load_profile
 
     profile = load_profile(file)
     eds_path(file)
@@ -342,7 +338,7 @@ def _load(file: str) -> Profile:
 
 
 def _console() -> Any:
-    from tdhil.report.console import PlainConsole
+    from tdhil.report import PlainConsole
 
     return PlainConsole()
 

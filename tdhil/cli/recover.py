@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from tdhil.recording.salvage import Salvage
+    from tdhil.recording import Salvage
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,9 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: nothing is missing; 3: some of it is; 10 (`NothingRecoverable`): nothing can be read."""
-    from tdhil.recording.salvage import examine, write_copy
-    from tdhil.report.live import stderr_console
-    from tdhil.session.log_place import check_log_path, make_room
+    from tdhil.recording import examine, write_copy
+    from tdhil.report import stderr_console
+    from tdhil.session import check_log_path, make_room
 
     path, target = namespace.log, namespace.output
     if not path.is_file():
@@ -54,7 +54,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
     """Plain data. Times are control time in s; ``under_way``: the stage that the log breaks off in, or None."""
-    from tdhil.run.task import STAGES
+    from tdhil.run import STAGES
 
     run = found.run
     time_s = run.recording.time_s
@@ -84,7 +84,7 @@ def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
 
 
 def _print(document: dict[str, Any]) -> None:
-    from tdhil.report.console import PlainConsole
+    from tdhil.report import PlainConsole
 
     console = PlainConsole()
 

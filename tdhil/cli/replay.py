@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from profiles.quantities import SHARE, TIME, TORQUE
 from tdhil.cli.arguments import amount, share
 from tdhil.cli.results import print_result, save_report
-from tdhil.config.registry import MODELS
+from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session.recorded import is_log, read, stated_lags
+from tdhil.session import is_log, read, stated_lags
 
 if TYPE_CHECKING:
-    from tdhil.session.recorded import RunRecord
+    from tdhil.session import RunRecord
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
@@ -63,7 +63,7 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError("there is no such log", where=str(path),
                          next_step="Name a run.mcap of this tool, or a trace in CSV")
     if namespace.report is not None:
-        from tdhil.report.html import check_report_path
+        from tdhil.report import check_report_path
 
         check_report_path(namespace.report, path)
     trace: dict[str, Any] = {}
@@ -87,7 +87,7 @@ def run(namespace: argparse.Namespace) -> int:
 def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     """Identify and print; the exit code is that of the result, or says that only a part of the run was used."""
     from tdhil.api import identify
-    from tdhil.report.live import stderr_console
+    from tdhil.report import stderr_console
 
     result = identify(
         recorded, model=namespace.model, confidence=namespace.confidence, tolerance=namespace.tolerance

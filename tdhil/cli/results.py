@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.streams import OutputLost
 
 if TYPE_CHECKING:
-    from tdhil.recording.recording import Recording
+    from tdhil.recording import Recording
 
 
 def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:
     """Where one was asked for, the page as a file. Raises UsageError if it can't be written."""
     if path is not None:
-        from tdhil.report.html import write_report
+        from tdhil.report import write_report
 
         written = write_report(document, recording, path)
         if written != path:
@@ -26,8 +26,7 @@ def save_report(document: Mapping[str, Any], recording: Recording, path: Path | 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
-    from tdhil.report.card import print_card
-    from tdhil.report.console import PlainConsole
+    from tdhil.report import PlainConsole, print_card
 
     try:
         if as_json:

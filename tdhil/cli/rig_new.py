@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Write it, and say what is left to be filled in. UsageError where it can't be written."""
-    from profiles.library import load_profile
+    from profiles import load_profile
     from tdhil.cli.scan import blank_rig, to_fill_in
 
     path: Path = namespace.file

@@ -14,18 +14,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles.library import Profile
+from profiles import Profile, visible
 from profiles.modbus import ModbusProfile
-from profiles.visible import visible
 from tdhil.cli.found_drive import FoundDrive
 from tdhil.cli.profile_text import required_text
-from tdhil.config.rig import Limits, Rig
-from tdhil.session.connection import rated_torque_is_told_by_hand
-from tdhil.session.consent import doubtful
+from tdhil.config import Limits, Rig
+from tdhil.session import doubtful, rated_torque_is_told_by_hand
 
 if TYPE_CHECKING:
-    from tdhil.config.options import RunOptions
-    from tdhil.session.connection import Connection, PeerPlan
+    from tdhil.config import RunOptions
+    from tdhil.session import Connection, PeerPlan
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -209,11 +207,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """0 if anybody answered. Raises CommunicationLost (exit 5) if nobody did, with the likely causes."""
-    from tdhil.config.options import resolve
-    from tdhil.config.rig import load_rig
+    from tdhil.config import load_rig, resolve
     from tdhil.errors import UsageError
-    from tdhil.session.connection import connection_of
-    from tdhil.session.open_drive import plan_peer
+    from tdhil.session import connection_of, plan_peer
 
     if namespace.write is not None:
         _check_free(namespace.write)
@@ -238,10 +234,10 @@ def run(namespace: argparse.Namespace) -> int:
 def _canopen(
     plan: PeerPlan, connection: Connection, options: RunOptions, listen_s: float
 ) -> tuple[tuple[FoundDrive, ...], list[str]]:
-    from drivers.errors import CommunicationLost
+    from drivers import CommunicationLost
     from profiles.canopen import CanopenProfile
     from tdhil.cli.buses.canopen_scan import ask_all, identify_all
-    from tdhil.session.buses.canopen import open_can
+    from tdhil.session import open_can
 
     profile = connection.profile
     assert isinstance(profile, CanopenProfile)
@@ -270,7 +266,7 @@ def _canopen(
 
 def _modbus(plan: PeerPlan, connection: Connection, units: str | None) -> tuple[tuple[FoundDrive, ...], list[str]]:
     from tdhil.cli.buses.modbus_scan import UNITS_RTU, UNITS_TCP, parse_units, scan_lines
-    from tdhil.config.options import Origin
+    from tdhil.config import Origin
     from tdhil.errors import UsageError
 
     serial = connection.modbus.serial is not None and not plan.embedded
@@ -313,7 +309,7 @@ def _check_free(path: Path) -> None:
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
     """The starter file, of the one drive that was found, or of the one asked for among several."""
-    from profiles.library import load_profile
+    from profiles import load_profile
     from tdhil.errors import UsageError
 
     one = _chosen(found, connection, options)
@@ -333,7 +329,7 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
-    from tdhil.config.options import Origin
+    from tdhil.config import Origin
     from tdhil.errors import UsageError
 
     modbus = connection.drive == "modbus"

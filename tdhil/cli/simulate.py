@@ -7,6 +7,6 @@ import argparse
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """What to pretend to be, each kind with the simulator's own options."""
-    from sim_bus.command import add_kinds
+    from sim_bus import add_kinds
 
     add_kinds(parser)

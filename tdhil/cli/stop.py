@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 from tdhil.errors import ExitCode, UsageError, exit_code
 
 if TYPE_CHECKING:
-    from drivers.clock import Clock
-    from drivers.quick_stop import BareStopReport, Target
-    from tdhil.config.options import RunOptions
-    from tdhil.session.connection import Connection
+    from drivers import BareStopReport, Clock, Target
+    from tdhil.config import RunOptions
+    from tdhil.session import Connection
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
@@ -40,11 +39,9 @@ def run(namespace: argparse.Namespace) -> int:
 
     Ctrl-C ends the watching only: what was asked for stays asked for.
     """
-    from drivers.clock import MonotonicClock
-    from drivers.quick_stop import bare_stop
-    from tdhil.config.options import resolve
-    from tdhil.config.rig import load_rig
-    from tdhil.session.connection import connection_of
+    from drivers import MonotonicClock, bare_stop
+    from tdhil.config import load_rig, resolve
+    from tdhil.session import connection_of
 
     rig = load_rig(namespace.rig) if namespace.rig else None
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
@@ -93,8 +90,8 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
 
     profile = connection.profile
     if isinstance(profile, ModbusProfile):
-        from drivers.modbus.quick_stop import ModbusTarget
-        from tdhil.session.buses.modbus import open_wire
+        from drivers.modbus import ModbusTarget
+        from tdhil.session import open_wire
 
         link = open_wire(connection.modbus, clock)
         try:
@@ -102,8 +99,8 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
         finally:
             link.close()
         return
-    from drivers.canopen.quick_stop import Cia402Target
-    from tdhil.session.buses.can_bus import open_bus
+    from drivers.canopen import Cia402Target
+    from tdhil.session import open_bus
 
     bus = open_bus(connection.bus)
     node = options.node if options.node is not None else profile.node
@@ -115,7 +112,7 @@ def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> I
 
 
 def _exit_code(report: BareStopReport) -> ExitCode:
-    from drivers.quick_stop import Ended
+    from drivers import Ended
 
     return {
         Ended.AT_REST: ExitCode.OK,
@@ -126,7 +123,7 @@ def _exit_code(report: BareStopReport) -> ExitCode:
 
 def said(report: BareStopReport) -> list[str]:
     """What was seen, a line each; the last one is the verdict."""
-    from drivers.quick_stop import Ended
+    from drivers import Ended
 
     lines = []
     if report.first is not None and report.last is not None:
@@ -142,7 +139,7 @@ def said(report: BareStopReport) -> list[str]:
 
 
 def _holds(report: BareStopReport) -> str:
-    from drivers.drive import PowerState
+    from drivers import PowerState
 
     if report.last is not None and report.last.state in (PowerState.OFF, PowerState.READY, PowerState.FAULT):
         return "The drive's torque is off: nothing but a brake holds it."

@@ -16,16 +16,13 @@ from typing import TYPE_CHECKING, Any
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
-    from drivers.drive import Command, Identity, Preflight, Sample
-    from sim_bus.params import RigParams
-    from tdhil.config.options import RunOptions
-    from tdhil.config.rig import Rig
-    from tdhil.recording.recording import Recording, Stage
+    from drivers import Command, Identity, Preflight, Sample
+    from sim_bus import RigParams
+    from tdhil.config import Rig, RunOptions
+    from tdhil.recording import Recording, Stage
+    from tdhil.run import Idle, RunOutcome, Task
     from tdhil.run.excitation import Plan, SwingPlan
-    from tdhil.run.task import Idle, RunOutcome, Task
-    from tdhil.studies.field.bench import FieldRun, RunProgress
-    from tdhil.studies.output import Chapter
-    from tdhil.studies.study import Study, StudyOutcome
+    from tdhil.studies import Chapter, FieldRun, RunProgress, Study, StudyOutcome
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -44,13 +41,10 @@ class SimulatedFieldBench:
 
     def run(self, wish: FieldRun, progress: RunProgress) -> Recording:
         """The Recording; raises what ended the run before its end."""
-        from tdhil.config.options import resolve
-        from tdhil.recording.log_writer import RunWriter
-        from tdhil.recording.run_log import RunLog
-        from tdhil.run.runner import Runner
-        from tdhil.session.connection import PeerPlan, simulated_canopen
-        from tdhil.session.open_drive import open_drive
-        from tdhil.session.stop_signals import stop_on_signals
+        from tdhil.config import resolve
+        from tdhil.recording import RunLog, RunWriter
+        from tdhil.run import Runner
+        from tdhil.session import PeerPlan, open_drive, simulated_canopen, stop_on_signals
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -72,7 +66,7 @@ class SimulatedFieldBench:
 
 def bench_rig(wish: FieldRun) -> Rig:
     """The limits of the bench: those of the simulated rig, with the study's torque limit."""
-    from tdhil.config.rig import Rig, simulated_default_rig
+    from tdhil.config import Rig, simulated_default_rig
 
     usual = simulated_default_rig().model_dump(by_alias=True)
     return Rig.model_validate({**usual, "limits": {**usual["limits"], "torque_nm": wish.torque_limit_nm}})
@@ -80,7 +74,7 @@ def bench_rig(wish: FieldRun) -> Rig:
 
 def plant_of(wish: FieldRun) -> RigParams:
     """The simulator's parameters: the study's rig, loop and torque limit on the simulator's own defaults."""
-    from sim_bus.params import RigParams
+    from sim_bus import RigParams
 
     rig = wish.rig
     usual = RigParams().model_dump()
@@ -116,8 +110,8 @@ def _asked(wish: FieldRun) -> dict[str, object]:
 
 
 def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
-    from tdhil.run.task import Task
-    from tdhil.session.task import bench_of, excitation_request, facts, machine_limits
+    from tdhil.run import Task
+    from tdhil.session import bench_of, excitation_request, facts, machine_limits
 
     bench = bench_of(identity, rig)
     return Task(machine_limits(bench), excitation_request(options), facts(bench))
@@ -129,7 +123,7 @@ def _no_prompt(task: Task, preflight: Preflight, idle: Idle) -> None:
 
 
 def _raise_if_ended(outcome: RunOutcome) -> None:
-    from tdhil.run.stop import not_confirmed
+    from tdhil.run import not_confirmed
 
     if outcome.cause is not None:
         raise outcome.cause
@@ -204,9 +198,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def all_studies() -> dict[str, Study]:
     """Every study by its name, tables first, figures in the paper's order; ours last."""
-    from tdhil.studies.coverage.study import COVERAGE
-    from tdhil.studies.field.registry import field_studies
-    from tdhil.studies.registry import simulated_studies
+    from tdhil.studies import COVERAGE, field_studies, simulated_studies
 
     known = {study.name: study for study in (*simulated_studies(), *field_studies(SimulatedFieldBench()))}
     return {name: known[name] for name in sorted(known, key=_order)} | {COVERAGE.name: COVERAGE}
@@ -215,7 +207,7 @@ def all_studies() -> dict[str, Study]:
 def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[tuple[Study, Any]]:
     """Each study that was asked for, with its settings. UsageError and DataFileError, a line each."""
     from tdhil.errors import UsageError
-    from tdhil.studies.settings_files import load_study_file, with_assignments
+    from tdhil.studies import load_study_file, with_assignments
 
     names = list(dict.fromkeys(namespace.studies))
     if names == [ALL]:
@@ -244,7 +236,7 @@ def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[
 
 def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
     from tdhil.errors import UsageError
-    from tdhil.studies.settings_files import with_assignments
+    from tdhil.studies import with_assignments
 
     if "seed" in type(settings).model_fields:
         try:
@@ -258,9 +250,8 @@ def _seeded(study: Study, settings: Any, seed: int, *, alone: bool) -> Any:
 
 def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, report: bool) -> int:
     from tdhil.errors import ExitCode, Interrupted, TdhilError, exit_code
-    from tdhil.report.console import PlainConsole
-    from tdhil.report.live import stderr_console
-    from tdhil.studies.output import (
+    from tdhil.report import PlainConsole, stderr_console
+    from tdhil.studies import (
         INSTALL,
         Chapter,
         StudyBar,
@@ -343,8 +334,8 @@ def _list(studies: Mapping[str, Study], as_json: bool) -> int:
                   ensure_ascii=False, indent=2)
         sys.stdout.write("\n")
         return 0
-    from tdhil.report.console import PlainConsole
-    from tdhil.studies.output import print_list
+    from tdhil.report import PlainConsole
+    from tdhil.studies import print_list
 
     print_list(studies.values(), PlainConsole())
     return 0

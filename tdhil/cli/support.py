@@ -109,7 +109,7 @@ def versions() -> dict[str, Any]:
 def _add_log(archive: zipfile.ZipFile, log: Path, scrub: Scrub) -> bool:
     """The log with its texts scrubbed, and what it says of the run, as files that anybody reads."""
     from tdhil.cli.recover import report
-    from tdhil.recording.salvage import examine, write_copy
+    from tdhil.recording import examine, write_copy
 
     try:
         found = examine(log)
@@ -176,7 +176,7 @@ class Scrub:
         """A message of a log: its numbers as they are, its texts scrubbed."""
         from google.protobuf.descriptor import FieldDescriptor
 
-        from tdhil.recording.log_format import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE
+        from tdhil.recording import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE
 
         if channel in (SAMPLE, COMMAND, CAN, MODBUS, EXCITATION):
             return payload

@@ -1,1 +1,29 @@
 """What a run is told: rig.yaml, and every option with where its value came from."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.config.options import Origin as Origin, RunOptions as RunOptions, Setting as Setting, resolve as resolve
+    from tdhil.config.registry import (
+        BUSES as BUSES, DEFAULT_EXCITATION as DEFAULT_EXCITATION, EXCITATIONS as EXCITATIONS, MODELS as MODELS,
+        has_plateaus as has_plateaus, load as load,
+    )
+    from tdhil.config.rig import (
+        DriveData as DriveData, Limits as Limits, Modbus as Modbus, Registered as Registered, Rig as Rig,
+        bit_rate_problem as bit_rate_problem, load_rig as load_rig, require_limits as require_limits,
+        simulated_default_rig as simulated_default_rig,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "options": ("Origin", "RunOptions", "Setting", "resolve"),
+            "registry": ("BUSES", "DEFAULT_EXCITATION", "EXCITATIONS", "MODELS", "has_plateaus", "load"),
+            "rig": (
+                "DriveData", "Limits", "Modbus", "Registered", "Rig", "bit_rate_problem", "load_rig",
+                "require_limits", "simulated_default_rig",
+            ),
+        },
+    )

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
-from profiles.yaml_loader import messages_of
+from profiles import messages_of
 from tdhil.config.registry import DEFAULT_EXCITATION
 from tdhil.config.rig import Rig
 from tdhil.errors import UsageError

@@ -20,9 +20,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
 from pydantic_core import PydanticKnownError, core_schema
 
-from drivers.errors import DataFileError, PreflightRefused, Problem
-from profiles.model import DataModel, Finding
-from profiles.yaml_loader import Conversion, load_with_lines, messages_of
+from drivers import DataFileError, PreflightRefused, Problem
+from profiles import Conversion, DataModel, Finding, load_with_lines, messages_of
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, names
 
 

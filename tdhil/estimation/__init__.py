@@ -1,6 +1,11 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
-from tdhil.estimation.identify import identify
+from tdhil.estimation.identification import identify
+from tdhil.estimation.paper_method import (
+    STEP_S,
+    line_fit,
+    paper_estimate,
+)
 from tdhil.estimation.result import (
     BudgetLine,
     Compliant,
@@ -15,9 +20,17 @@ from tdhil.estimation.result import (
     SecondOpinion,
     Verdict,
 )
-from tdhil.estimation.rough_inertia import RoughFriction, RoughInertia, rough_friction, rough_inertia
+from tdhil.estimation.rough_estimates import RoughFriction, RoughInertia, rough_friction, rough_inertia
+from tdhil.estimation.samples import (
+    Samples,
+    Stretch,
+    excited_window,
+    stretches,
+    usable_samples,
+)
 
 __all__ = [
+    "STEP_S",
     "BudgetLine",
     "Compliant",
     "Estimate",
@@ -30,9 +43,16 @@ __all__ = [
     "ResidualTest",
     "RoughFriction",
     "RoughInertia",
+    "Samples",
     "SecondOpinion",
+    "Stretch",
     "Verdict",
+    "excited_window",
     "identify",
+    "line_fit",
+    "paper_estimate",
     "rough_friction",
     "rough_inertia",
+    "stretches",
+    "usable_samples",
 ]

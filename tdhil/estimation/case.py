@@ -4,9 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint
-from tdhil.estimation.frequency_domain.inference import rejects
-from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines
+from tdhil.estimation.frequency_domain import Levels, Line, PeriodLines, ViscousConstraint, rejects
 from tdhil.estimation.result import (
     BudgetLine,
     Compliant,
@@ -20,7 +18,7 @@ from tdhil.estimation.result import (
     SecondOpinion,
 )
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.recording.recording import Recording, Stage
+from tdhil.recording import Recording, Stage
 
 
 def _no_samples() -> Samples:

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.frequency_domain.inference import widened_most_by_scale, with_total
+from tdhil.estimation.frequency_domain import widened_most_by_scale, with_total
 from tdhil.estimation.result import Identification, InertiaEstimate, Options, Verdict
-from tdhil.recording.recording import Stage
+from tdhil.recording import Stage
 
 _SHARPER = "identical filters on reported speed and torque, or known ones, would sharpen this further"
 _BY_SCALE = "the drive's torque, checked against a known one, would sharpen this most"

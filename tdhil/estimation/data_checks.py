@@ -10,10 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.config.registry import has_plateaus
+from tdhil.config import has_plateaus
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, excited_window, usual_interval
-from tdhil.recording.recording import Excitation, FloatArray, Recording, Segment
+from tdhil.recording import Excitation, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Motion that a limit shaped: the drive's flag, the torque at its limit, and flat tops that nobody declared.

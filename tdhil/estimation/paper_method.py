@@ -16,7 +16,7 @@ import numpy as np
 
 from tdhil.estimation.result import LineFit, PaperEstimate
 from tdhil.estimation.samples import Samples
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 STEP_S = 0.1
 _SHORTEST = 0.7     # of a step: a gap before the last sample may cut it

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from tdhil.config.registry import MODELS
+from tdhil.config import MODELS
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What may be asked of identification.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
+from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Feedback that stuck while it was called fresh: the same value again and again where the motion says it must change.

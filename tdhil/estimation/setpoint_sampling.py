@@ -22,7 +22,7 @@ import numpy as np
 
 from tdhil.estimation.case import Finding
 from tdhil.estimation.result import BudgetLine
-from tdhil.recording.recording import FloatArray, Recording, SteppedSetpoint
+from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
 NEGLIGIBLE = 1e-3         # of J
 _FINE = 32                # steps of a cycle

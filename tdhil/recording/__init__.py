@@ -1,1 +1,41 @@
 """From samples to run.mcap and back to a Recording."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.recording.csv import (
+        Bench as Bench, USUAL as USUAL, parse_columns as parse_columns, read_recording as read_recording,
+    )
+    from tdhil.recording.log_format import (
+        CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
+        MODBUS as MODBUS, SAMPLE as SAMPLE,
+    )
+    from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
+    from tdhil.recording.log_writer import RunWriter as RunWriter
+    from tdhil.recording.mcap_container import MAGIC as MAGIC
+    from tdhil.recording.recording import (
+        BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, LagPrior as LagPrior,
+        Level as Level, Ramp as Ramp, Recording as Recording, Segment as Segment, Stage as Stage,
+        SteppedSetpoint as SteppedSetpoint, aborted_stage as aborted_stage, before_abort as before_abort,
+    )
+    from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended
+    from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "csv": ("Bench", "USUAL", "parse_columns", "read_recording"),
+            "log_format": ("CAN", "CHANNELS", "CLASSES", "COMMAND", "EXCITATION", "MODBUS", "SAMPLE"),
+            "log_reader": ("read_cycles", "read_frames", "read_run"),
+            "log_writer": ("RunWriter",),
+            "mcap_container": ("MAGIC",),
+            "recording": (
+                "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Ramp", "Recording", "Segment",
+                "Stage", "SteppedSetpoint", "aborted_stage", "before_abort",
+            ),
+            "run_log": ("Ended", "RunLog", "find_ended"),
+            "salvage": ("Salvage", "examine", "write_copy"),
+        },
+    )

@@ -9,7 +9,7 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from drivers.drive import Sample
+from drivers import Sample
 from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import DESCRIPTOR as TIMESTAMP
 
-from drivers.drive import Mode, PowerState
+from drivers import Mode, PowerState
 from tdhil.recording.builder import hints_of
 from tdhil.recording.recording import Excitation, Level, Ramp, Segment, Stage
 

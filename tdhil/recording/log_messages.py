@@ -11,7 +11,7 @@ from functools import lru_cache
 from struct import Struct
 from typing import Any, Final, NamedTuple
 
-from drivers.drive import Command, RawFrame, Sample
+from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogError
 from tdhil.recording.builder import plain
 from tdhil.recording.log_format import CLASSES, CONFIGURATION, EVENT, EXCITATION, MODES, RESULT, STAGE, STATES, Event

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from google.protobuf.message import DecodeError
 
-from drivers.drive import Command, PowerState, RawFrame, Sample
+from drivers import Command, PowerState, RawFrame, Sample
 from tdhil.errors import LogError
 from tdhil.recording import log_format
 from tdhil.recording.builder import FACTS, RecordingBuilder, structure

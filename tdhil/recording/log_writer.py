@@ -19,7 +19,7 @@ from threading import Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
-from drivers.drive import Command, RawFrame, Sample
+from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.recording import log_messages
 from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, MODBUS, SAMPLE, Event, log_payload

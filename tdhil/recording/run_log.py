@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from drivers.drive import Command, RawFrame, Sample
-from drivers.errors import TdhilError
+from drivers import Command, RawFrame, Sample, TdhilError
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import FAILURE, INTERRUPTED, Event

@@ -1,1 +1,32 @@
 """Findings to terminal, JSON, HTML and PDF."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.report.card import (
+        card_html as card_html, card_text as card_text, minutes as minutes, print_card as print_card,
+    )
+    from tdhil.report.console import PlainConsole as PlainConsole
+    from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document
+    from tdhil.report.html import check_report_path as check_report_path, write_report as write_report
+    from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console
+    from tdhil.report.page import (
+        STYLE as STYLE, install_command as install_command, repeatable_figures as repeatable_figures,
+        require_extra as require_extra,
+    )
+    from tdhil.report.plots import draw_run as draw_run
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "card": ("card_html", "card_text", "minutes", "print_card"),
+            "console": ("PlainConsole",),
+            "document": ("SIMULATED", "result_document"),
+            "html": ("check_report_path", "write_report"),
+            "live": ("LiveDisplay", "stderr_console"),
+            "page": ("STYLE", "install_command", "repeatable_figures", "require_extra"),
+            "plots": ("draw_run",),
+        },
+    )

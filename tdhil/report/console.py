@@ -8,7 +8,7 @@ from typing import TextIO
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from profiles.visible import visible
+from profiles import visible
 
 
 class PlainConsole(Console):

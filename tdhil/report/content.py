@@ -12,7 +12,7 @@ from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from tdhil.recording.recording import Recording
+from tdhil.recording import Recording
 from tdhil.report.card import estimate_text, inertia_text, minutes, plus_minus, rounded
 from tdhil.report.document import SIMULATED
 

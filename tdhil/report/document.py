@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from tdhil.estimation.result import Identification, InertiaEstimate, LineFit
-from tdhil.recording.recording import Recording
+from tdhil.estimation import Identification, InertiaEstimate, LineFit
+from tdhil.recording import Recording
 from tdhil.version import __version__
 
 SIMULATED = "SIMULATED"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tdhil.errors import UsageError
-from tdhil.recording.recording import Recording
+from tdhil.recording import Recording
 from tdhil.report.content import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
 

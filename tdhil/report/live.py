@@ -16,9 +16,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from drivers.drive import Command, Outcome, Preflight, Sample
-from profiles.visible import visible
-from tdhil.recording.recording import Stage
+from drivers import Command, Outcome, Preflight, Sample
+from profiles import visible
+from tdhil.recording import Stage
 from tdhil.report.card import minutes
 from tdhil.report.console import PlainConsole
 from tdhil.report.document import SIMULATED

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

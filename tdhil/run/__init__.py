@@ -8,6 +8,47 @@ import sys
 from importlib import import_module
 from types import ModuleType
 from typing import Any
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.run.design import (
+        Knowledge as Knowledge, assumed_noise as assumed_noise, interval_confidence as interval_confidence,
+    )
+    from tdhil.run.guard import Guard as Guard
+    from tdhil.run.planning import (
+        NOTHING_TO_EXPECT as NOTHING_TO_EXPECT, NOT_PREDICTED as NOT_PREDICTED, Planned as Planned,
+        plan_acquisition as plan_acquisition, refuse_hopeless as refuse_hopeless,
+    )
+    from tdhil.run.preconditions import precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan
+    from tdhil.run.runner import Runner as Runner
+    from tdhil.run.settings import (
+        ControlAssumptions as ControlAssumptions, ExcitationRequest as ExcitationRequest,
+        MachineLimits as MachineLimits, StopRequest as StopRequest,
+    )
+    from tdhil.run.speed_check import speed_warnings as speed_warnings
+    from tdhil.run.stage_log import stage_warnings as stage_warnings
+    from tdhil.run.stop import not_confirmed as not_confirmed
+    from tdhil.run.task import (
+        Display as Display, Idle as Idle, RunOutcome as RunOutcome, STAGES as STAGES, Task as Task,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "design": ("Knowledge", "assumed_noise", "interval_confidence"),
+            "guard": ("Guard",),
+            "planning": ("NOTHING_TO_EXPECT", "NOT_PREDICTED", "Planned", "plan_acquisition", "refuse_hopeless"),
+            "preconditions": ("precondition_warnings", "refuse_by_plan"),
+            "runner": ("Runner",),
+            "settings": ("ControlAssumptions", "ExcitationRequest", "MachineLimits", "StopRequest"),
+            "speed_check": ("speed_warnings",),
+            "stage_log": ("stage_warnings",),
+            "stop": ("not_confirmed",),
+            "task": ("Display", "Idle", "RunOutcome", "STAGES", "Task"),
+        },
+    )
 
 
 class _Room(ModuleType):

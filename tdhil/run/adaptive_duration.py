@@ -9,8 +9,8 @@ from functools import partial
 from statistics import NormalDist
 from typing import Any
 
-from tdhil.recording.recording import Recording
-from tdhil.run.design.stopping_rule import LOOKS, MARGIN, Look, interval_of, look
+from tdhil.recording import Recording
+from tdhil.run.design import LOOKS, MARGIN, Look, interval_of, look
 from tdhil.run.excitation import Plan
 from tdhil.run.planning import Stopping, extension_s
 

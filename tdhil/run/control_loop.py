@@ -6,8 +6,7 @@ from collections.abc import Callable
 from threading import Event
 from typing import Any, Protocol, TypeVar
 
-from drivers.drive import Command, Drive, KeptAlive, Mode, PowerState, Sample, Telling
-from drivers.errors import DriveFault, ModeNotConfirmed
+from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
 from tdhil.errors import Interrupted
 from tdhil.run.background import Beside, Reckoner
 from tdhil.run.guard import Guard

@@ -22,9 +22,19 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from drivers.clock import LOWER_THE_RATE
-from drivers.drive import Command, Counters, Mode, PowerState, Sample
-from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed
+from drivers import (
+    LOWER_THE_RATE,
+    Command,
+    CommandRejected,
+    CommunicationLost,
+    Counters,
+    DriveFault,
+    LimitHit,
+    Mode,
+    ModeNotConfirmed,
+    PowerState,
+    Sample,
+)
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 

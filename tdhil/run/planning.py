@@ -10,9 +10,19 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from tdhil.run.design.choose import Choice, Knowledge, choose, refuse_unfit
-from tdhil.run.design.prediction import Evidence, half_width, longer, predicted
-from tdhil.run.design.stopping_rule import MARGIN, interval_confidence, least_scale
+from tdhil.run.design import (
+    MARGIN,
+    Choice,
+    Evidence,
+    Knowledge,
+    choose,
+    half_width,
+    interval_confidence,
+    least_scale,
+    longer,
+    predicted,
+    refuse_unfit,
+)
 from tdhil.run.excitation import (
     LEAST_COUNTED,
     ExcitationWish,
@@ -29,7 +39,7 @@ from tdhil.run.excitation import (
     periodic_kind,
 )
 from tdhil.run.settings import ExcitationRequest
-from tdhil.run.stages.speed import Course
+from tdhil.run.stages import Course
 
 NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
 NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"

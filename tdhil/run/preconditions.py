@@ -8,12 +8,24 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from drivers.clock import LOWER_THE_RATE, quantile
-from drivers.drive import Mode, Paced, Preflight, ReportingFilters, Sample
-from drivers.errors import CommunicationLost, PreflightRefused
+from drivers import (
+    ACCEPTED_BY,
+    ANY_CLIENT,
+    LOWER_THE_RATE,
+    NO_WATCHDOG_FLAG,
+    NOTHING_STOPS_IT,
+    SHARED_FLAG,
+    CommunicationLost,
+    Mode,
+    Paced,
+    Preflight,
+    PreflightRefused,
+    ReportingFilters,
+    Sample,
+    quantile,
+)
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
-from drivers.preflight import ACCEPTED_BY, ANY_CLIENT, NO_WATCHDOG_FLAG, NOTHING_STOPS_IT, SHARED_FLAG
-from tdhil.recording.recording import LagPrior
+from tdhil.recording import LagPrior
 from tdhil.run.excitation import excitation_kind
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
@@ -192,7 +204,7 @@ def configuration(preflight: Preflight) -> dict[str, Any]:
     return {} if preflight.watched else {"watchdog": {"armed": False, "accepted_by": NO_WATCHDOG_FLAG}}
 
 
-def warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+def precondition_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
     """For the result, from the log's configuration: the same live and replayed."""
     found = run.get("watchdog")
     if not isinstance(found, Mapping):

@@ -9,11 +9,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 
-from drivers.drive import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, Sample, Timed
-from drivers.errors import PreflightRefused
+from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from tdhil.errors import Interrupted
-from tdhil.recording.recording import Excitation, LagPrior, Ramp
-from tdhil.recording.run_log import RunLog
+from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
 from tdhil.run.control_loop import ControlLoop
@@ -34,12 +32,19 @@ from tdhil.run.settings import StopRequest
 from tdhil.run.speed_check import Onlooker
 from tdhil.run.stage_log import StageBook
 from tdhil.run.stage_planner import StagePlanner
-from tdhil.run.stages.acquire import run_plan
-from tdhil.run.stages.brake_test import NOT_YET, slow_down
-from tdhil.run.stages.hold import MeanSpeedControl, run_hold
-from tdhil.run.stages.setup import measure_offsets, probe_sign
-from tdhil.run.stages.speed import SpeedResult, run_speed
-from tdhil.run.stages.torque import TorqueResult, run_torque
+from tdhil.run.stages import (
+    NOT_YET,
+    MeanSpeedControl,
+    SpeedResult,
+    TorqueResult,
+    measure_offsets,
+    probe_sign,
+    run_hold,
+    run_plan,
+    run_speed,
+    run_torque,
+    slow_down,
+)
 from tdhil.run.stop import StopReport, StopSequence
 from tdhil.run.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
 

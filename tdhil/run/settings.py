@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from tdhil.config.registry import DEFAULT_EXCITATION
+from tdhil.config import DEFAULT_EXCITATION
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, NoReturn
 
-from drivers.drive import Command, Mode, Positioned, PositionReading, Sample
-from drivers.errors import PreflightRefused
+from drivers import Command, Mode, Positioned, PositionReading, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.task import ConfirmSpeed, Say, nobody_sees
@@ -488,7 +487,7 @@ class SpeedLook:
         self._loop.log.event(self._loop.now_s, "probe", text)
 
 
-def warnings(run: Any) -> tuple[str, ...]:
+def speed_warnings(run: Any) -> tuple[str, ...]:
     """For the result, from the log's configuration: the same live and replayed."""
     found = run.get("speed_unit")
     if not isinstance(found, dict):

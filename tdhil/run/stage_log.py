@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from drivers.drive import Counters, Drive, Preflight, Rehearsed, Telling
-from tdhil.recording.recording import Stage
-from tdhil.recording.run_log import RunLog
+from drivers import Counters, Drive, Preflight, Rehearsed, Telling
+from tdhil.recording import RunLog, Stage
 from tdhil.run import preconditions
 from tdhil.run.task import Display, Say
 
@@ -29,7 +28,7 @@ def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None
             say(f"on the drive's bus: {line}")
 
 
-def warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+def stage_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
     """For the result, from the log's configuration: the same live and replayed."""
     found = run.get("others")
     return tuple(f"on the drive's bus: {line}" for line in found) if isinstance(found, list) else ()

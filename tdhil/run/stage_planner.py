@@ -6,11 +6,9 @@ import math
 from functools import partial
 from typing import Any
 
-from drivers.drive import Command, Mode
-from drivers.errors import LimitHit, PreflightRefused
-from tdhil.estimation.samples import Samples
-from tdhil.recording.recording import FloatArray, LagPrior, SteppedSetpoint
-from tdhil.recording.run_log import RunLog
+from drivers import Command, LimitHit, Mode, PreflightRefused
+from tdhil.estimation import Samples
+from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.run import excitation
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
@@ -19,7 +17,7 @@ from tdhil.run.excitation import Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.run.guard import Guard
 from tdhil.run.planning import Planned, as_followed, plan_acquisition
 from tdhil.run.settings import ExcitationRequest
-from tdhil.run.stages.speed import Course, SpeedResult
+from tdhil.run.stages import Course, SpeedResult
 from tdhil.run.task import Display, Say, Task
 
 RESERVE_S = 30.0

@@ -32,8 +32,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.drive import Command, Drive, Mode, Polled, PowerState, Sample, StopsFeeding
-from drivers.errors import CommandRejected, StopNotConfirmed
+from drivers import Command, CommandRejected, Drive, Mode, Polled, PowerState, Sample, StopNotConfirmed, StopsFeeding
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.string_release import MEAN_S, StringRelease, StringReleaseLimits

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from drivers.drive import Command, Identity, Preflight, Sample
-from drivers.errors import PreflightRefused
-from tdhil.recording.recording import Stage
+from drivers import Command, Identity, Preflight, PreflightRefused, Sample
+from tdhil.recording import Stage
 from tdhil.run.excitation import Plan, SwingPlan
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.run.stop import StopReport

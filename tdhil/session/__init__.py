@@ -1,1 +1,65 @@
 """One run, from what was asked for to a closed log: which drive, who confirms, where the files go."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.session.buses import (
+        ModbusConfig as ModbusConfig, SettingsRefused as SettingsRefused, link_report as link_report,
+        open_bus as open_bus, open_can as open_can, open_line as open_line, open_wire as open_wire,
+        rated_torque_nm as rated_torque_nm,
+    )
+    from tdhil.session.conclusion import conclude as conclude
+    from tdhil.session.confirm import AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant
+    from tdhil.session.connection import (
+        Connection as Connection, PeerPlan as PeerPlan, can_torque as can_torque, connection_of as connection_of,
+        rated_torque_is_told_by_hand as rated_torque_is_told_by_hand, simulated_canopen as simulated_canopen,
+    )
+    from tdhil.session.consent import (
+        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
+        is_accepted as is_accepted,
+    )
+    from tdhil.session.log_place import (
+        check_different_files as check_different_files, check_log_path as check_log_path, make_room as make_room,
+    )
+    from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
+    from tdhil.session.plan_ahead import (
+        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_dry as plan_dry,
+        refuse_hopeless as refuse_hopeless,
+    )
+    from tdhil.session.recorded import (
+        RunRecord as RunRecord, is_log as is_log, read as read, stated_lags as stated_lags,
+    )
+    from tdhil.session.run_session import (
+        Attendant as Attendant, Consent as Consent, RunRequest as RunRequest, RunSession as RunSession,
+    )
+    from tdhil.session.stop_signals import stop_on_signals as stop_on_signals
+    from tdhil.session.task import (
+        bench_of as bench_of, excitation_request as excitation_request, facts as facts,
+        machine_limits as machine_limits, suited as suited,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "buses": (
+                "ModbusConfig", "SettingsRefused", "link_report", "open_bus", "open_can", "open_line", "open_wire",
+                "rated_torque_nm",
+            ),
+            "conclusion": ("conclude",),
+            "confirm": ("AskingAttendant", "TerminalAttendant"),
+            "connection": (
+                "Connection", "PeerPlan", "can_torque", "connection_of", "rated_torque_is_told_by_hand",
+                "simulated_canopen",
+            ),
+            "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
+            "log_place": ("check_different_files", "check_log_path", "make_room"),
+            "opening": ("open_drive", "plan_peer", "with_faults"),
+            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry", "refuse_hopeless"),
+            "recorded": ("RunRecord", "is_log", "read", "stated_lags"),
+            "run_session": ("Attendant", "Consent", "RunRequest", "RunSession"),
+            "stop_signals": ("stop_on_signals",),
+            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "suited"),
+        },
+    )

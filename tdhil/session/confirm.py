@@ -11,15 +11,11 @@ from contextlib import contextmanager
 
 from rich.console import Console
 
-from drivers.drive import Preflight
-from drivers.errors import PreflightRefused
-from drivers.preflight import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT
+from drivers import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT, Preflight, PreflightRefused
+from profiles import visible
 from profiles.quantities import RPM
-from profiles.visible import visible
-from tdhil.report.card import minutes
-from tdhil.report.live import LiveDisplay
-from tdhil.run.settings import ExcitationRequest, MachineLimits
-from tdhil.run.task import Display, Idle, Task
+from tdhil.report import LiveDisplay, minutes
+from tdhil.run import Display, ExcitationRequest, Idle, MachineLimits, Task
 
 WORD = "MOVE"
 SPEED_FLAG = "--accept-speed-unit"

@@ -8,17 +8,16 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from drivers.errors import DataFileError, Problem
-from profiles.library import Profile, load_canopen_profile, load_modbus_profile, load_profile
+from drivers import DataFileError, Problem
+from profiles import Profile, load_canopen_profile, load_modbus_profile, load_profile
 from profiles.modbus import ModbusProfile
-from tdhil.config.options import Origin, RunOptions, Setting
+from tdhil.config import Origin, RunOptions, Setting
 from tdhil.errors import UsageError
-from tdhil.session.buses.can_bus import BusConfig, bus_config
-from tdhil.session.buses.modbus_line import ModbusConfig, asked_for, modbus_config
+from tdhil.session.buses import BusConfig, ModbusConfig, asked_for, bus_config, modbus_config
 
 if TYPE_CHECKING:
-    from profiles.library import Profile
-    from tdhil.config.rig import Rig
+    from profiles import Profile
+    from tdhil.config import Rig
 
 MODBUS_PROFILE = "generic/modbus"
 """Worn and spoken where nobody names another; for CANopen it is `tdhil.config.options`' default."""

@@ -9,9 +9,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterable
 
-from drivers.errors import PreflightRefused
-from profiles.entry import Entry
-from profiles.library import Profile
+from drivers import PreflightRefused
+from profiles import Entry, Profile
 from tdhil.errors import UsageError
 
 ALL_LIKELY = "likely"

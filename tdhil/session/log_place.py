@@ -65,7 +65,7 @@ class LogPlace:
 
 def check_log_path(path: Path, where: str = "--log") -> None:
     """UsageError for a file that is no log: it would be moved aside by mistake."""
-    from tdhil.recording.mcap_container import MAGIC
+    from tdhil.recording import MAGIC
 
     if not path.is_file() or path.suffix == ".mcap":
         return
@@ -75,7 +75,7 @@ def check_log_path(path: Path, where: str = "--log") -> None:
     raise UsageError("is no log; it is left as it is", where=f"{where} {path}", next_step="Name another, as run.mcap")
 
 
-def check_names(paths: Mapping[str, Path | None]) -> None:
+def check_different_files(paths: Mapping[str, Path | None]) -> None:
     """UsageError where two of the files that a run reads or writes are the same one; by option."""
     seen: dict[Path, str] = {}
     for option, path in paths.items():
@@ -127,7 +127,7 @@ def _dated(path: Path, time_s: float) -> Path:
 def _is_stub(path: Path) -> bool:
     """Does an older log hold no motion either?"""
     from tdhil.errors import LogError
-    from tdhil.recording.log_reader import read_run
+    from tdhil.recording import read_run
 
     with suppress(OSError, LogError):
         return path.stat().st_size < _LARGEST_STUB and not any(

@@ -5,19 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from drivers.drive import Identity
-from drivers.errors import PreflightRefused
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import Rig, simulated_default_rig
+from drivers import Identity, PreflightRefused
+from tdhil.config import Rig, RunOptions, simulated_default_rig
 from tdhil.session.task import bench_of, excitation_request, lag_prior, machine_limits
 
 if TYPE_CHECKING:
 
-    from tdhil.run import excitation
-    from tdhil.run.design import Knowledge
+    from tdhil.run import Knowledge, MachineLimits, Planned, excitation
     from tdhil.run.excitation import RigGuess
-    from tdhil.run.planning import Planned
-    from tdhil.run.settings import MachineLimits
 
 
 SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
@@ -44,9 +39,8 @@ def plan_dry(
     options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
 ) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
     """The plan, what it rests on, and the machine's limits."""
+    from tdhil.run import plan_acquisition, refuse_by_plan
     from tdhil.run.excitation import PlanRefused
-    from tdhil.run.planning import plan_acquisition
-    from tdhil.run.preconditions import refuse_by_plan
 
     bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
     limits = machine_limits(bench)
@@ -69,7 +63,7 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> N
 
     Nothing is known of the shaft yet, nor whether it is a simulated one, whose limits need not be given.
     """
-    from tdhil.run import planning
+    from tdhil.run import refuse_hopeless as refuse_hopeless_plan
     from tdhil.run.excitation import PlanRefused
 
     bench = simulated_default_rig(rig)
@@ -77,7 +71,7 @@ def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> N
     modes = (options.mode,) if options.mode else ("torque", "speed") if can_torque else ("speed",)
     guess, known, _ = _assumed(bench, limits)
     try:
-        planning.refuse_hopeless(excitation_request(options), modes, _room(options, limits), guess, known)
+        refuse_hopeless_plan(excitation_request(options), modes, _room(options, limits), guess, known)
     except PlanRefused as error:
         raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step) from error
 
@@ -95,9 +89,7 @@ def _mode(options: RunOptions, can_torque: bool) -> str:
 
 def _room(options: RunOptions, limits: MachineLimits) -> excitation.MachineLimits:
     """What a plan may use of the limits at the rate that was asked for."""
-    from tdhil.run import excitation
-    from tdhil.run.guard import Guard
-    from tdhil.run.settings import ControlAssumptions
+    from tdhil.run import ControlAssumptions, Guard, excitation
 
     assumptions = ControlAssumptions()
     if options.rate_hz:
@@ -109,7 +101,7 @@ def _room(options: RunOptions, limits: MachineLimits) -> excitation.MachineLimit
 
 def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tuple[Figure, ...]]:
     """The rig, its noise and its lags, and what each of them rests on."""
-    from tdhil.run.design import Knowledge, assumed_noise
+    from tdhil.run import Knowledge, assumed_noise
 
     guess, figures = _guess(bench, limits)
     stated = bench.expected.load_noise_nm

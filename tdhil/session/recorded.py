@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from tdhil.recording.recording import LagPrior, Recording
-    from tdhil.recording.run_log import Ended
+    from tdhil.recording import Ended, LagPrior, Recording
 
 _REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
 """Exit codes of a run that tell of the run; the others tell of the process that it was."""
@@ -46,7 +45,7 @@ class RunRecord:
     @property
     def whole(self) -> bool:
         """Did the run come to its end, and all of it into the log?"""
-        from tdhil.recording.recording import aborted_stage
+        from tdhil.recording import aborted_stage
 
         return self.recording.complete and aborted_stage(self.recording) is None
 
@@ -147,7 +146,7 @@ def read(
 
 def is_log(path: Path) -> bool:
     """Tell MCAP by its first bytes, also if there are no more than some of them. Raises NothingRecoverable."""
-    from tdhil.recording.mcap_container import MAGIC
+    from tdhil.recording import MAGIC
 
     try:
         with path.open("rb") as file:
@@ -162,7 +161,7 @@ def stated_lags(
     source: str = "",
 ) -> LagPrior:
     """Reporting lags as somebody states them; without a deviation it is a tenth."""
-    from tdhil.recording.recording import LagPrior
+    from tdhil.recording import LagPrior
     from tdhil.session.task import UNKNOWN_LAG_SD_SHARE
 
     def deviation(lag_s: float | None, stated_s: float | None) -> float:
@@ -178,8 +177,7 @@ def stated_lags(
 
 
 def _read_log(path: Path) -> RunRecord:
-    from tdhil.recording.log_reader import read_run
-    from tdhil.recording.run_log import find_ended
+    from tdhil.recording import find_ended, read_run
 
     try:
         found = read_run(path)
@@ -197,9 +195,7 @@ def _read_trace(
     path: Path, columns: Sequence[str] | None, excitation: str | Path | None, rated_torque_nm: float | None,
     torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None, lags: LagPrior | None,
 ) -> RunRecord:
-    from tdhil.recording.csv.layout import USUAL, parse_columns
-    from tdhil.recording.csv.reader import Bench, read_recording
-    from tdhil.recording.recording import LagPrior
+    from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
     from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
 
     bench = Bench(

@@ -13,25 +13,22 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import Rig
+from tdhil.config import Rig, RunOptions
 from tdhil.errors import LogError
-from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.run_log import RunLog
-from tdhil.run.runner import Runner
-from tdhil.run.task import Display, Idle, RunOutcome, Task
+from tdhil.recording import RunLog, RunWriter
+from tdhil.run import Display, Idle, Runner, RunOutcome, Task
 from tdhil.session.connection import Connection, PeerPlan
 from tdhil.session.consent import accepted_lines, note, require_accepted
 from tdhil.session.log_place import LogPlace
-from tdhil.session.open_drive import open_drive
+from tdhil.session.opening import open_drive
 from tdhil.session.real_time import real_time_priority
 from tdhil.session.stop_signals import stop_on_signals
 from tdhil.session.task import bench_of, excitation_request, facts, machine_limits
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
-    from drivers.drive import Identity, Preflight
-    from tdhil.session.conclude import Conclusion
+    from drivers import Identity, Preflight
+    from tdhil.session.conclusion import Conclusion
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,7 @@ class RunSession:
 
     def conclude(self) -> Conclusion:
         """Identify from what was recorded, and put the result into the log."""
-        from tdhil.session.conclude import conclude
+        from tdhil.session.conclusion import conclude
 
         found = conclude(self.log.recording(complete=True), self.log.run, str(self.path))
         with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
@@ -227,12 +224,14 @@ def load_what_the_end_needs(report: bool) -> None:
     import scipy.stats  # noqa: F401
     from rich.console import Console
 
-    from tdhil.estimation import identify  # noqa: F401
-    from tdhil.estimation.result import Verdict  # noqa: F401
-    from tdhil.report import card, document, html  # noqa: F401
-    from tdhil.session import conclude  # noqa: F401
+    from tdhil.estimation import (
+        Verdict,  # noqa: F401
+        identify,  # noqa: F401
+    )
+    from tdhil.report import card_text, result_document, write_report  # noqa: F401
+    from tdhil.session import conclusion  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners when it needs them
     if report:
-        from tdhil.report import page, plots  # noqa: F401
+        from tdhil.report import draw_run, require_extra  # noqa: F401

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from tdhil.run.settings import StopRequest
+from tdhil.run import StopRequest
 
 if TYPE_CHECKING:
     pass

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from drivers.drive import Identity
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import Rig, require_limits, simulated_default_rig
-from tdhil.recording.recording import LagPrior
-from tdhil.run.settings import ExcitationRequest, MachineLimits
+from drivers import Identity
+from tdhil.config import Rig, RunOptions, require_limits, simulated_default_rig
+from tdhil.recording import LagPrior
+from tdhil.run import ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Limits of the embedded simulated rig where a plant.yaml hangs a drill string on it and no rig.yaml names any.
@@ -30,7 +29,7 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
     """``rig`` as it is, unless ``plant`` (`sim_bus.params.RigParams`) can be wound up and ``rig`` has no limits."""
     if plant is None or (rig is not None and rig.limits is not None):
         return rig
-    from sim_bus.plant.kinds import PLANTS
+    from sim_bus.plant import PLANTS
 
     if not PLANTS[plant.plant.kind].winds_up:
         return rig

@@ -24,8 +24,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
 
-from tdhil.report import page
-from tdhil.report.page import STYLE
+from tdhil.report import STYLE, install_command, repeatable_figures
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -95,7 +94,7 @@ class StudyBar:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-INSTALL = f"no pictures without matplotlib; install it with: {page.install_command()}"
+INSTALL = f"no pictures without matplotlib; install it with: {install_command()}"
 DPI = 120
 
 
@@ -185,7 +184,7 @@ def _pictures(outcome: StudyOutcome, folder: Path) -> tuple[Path, Path]:
 
     assert outcome.draw is not None
     png, svg = folder / f"{outcome.name}.png", folder / f"{outcome.name}.svg"
-    with page.repeatable_figures():
+    with repeatable_figures():
         figure = Figure(figsize=outcome.figure_size_in)
         FigureCanvasAgg(figure)
         outcome.draw(figure)

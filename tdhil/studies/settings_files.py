@@ -20,12 +20,9 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError, create_model
 
-from profiles.errors import DataFileError, Problem
-from profiles.model import DataModel
-from profiles.yaml_loader import load_model, load_with_lines, messages_of
-from profiles.yaml_tree import read_tree
+from profiles import DataFileError, DataModel, Problem, load_model, load_with_lines, messages_of, read_tree
 from tdhil.errors import UsageError
-from tdhil.studies.paper.loop import SYMBOLS, full_name
+from tdhil.studies.paper import SYMBOLS, full_name
 from tdhil.studies.study import Study
 
 M = TypeVar("M", bound=BaseModel)

@@ -15,7 +15,7 @@ from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
 from tdhil.run.stop import StopReport
 from tdhil.run.task import RunOutcome
-from tdhil.session.conclude import Conclusion
+from tdhil.session.conclusion import Conclusion
 from tdhil.session.stop_signals import stop_on_signals
 
 REST = StopReport(True, 12.25, True)
@@ -45,7 +45,7 @@ def ends(monkeypatch, tmp_path, capsys):
             return Conclusion(None, {"verdict": "as the test has it"}, verdict)
 
         monkeypatch.setattr("tdhil.session.run_session.Runner", Fake)
-        monkeypatch.setattr("tdhil.session.conclude.conclude", conclude)
+        monkeypatch.setattr("tdhil.session.conclusion.conclude", conclude)
         monkeypatch.setattr("tdhil.cli.results.print_result", lambda document, _: print(json.dumps(document)))
         code = main(["identify", "--simulate", "--seed", "1", *arguments])
         said = capsys.readouterr()

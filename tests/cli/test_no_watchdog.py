@@ -65,10 +65,10 @@ def test_where_none_is_armed_nobody_is_told_that_it_acts() -> None:
     other = DriveFault("EMCY 7305h", next_step="Mend the sensor")
     preconditions.correct(other, found)
     assert other.next_step == "Mend the sensor"
-    assert len(preconditions.warnings(preconditions.configuration(found))) == 1
+    assert len(preconditions.precondition_warnings(preconditions.configuration(found))) == 1
 
 
 @pytest.mark.parametrize("run", [{}, {"watchdog": None}, {"watchdog": 3}, {"watchdog": {"armed": True}},
                                  {"watchdog": {"armed": 0}}, {"watchdog": ["armed"]}])
 def test_a_log_that_does_not_say_so_warns_of_nothing(run: dict[str, object]) -> None:
-    assert preconditions.warnings(run) == ()
+    assert preconditions.precondition_warnings(run) == ()

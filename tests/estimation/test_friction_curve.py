@@ -8,7 +8,7 @@ from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
 from sim_bus.plant.rigid import Params
 from tdhil.estimation import Options
-from tdhil.estimation.cross_checks.friction_curve import FrictionCurve, Inertia, friction_curve
+from tdhil.estimation.cross_checks.friction_by_speed import FrictionCurve, Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum_fit import Delay
 from tdhil.estimation.frequency_domain.friction_levels import Levels, measure_levels
 from tdhil.estimation.frequency_domain.spectrum import period_lines

@@ -279,7 +279,7 @@ def test_taken_by_name_nobody_is_asked(made, bus):
     limits = replace(LIMITS, accept_speed_unit=True)
     assert isinstance(rig.run(simulated=False, limits=limits).cause, Enough)
     assert rig.log.run["speed_unit"]["seen_by"] == "--accept-speed-unit"
-    (warning,) = speed_check.warnings(rig.log.run)
+    (warning,) = speed_check.speed_warnings(rig.log.run)
     assert "--accept-speed-unit" in warning
 
 
@@ -323,7 +323,7 @@ def test_a_right_unit_is_seen_to_be_right_without_a_pause(made, bus):
         one.log.on = True
         assert isinstance(one.run().cause, Enough)
     assert rig.log.run["speed_unit"]["ratio"] == pytest.approx(1.0, abs=0.005)
-    assert speed_check.warnings(rig.log.run) == ()
+    assert speed_check.speed_warnings(rig.log.run) == ()
     # No cycle of its own; on Modbus its requests take time on the line, which shifts the noise.
     assert rig.log.cycles == pytest.approx(plain.log.cycles, abs=0 if bus is canopen else 20)
 

@@ -12,7 +12,7 @@ import pytest
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.recording.log_reader import read_run
-from tdhil.session.conclude import conclude
+from tdhil.session.conclusion import conclude
 from tests.path.path_runs import QUICK, clean_environment
 
 FULL = "/dev/full"

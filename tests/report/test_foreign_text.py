@@ -12,7 +12,7 @@ from rich.table import Table
 
 from drivers.drive import Check, Identity, Outcome, Preflight
 from drivers.errors import PreflightRefused
-from profiles.visible import visible
+from profiles.visible_text import visible
 from tdhil.cli.main import main
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table

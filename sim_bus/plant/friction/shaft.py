@@ -4,7 +4,7 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from profiles.model import NonNegative, Positive, Validated, refuse_if
+from profiles import NonNegative, Positive, Validated, refuse_if
 
 
 class Shaft(Validated):

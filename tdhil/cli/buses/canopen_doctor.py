@@ -6,16 +6,10 @@ import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from drivers.canopen.bus import CanLink
-from drivers.canopen.limits import check_parameters
-from drivers.canopen.preflight import find_units
-from drivers.canopen.sdo import Objects, name
-from drivers.canopen.state_machine import State, decode
-from drivers.clock import MonotonicClock
-from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.preflight import NO_WATCHDOG_FLAG, Table
+from drivers import NO_WATCHDOG_FLAG, CommunicationLost, MonotonicClock, ObjectRefused, Table
+from drivers.canopen import CanLink, Objects, State, check_parameters, decode, find_units, name
+from profiles import MARKER_INDEX, MARKER_TEXT
 from profiles.canopen import CanopenProfile
-from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
 from tdhil.cli.finding import Finding, Grade, bad, note, of_check, ok
 
 if TYPE_CHECKING:

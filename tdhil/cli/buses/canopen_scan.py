@@ -12,14 +12,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
-from drivers.canopen.bus import CanLink
-from drivers.canopen.sdo import Objects
-from drivers.clock import MonotonicClock
-from drivers.errors import CommunicationLost, ObjectRefused
+from drivers import CommunicationLost, MonotonicClock, ObjectRefused
+from drivers.canopen import CanLink, Objects
+from profiles import MARKER_INDEX, MARKER_TEXT, load_profile, profile_names, visible
 from profiles.canopen import CanopenProfile
-from profiles.library import load_profile, profile_names
-from profiles.simulator_marker import MARKER_INDEX, MARKER_TEXT
-from profiles.visible import visible
 from tdhil.cli.found_drive import FoundDrive
 
 if TYPE_CHECKING:

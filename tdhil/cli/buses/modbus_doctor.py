@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from drivers.drive import PowerState
-from drivers.errors import ObjectRefused
-from drivers.modbus.access import Access
-from drivers.modbus.codec import settle
-from drivers.modbus.identity import read_marker
-from drivers.modbus.link import Link
-from drivers.modbus.parameters import check_name_plate, check_required, find_filters, find_rated_torque, read_parameters
-from drivers.modbus.state_machine import decode, power_state, seen
-from drivers.preflight import NO_WATCHDOG_FLAG, Table
+from drivers import NO_WATCHDOG_FLAG, ObjectRefused, PowerState, Table
+from drivers.modbus import (
+    Access,
+    Link,
+    check_name_plate,
+    check_required,
+    decode,
+    find_filters,
+    find_rated_torque,
+    power_state,
+    read_marker,
+    read_parameters,
+    seen,
+    settle,
+)
 from profiles.modbus import ModbusProfile, Parameter
 from tdhil.cli.finding import Finding, bad, note, of_check, ok
 from tdhil.cli.profile_text import RegisterUse, register_uses, unit_text, watchdog_text

@@ -8,28 +8,31 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from drivers.clock import Clock, MonotonicClock, SteppedClock
-from drivers.errors import CommunicationLost, PreflightRefused
-from drivers.modbus.access import Access
-from drivers.modbus.codec import from_words, settle
-from drivers.modbus.identity import read_marker
-from drivers.modbus.link import Link
-from drivers.modbus.parameters import Parameters, check_name_plate, find_rated_torque
-from drivers.modbus.pdu import READ_HOLDING, READ_INPUT, BadReply, NoReply, read
-from drivers.preflight import Table
-from profiles.library import load_profile, profile_names
+from drivers import Clock, CommunicationLost, MonotonicClock, PreflightRefused, SteppedClock, Table
+from drivers.modbus import (
+    READ_HOLDING,
+    READ_INPUT,
+    Access,
+    BadReply,
+    Link,
+    NoReply,
+    Parameters,
+    check_name_plate,
+    find_rated_torque,
+    from_words,
+    read,
+    read_marker,
+    settle,
+)
+from profiles import load_profile, profile_names, visible
 from profiles.modbus import ModbusProfile, Register
-from profiles.visible import visible
 from tdhil.cli.found_drive import FoundDrive
 from tdhil.cli.profile_text import register_uses
-from tdhil.config.options import Origin, Setting
-from tdhil.config.rig import DriveData
-from tdhil.session.buses.modbus import SettingsRefused, open_line
-from tdhil.session.buses.modbus_line import ModbusConfig
-from tdhil.session.connection import Connection
+from tdhil.config import DriveData, Origin, Setting
+from tdhil.session import Connection, ModbusConfig, SettingsRefused, open_line
 
 if TYPE_CHECKING:
-    from tdhil.session.connection import PeerPlan
+    from tdhil.session import PeerPlan
 
 
 # ---------------------------------------------------------------------------------------------------------------------

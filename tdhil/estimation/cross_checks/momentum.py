@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.config.registry import has_plateaus
+from tdhil.config import has_plateaus
 from tdhil.estimation.samples import Samples
-from tdhil.recording.recording import BoolArray, FloatArray, Recording, Segment
+from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Where a run stood calm, and where it coasted: read off half-second means of what was reported, whoever ran it.

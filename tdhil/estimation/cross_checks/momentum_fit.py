@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 
 from tdhil.estimation.cross_checks.momentum import Balances, Kind, Row, overlap_s
-from tdhil.estimation.frequency_domain.inference import student_quantile
-from tdhil.recording.recording import FloatArray
+from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01
 _LEAST_DOF = 3.0

@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.config.registry import has_plateaus
+from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
+from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum import Balances, Kind, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
     UNKNOWN_DELAY,
@@ -27,10 +27,10 @@ from tdhil.estimation.cross_checks.momentum_fit import (
     Resolution,
     fit_momentum,
 )
-from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, SecondOpinion
 from tdhil.estimation.samples import Samples
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.recording import FloatArray, Recording
 
 _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion

@@ -26,7 +26,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.estimation.result import Estimate, ResidualTest
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Where the descents of a compliant shaft begin: linear least squares over a grid of resonances.

@@ -33,7 +33,7 @@ from tdhil.estimation.frequency_domain.optimiser import (
     rough_inertia_of,
 )
 from tdhil.estimation.frequency_domain.signal_filters import AVERAGE, SPEED_SHAPE, TORQUE_SHAPE
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # where the whole family's descents begin, besides the first-order fit itself
 _SHAPES = ((SPEED_SHAPE, 0.25), (TORQUE_SHAPE, 0.25), (AVERAGE, 0.1), (AVERAGE, -0.1))

@@ -20,7 +20,7 @@ import numpy as np
 
 from tdhil.estimation.frequency_domain.spectrum import PeriodLines
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.recording.recording import FloatArray, Level
+from tdhil.recording import FloatArray, Level
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Friction that changes during the run: as bearings and oil warm up, or as the torque's zero wanders.

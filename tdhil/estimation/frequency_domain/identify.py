@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.estimation.case import Case, Finding, PeriodicCase
-from tdhil.estimation.cross_checks.friction_curve import Inertia, friction_curve
+from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
 from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
@@ -29,7 +29,7 @@ from tdhil.estimation.frequency_domain.shafts import shaft_model
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.estimation.result import Refusal, Refused
 from tdhil.estimation.samples import Stretch, log_warnings, stretches
-from tdhil.recording.recording import Excitation
+from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1
 _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing

@@ -17,7 +17,7 @@ from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, minimis
 from tdhil.estimation.frequency_domain.shafts import INERTIA
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import BudgetLine, Estimate, InertiaEstimate, ResidualTest
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Do the residuals look like the scatter between periods? If not, the model is wrong, and so would its number be.

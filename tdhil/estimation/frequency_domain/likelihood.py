@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 
 @dataclass(frozen=True)

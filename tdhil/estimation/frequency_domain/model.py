@@ -8,7 +8,7 @@ import numpy as np
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.shafts import RigidShaft, Shaft
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of,
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines
 from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest
-from tdhil.recording.recording import FloatArray, Segment
+from tdhil.recording import FloatArray, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The shapes that friction over speed may have besides its straight line.

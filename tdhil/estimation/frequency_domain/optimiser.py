@@ -16,7 +16,7 @@ import numpy as np
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
-from tdhil.recording.recording import BoolArray, FloatArray
+from tdhil.recording import BoolArray, FloatArray
 
 Linearised = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Residuals = Callable[[FloatArray], FloatArray]

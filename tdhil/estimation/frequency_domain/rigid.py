@@ -33,7 +33,7 @@ from tdhil.estimation.frequency_domain.signal_filters import (
 )
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.estimation.result import BudgetLine, Estimate, LinePoint, Refusal, ResidualTest
-from tdhil.recording.recording import LagPrior
+from tdhil.recording import LagPrior
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Can these lines tell the inertia at all? Count equations and unknowns before fitting.

@@ -10,9 +10,9 @@ from typing import Protocol
 
 import numpy as np
 
-from tdhil.config.registry import MODELS, load
+from tdhil.config import MODELS, load
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Two masses on a torsion spring, seen from the motor (the paper's figure 7, which it draws and then drops).

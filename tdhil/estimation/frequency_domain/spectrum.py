@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The speed at the two ends of a period, from which its net change is told (why that is needed: `spectrum`).

@@ -16,7 +16,7 @@ import numpy as np
 
 from tdhil.estimation.time_domain.taylor import ComplexArray, exponential, polynomial, product
 from tdhil.estimation.time_domain.windows import Bins
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, SPEED_SHAPE, TORQUE_SHAPE, FORWARD, BACK, BEND = range(10)
 PARAMETERS = 10

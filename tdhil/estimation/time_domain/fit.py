@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.model import GaussianPrior
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit
-from tdhil.estimation.frequency_domain.signal_filters import LAG_BOUND_S, SKEW_BOUND_S
+from tdhil.estimation.frequency_domain import LAG_BOUND_S, SKEW_BOUND_S, Box, Fit, GaussianPrior
 from tdhil.estimation.time_domain.equation import (
     BACK,
     FORWARD,
@@ -28,7 +26,7 @@ from tdhil.estimation.time_domain.equation import (
 )
 from tdhil.estimation.time_domain.taylor import ComplexArray
 from tdhil.estimation.time_domain.windows import Bins
-from tdhil.recording.recording import BoolArray, FloatArray
+from tdhil.recording import BoolArray, FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # How loud the noise is at each frequency, from what the fit leaves over.

@@ -10,17 +10,20 @@ from typing import NoReturn
 import numpy as np
 
 from tdhil.estimation.case import Case, Finding, Words
-from tdhil.estimation.frequency_domain.inference import torque_scale_line
-from tdhil.estimation.frequency_domain.model import GaussianPrior
-from tdhil.estimation.frequency_domain.rigid import lag_priors
-from tdhil.estimation.frequency_domain.shafts import shaft_model
-from tdhil.estimation.frequency_domain.signal_filters import LAG_BOUND_S, SKEW_BOUND_S
+from tdhil.estimation.frequency_domain import (
+    LAG_BOUND_S,
+    SKEW_BOUND_S,
+    GaussianPrior,
+    lag_priors,
+    shaft_model,
+    torque_scale_line,
+)
 from tdhil.estimation.result import Estimate, Options, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.solve import Solved, solve
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.recording import FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What kind of motion a record holds, in words: a refusal should name what is missing, not only that something is.

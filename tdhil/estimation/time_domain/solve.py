@@ -5,9 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.inference import profile_edge, student_quantile
-from tdhil.estimation.frequency_domain.model import GaussianPrior
-from tdhil.estimation.frequency_domain.optimiser import Fit
+from tdhil.estimation.frequency_domain import Fit, GaussianPrior, profile_edge, student_quantile
 from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest
 from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
@@ -26,7 +24,7 @@ from tdhil.estimation.time_domain.equation import (
 from tdhil.estimation.time_domain.fit import Problem, covariance, minimise, search
 from tdhil.estimation.time_domain.taylor import flat_top, times
 from tdhil.estimation.time_domain.windows import Bins, Window, seen_through
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Does any smooth response explain the bins better than the model? Then the model is wrong, and so may be its number.

@@ -7,7 +7,7 @@ truncated alike.
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Smooth windows with their derivatives: nothing is to be left at their ends, nor of their first three slopes.

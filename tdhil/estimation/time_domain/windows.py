@@ -18,7 +18,7 @@ import numpy as np
 
 from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.taylor import ORDERS, ComplexArray, flat_top
-from tdhil.recording.recording import BoolArray, FloatArray
+from tdhil.recording import BoolArray, FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Which parts of a record the equation holds in: turning one way, without holes.

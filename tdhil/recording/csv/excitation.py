@@ -17,11 +17,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from drivers.errors import DataFileError, Problem
-from profiles.model import DataModel, refuse_if
-from profiles.yaml_loader import load_with_lines
-from tdhil.config.registry import DEFAULT_EXCITATION, EXCITATIONS
-from tdhil.config.rig import Registered
+from drivers import DataFileError, Problem
+from profiles import DataModel, load_with_lines, refuse_if
+from tdhil.config import DEFAULT_EXCITATION, EXCITATIONS, Registered
 from tdhil.recording.recording import Excitation, FloatArray, Level, Segment
 
 _MOST_PERIODS = 100_000

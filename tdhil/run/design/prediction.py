@@ -16,13 +16,21 @@ from typing import Literal
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.friction_levels import Levels, tie_viscous
-from tdhil.estimation.frequency_domain.model import Model
-from tdhil.estimation.frequency_domain.rigid import RigidResult, fit_rigid, known_of, refuse_count
-from tdhil.estimation.frequency_domain.signal_filters import SPEED_LAG, TORQUE_LAG
-from tdhil.estimation.frequency_domain.spectrum import Line, period_lines
-from tdhil.estimation.samples import Samples, Stretch
-from tdhil.recording.recording import FloatArray, LagPrior, Segment
+from tdhil.estimation import Samples, Stretch
+from tdhil.estimation.frequency_domain import (
+    SPEED_LAG,
+    TORQUE_LAG,
+    Levels,
+    Line,
+    Model,
+    RigidResult,
+    fit_rigid,
+    known_of,
+    period_lines,
+    refuse_count,
+    tie_viscous,
+)
+from tdhil.recording import FloatArray, LagPrior, Segment
 from tdhil.run.excitation import Plan
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -33,12 +33,9 @@ from itertools import product
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.friction_levels import measure_levels, tie_viscous
-from tdhil.estimation.frequency_domain.spectrum import period_lines, pooled_lines
-from tdhil.estimation.identify import identify
-from tdhil.estimation.result import Options
-from tdhil.estimation.samples import stretches, usable_samples
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.estimation import Options, identify, stretches, usable_samples
+from tdhil.estimation.frequency_domain import measure_levels, period_lines, pooled_lines, tie_viscous
+from tdhil.recording import FloatArray, Recording
 from tdhil.run.design.prediction import LEAST_NU, Evidence, Fitted, fit, half_width, longer, noise_free, whole_periods
 
 LOOKS = 4                 # extensions at most

@@ -9,7 +9,13 @@ from tdhil.run.excitation.plan import (
     periodic_kind,
     settling_periods,
 )
-from tdhil.run.excitation.pulses import SwingKind, SwingPlan, Way, make_swings
+from tdhil.run.excitation.pulses import (
+    CALM_S,
+    SwingKind,
+    SwingPlan,
+    Way,
+    make_swings,
+)
 from tdhil.run.excitation.reference import (
     DriveMode,
     ExcitationKind,
@@ -21,10 +27,15 @@ from tdhil.run.excitation.reference import (
     excitation_kind,
     make_transition,
 )
-from tdhil.run.excitation.signals import PeriodicKind, Shape
+from tdhil.run.excitation.signals import (
+    PeriodicKind,
+    Shape,
+    unit_peak,
+)
 from tdhil.run.excitation.speed_loop import Following, fit_following, held_back_to
 
 __all__ = [
+    "CALM_S",
     "LEAST_COUNTED",
     "DriveMode",
     "ExcitationKind",
@@ -50,4 +61,5 @@ __all__ = [
     "make_transition",
     "periodic_kind",
     "settling_periods",
+    "unit_peak",
 ]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.config.registry import DEFAULT_EXCITATION
-from tdhil.recording.recording import Segment
+from tdhil.config import DEFAULT_EXCITATION
+from tdhil.recording import Segment
 from tdhil.run.excitation import signals
 from tdhil.run.excitation.reference import (
     DriveMode,

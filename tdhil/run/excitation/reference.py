@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from tdhil.config.registry import EXCITATIONS, load
+from tdhil.config import EXCITATIONS, load
 from tdhil.run.excitation.speed_loop import Following
 
 DriveMode = Literal["torque", "speed"]

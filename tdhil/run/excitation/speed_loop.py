@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 
 _GRID_S = 0.02
 _STARTS = ((1.0, 1.0, 0.3), (0.2, 0.6, 0.1), (0.1, 0.15, 0.01))    # b, a1, a2

@@ -1,1 +1,25 @@
 """The five stages of a run (section 5.1 of the paper), and the brake test that may come before the third."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.run.stages.acquire import run_plan as run_plan
+    from tdhil.run.stages.brake_test import NOT_YET as NOT_YET, slow_down as slow_down
+    from tdhil.run.stages.hold import MeanSpeedControl as MeanSpeedControl, run_hold as run_hold
+    from tdhil.run.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
+    from tdhil.run.stages.speed import Course as Course, SpeedResult as SpeedResult, run_speed as run_speed
+    from tdhil.run.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "acquire": ("run_plan",),
+            "brake_test": ("NOT_YET", "slow_down"),
+            "hold": ("MeanSpeedControl", "run_hold"),
+            "setup": ("measure_offsets", "probe_sign"),
+            "speed": ("Course", "SpeedResult", "run_speed"),
+            "torque": ("TorqueResult", "run_torque"),
+        },
+    )

@@ -10,12 +10,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from drivers.drive import Command, Mode, Sample
-from tdhil.recording.recording import Excitation, Segment
+from drivers import Command, Mode, Sample
+from tdhil.recording import Excitation, Segment
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
-from tdhil.run.excitation import Plan, PlannedSegment, RigGuess
-from tdhil.run.excitation.pulses import CALM_S, SwingPlan, Way
+from tdhil.run.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SwingPlan, Way
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.hold import MeanSpeedControl
 

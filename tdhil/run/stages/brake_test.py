@@ -17,8 +17,7 @@ from enum import Enum
 
 import numpy as np
 
-from drivers.drive import Command, Mode, Sample
-from drivers.errors import PreflightRefused
+from drivers import Command, Mode, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.drive import Command, Mode
-from drivers.errors import LimitHit
+from drivers import Command, LimitHit, Mode
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from drivers.drive import Command, Mode
-from drivers.errors import LimitHit, PreflightRefused
+from drivers import Command, LimitHit, Mode, PreflightRefused
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import MachineLimits
 from tdhil.run.stages.steady import trace

@@ -11,11 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.drive import Command, Mode, Sample
-from drivers.errors import DriveFault
-from tdhil.estimation.rough_inertia import RoughInertia, rough_inertia
-from tdhil.estimation.samples import Samples
-from tdhil.recording.recording import FloatArray, Level, Ramp
+from drivers import Command, DriveFault, Mode, Sample
+from tdhil.estimation import RoughInertia, Samples, rough_inertia
+from tdhil.recording import FloatArray, Level, Ramp
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits

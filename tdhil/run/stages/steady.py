@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.drive import Command, Sample
-from drivers.errors import LimitHit
-from tdhil.recording.recording import FloatArray, Level
+from drivers import Command, LimitHit, Sample
+from tdhil.recording import FloatArray, Level
 from tdhil.run.control_loop import ControlLoop
 
 

@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.drive import Command, Mode, Sample
-from tdhil.estimation.rough_inertia import RoughInertia, rough_inertia
-from tdhil.recording.recording import Level, Ramp
+from drivers import Command, Mode, Sample
+from tdhil.estimation import RoughInertia, rough_inertia
+from tdhil.recording import Level, Ramp
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.brake_test import probe_braking, slow_speed

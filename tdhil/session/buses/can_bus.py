@@ -20,9 +20,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from drivers.errors import CommunicationLost, DataFileError, PreflightRefused, Problem
-from tdhil.config.options import Origin, Setting
-from tdhil.config.rig import Rig, bit_rate_problem
+from drivers import CommunicationLost, DataFileError, PreflightRefused, Problem
+from tdhil.config import Origin, Rig, Setting, bit_rate_problem
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:

@@ -7,19 +7,17 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.canopen.drive import Cia402Drive
-from drivers.clock import Clock
-from drivers.drive import FrameTap
+from drivers import Clock, FrameTap
+from drivers.canopen import Cia402Drive
 from drivers.left_behind import LeftBehind
 from profiles.canopen import CanopenProfile
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import DriveData
+from tdhil.config import DriveData, RunOptions
 from tdhil.session.connection import Connection, rated_torque_is_told_by_hand
 
 if TYPE_CHECKING:
     import can
 
-    from sim_bus.canopen.simulator import Simulator
+    from sim_bus.canopen import Simulator
     from tdhil.session.connection import PeerPlan
 
 PLAIN = "generic/cia402"
@@ -76,7 +74,7 @@ def _embedded(
     worn = None if connection.profile.name == PLAIN else connection.profile
     assert worn is None or isinstance(worn, CanopenProfile)
     if plan.stepped:
-        from sim_bus.canopen.inline import InlineSimulator
+        from sim_bus.canopen import InlineSimulator
 
         inline = stack.enter_context(
             InlineSimulator(plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, profile=worn,
@@ -85,7 +83,7 @@ def _embedded(
         return inline.simulator, inline.bus
     import can
 
-    from sim_bus.canopen.simulator import EmbeddedSimulator
+    from sim_bus.canopen import EmbeddedSimulator
 
     simulated = stack.enter_context(
         EmbeddedSimulator(plan.plant, node_id=node, seed=plan.seed or 0, trace=trace, stepped=False, profile=worn,

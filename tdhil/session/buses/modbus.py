@@ -8,18 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.clock import Clock
-from drivers.drive import FrameTap
-from drivers.errors import PreflightRefused, TdhilError
-from drivers.modbus.drive import ModbusDrive
+from drivers import Clock, FrameTap, PreflightRefused, TdhilError
+from drivers.modbus import ModbusDrive
 from profiles.modbus import ModbusProfile
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import DriveData
+from tdhil.config import DriveData, RunOptions
 from tdhil.session.buses.modbus_line import ModbusConfig
 from tdhil.session.connection import Connection
 
 if TYPE_CHECKING:
-    from drivers.modbus.link import Link
+    from drivers.modbus import Link
     from tdhil.session.connection import PeerPlan
 
 
@@ -73,10 +70,10 @@ def open_line(
 def open_wire(line: ModbusConfig, clock: Clock) -> Link:
     """TCP where a host is named, else RTU on the serial device."""
     if line.host is not None:
-        from drivers.modbus.tcp import TcpLink
+        from drivers.modbus import TcpLink
 
         return TcpLink(line.host, line.port, clock)
-    from drivers.modbus.rtu import RtuLink
+    from drivers.modbus import RtuLink
 
     assert line.serial is not None
     try:
@@ -93,8 +90,8 @@ def open_wire(line: ModbusConfig, clock: Clock) -> Link:
 def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData, clock: Clock,
               trace: Path | None) -> OpenLine:
     """What nobody states of a simulated drive it states itself: there is no panel to read it from."""
-    from drivers.modbus.link import EmbeddedLink
-    from sim_bus.modbus.embedded import EmbeddedModbusDrive
+    from drivers.modbus import EmbeddedLink
+    from sim_bus.modbus import EmbeddedModbusDrive
 
     drive = EmbeddedModbusDrive(plan.plant, profile, unit=unit, seed=plan.seed or 0, trace=trace,
                                 script=plan.faults)

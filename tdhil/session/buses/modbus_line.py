@@ -11,10 +11,9 @@ from typing import Any, Literal, cast
 
 from pydantic import ValidationError
 
+from profiles import messages_of
 from profiles.modbus import Line, ModbusProfile
-from profiles.yaml_loader import messages_of
-from tdhil.config.options import Origin, Setting
-from tdhil.config.rig import Modbus, Rig
+from tdhil.config import Modbus, Origin, Rig, Setting
 from tdhil.errors import UsageError
 
 FLAGS = {

@@ -1,1 +1,15 @@
 """How often the interval covers: seeded plants, identified by the hundred."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.studies.coverage.study import COVERAGE as COVERAGE, normal_quantile as normal_quantile
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "study": ("COVERAGE", "normal_quantile"),
+        },
+    )

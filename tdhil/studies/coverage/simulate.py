@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.estimation.identify import identify
-from tdhil.estimation.result import Options
-from tdhil.recording.recording import Excitation, Recording, Segment
+from tdhil.estimation import Options, identify
+from tdhil.recording import Excitation, Recording, Segment
 from tdhil.run.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
 from tdhil.studies.coverage.workers import results

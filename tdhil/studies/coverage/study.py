@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from profiles.model import DataModel, Finding, refuse_if
+from profiles import DataModel, Finding, refuse_if
 from tdhil.studies.coverage.bound import cramer_rao
 from tdhil.studies.coverage.plants import FLEET, CoveragePlant
 from tdhil.studies.coverage.simulate import SimulatedRun, run_all, tasks
-from tdhil.studies.field.tone import tidy
+from tdhil.studies.field import tidy
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
 if TYPE_CHECKING:

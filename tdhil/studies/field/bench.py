@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from tdhil.recording.recording import Recording
+from tdhil.recording import Recording
 from tdhil.studies.field.settings import SimulatedRig
 from tdhil.studies.study import Progress
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.loops import best_kp, gain, tones_with_steady_rise
 from tdhil.studies.field.settings import GainSweepSettings, KiSweepSettings, KpSweepSettings

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.recording.recording import FloatArray
+from tdhil.recording import FloatArray
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.settings import LoopPair, ScatterSettings, SimulatedRig, ToneSweepSettings
 from tdhil.studies.field.tone import (

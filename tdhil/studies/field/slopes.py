@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from tdhil.estimation import Estimate, Identification, Options, identify
-from tdhil.recording.recording import Excitation, FloatArray, LagPrior, Recording, Segment
-from tdhil.studies.coverage.study import normal_quantile
+from tdhil.recording import Excitation, FloatArray, LagPrior, Recording, Segment
+from tdhil.studies.coverage import normal_quantile
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.settings import SlopeSettings
 from tdhil.studies.field.tone import PUBLISHED_STYLE, Scatter, colour, excited, line_slope, scatter, tidy

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.spectrum import period_lines
-from tdhil.estimation.paper_method import STEP_S, paper_estimate
-from tdhil.estimation.result import LineFit
-from tdhil.estimation.samples import Samples, excited_window, stretches, usable_samples
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.estimation import STEP_S, LineFit, Samples, excited_window, paper_estimate, stretches, usable_samples
+from tdhil.estimation.frequency_domain import period_lines
+from tdhil.recording import FloatArray, Recording
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

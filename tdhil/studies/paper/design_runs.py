@@ -10,9 +10,8 @@ from time import perf_counter
 
 import numpy as np
 
-from tdhil.estimation import Identification, Options, identify
-from tdhil.estimation.result import LineFit
-from tdhil.recording.recording import Excitation, FloatArray, LagPrior, Recording, Segment
+from tdhil.estimation import Identification, LineFit, Options, identify
+from tdhil.recording import Excitation, FloatArray, LagPrior, Recording, Segment
 from tdhil.studies.paper.loop import LoopRecord, LoopSettings, changed, reference_of, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings, LevelMeans, main_effects, ranking
 from tdhil.studies.paper.processing import backward_difference, settled_periods, torque_line

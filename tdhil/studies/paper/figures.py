@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import model_validator
 
-from profiles.model import refuse_if
+from profiles import refuse_if
 from tdhil.studies.paper.design_runs import DesignResult, DesignRun, run_design
 from tdhil.studies.paper.loop import LABELS, LoopRecord, LoopSettings, Positive, SamplePeriod, changed, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from profiles.model import DataModel, Finding, refuse_if
-from sim_bus.plant.batch import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_torque
+from profiles import DataModel, Finding, refuse_if
+from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_torque
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What can be set about one run of the paper's closed loop, and the names by which a factor or `--set` calls it.

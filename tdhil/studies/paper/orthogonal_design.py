@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError, model_validator
 
-from profiles.model import DataModel, Finding, refuse_if
-from profiles.yaml_loader import parse_model
+from profiles import DataModel, Finding, parse_model, refuse_if
 from tdhil.studies.paper.loop import FACTORS, SYMBOLS, LoopSettings, changed, full_name
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -8,8 +8,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.estimation.paper_method import line_fit
-from tdhil.estimation.result import LineFit
+from tdhil.estimation import LineFit, line_fit
 
 FloatArray = NDArray[np.float64]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.resources import files
 
-from profiles.model import DataModel
-from profiles.yaml_loader import parse_model
+from profiles import DataModel, parse_model
 from tdhil.studies.paper.orthogonal_design import Factor, runs_from_means, shipped_arrays
 
 

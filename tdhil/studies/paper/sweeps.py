@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from profiles.model import refuse_if
+from profiles import refuse_if
 from tdhil.studies.paper.loop import LABELS, LoopSettings, Positive, SamplePeriod, changed, simulate
 from tdhil.studies.paper.processing import Response, response, settled_periods
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, StudyOutcome

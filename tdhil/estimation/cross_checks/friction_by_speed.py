@@ -31,16 +31,15 @@ from tdhil.estimation.cross_checks.momentum import (
     through,
 )
 from tdhil.estimation.cross_checks.momentum_fit import UNKNOWN_DELAY, Delay, Density, Resolution, fit_momentum
-from tdhil.estimation.frequency_domain.friction_levels import Levels
-from tdhil.estimation.frequency_domain.inference import student_quantile
+from tdhil.estimation.frequency_domain import Levels, student_quantile
 from tdhil.estimation.result import Estimate, FrictionPoint, Options
 from tdhil.estimation.samples import Samples, excited_window
-from tdhil.recording.recording import FloatArray, Recording
+from tdhil.recording import FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The points of a friction curve: friction torque over each stretch of steady or slowly drifting speed.
 #
-# How a point is made of a balance of momentum stands in `tdhil.estimation.cross_checks.friction_curve`.
+# How a point is made of a balance of momentum stands in `tdhil.estimation.cross_checks.friction_by_speed`.
 
 
 _ALIKE = 0.01             # of the fastest: speeds closer than that are one

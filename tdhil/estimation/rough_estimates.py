@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.recording.recording import FloatArray, Level
+from tdhil.recording import FloatArray, Level
 
 _LEAST_REL = 0.05       # unknown lags, friction that isn't a straight line
 _MOST_REL = 0.9

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from tdhil.errors import ExitCode, UsageError
-from tdhil.estimation.result import Identification, Verdict
-from tdhil.recording.recording import Recording
+from tdhil.estimation import Identification, Verdict
+from tdhil.recording import Recording
 
 
 def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
@@ -23,7 +23,7 @@ def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
     last = stopping["decisions"][-1]
     if stopping.get("confidence") == confidence:
         return float(last["working_confidence"])
-    from tdhil.run.design.stopping_rule import interval_confidence
+    from tdhil.run import interval_confidence
 
     return interval_confidence(confidence, float(stopping["pilot_dof"]), int(last["seen"]))
 
@@ -56,10 +56,9 @@ def conclude(
 
     ``warnings``: what was assumed in reading a foreign trace; None for a run of ours.
     """
-    from tdhil.estimation import identify
-    from tdhil.estimation.result import Options, Verdict
-    from tdhil.report.document import result_document
-    from tdhil.run import preconditions, speed_check, stage_log
+    from tdhil.estimation import Options, Verdict, identify
+    from tdhil.report import result_document
+    from tdhil.run import precondition_warnings, speed_warnings, stage_warnings
 
     asked = run.get("identify", {})
     known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}
@@ -70,8 +69,8 @@ def conclude(
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     said = (
-        *(warnings or ()), *_stop_warnings(run), *preconditions.warnings(run), *speed_check.warnings(run),
-        *stage_log.warnings(run),
+        *(warnings or ()), *_stop_warnings(run), *precondition_warnings(run), *speed_warnings(run),
+        *stage_warnings(run),
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))

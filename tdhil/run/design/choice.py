@@ -13,21 +13,33 @@ from itertools import product
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.shafts import VISCOUS
-from tdhil.recording.recording import FloatArray, LagPrior
+from tdhil.estimation.frequency_domain import (
+    AVERAGE,
+    LAG_BOUND_S,
+    SHAPE_BOUND,
+    SKEW,
+    SPEED_LAG,
+    SPEED_SHAPE,
+    TORQUE_LAG,
+    TORQUE_SHAPE,
+    VISCOUS,
+)
+from tdhil.recording import FloatArray, LagPrior
 from tdhil.run.design.prediction import RIGID, SPEED_LAG_S, TORQUE_LAG_S, Noise, assumed_theta, expected_half_width
 from tdhil.run.excitation import (
     LEAST_COUNTED,
+    DriveMode,
     ExcitationWish,
+    MachineLimits,
     Plan,
     PlanRefused,
+    RigGuess,
+    Shape,
     make_plan,
     periodic_kind,
     settling_periods,
+    unit_peak,
 )
-from tdhil.run.excitation.reference import DriveMode, MachineLimits, RigGuess
-from tdhil.run.excitation.signals import Shape, unit_peak
 
 # ---------------------------------------------------------------------------------------------------------------------
 # A quick figure for the search: the Cramér-Rao bound of J, the structure of the lags being open.
@@ -56,7 +68,7 @@ def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) ->
     if nu < 2.0:
         return math.inf
     amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
-    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(signal_filters.SPEED_LAG)]))
+    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(SPEED_LAG)]))
     weight = 2.0 * (counts @ seen**2) / variance * (nu - 1.0) / nu
     fisher = np.einsum("k,ki,kj->ij", weight, columns.conj(), columns).real
     fisher[VISCOUS, VISCOUS] += _tie(plan, counts * period, float(noise.error_density(np.zeros(1), theta)[0]))
@@ -79,16 +91,16 @@ def _tie(plan: Plan, durations: FloatArray, density: float) -> float:
 
 def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
     """Standard deviations to begin with, of the reports' parameters: stated, or about the bounds of the fit."""
-    lags = theta[[RIGID.at(signal_filters.SPEED_LAG), RIGID.at(signal_filters.TORQUE_LAG)]]
+    lags = theta[[RIGID.at(SPEED_LAG), RIGID.at(TORQUE_LAG)]]
     longest = max(float(np.max(lags)), 1e-3)
     speed, torque = prior.speed_lag_s is not None, prior.torque_lag_s is not None
     return {
-        signal_filters.SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else signal_filters.LAG_BOUND_S,
-        signal_filters.SPEED_SHAPE: _CERTAIN if speed else signal_filters.SHAPE_BOUND,
-        signal_filters.TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else signal_filters.LAG_BOUND_S,
-        signal_filters.TORQUE_SHAPE: _CERTAIN if torque else signal_filters.SHAPE_BOUND,
-        signal_filters.AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
-        signal_filters.SKEW: _SKEW_SD_S,
+        SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else LAG_BOUND_S,
+        SPEED_SHAPE: _CERTAIN if speed else SHAPE_BOUND,
+        TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else LAG_BOUND_S,
+        TORQUE_SHAPE: _CERTAIN if torque else SHAPE_BOUND,
+        AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
+        SKEW: _SKEW_SD_S,
     }
 
 

@@ -12,13 +12,11 @@ from tdhil.errors import UsageError
 from tdhil.session.connection import PeerPlan
 
 if TYPE_CHECKING:
-    from tdhil.config.options import RunOptions
+    from tdhil.config import RunOptions
     from tdhil.session.connection import Connection
 
-from drivers.clock import Clock, MonotonicClock, SteppedClock
-from drivers.drive import Drive, FrameTap
-from tdhil.config.options import RunOptions
-from tdhil.config.rig import DriveData
+from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
+from tdhil.config import DriveData, RunOptions
 from tdhil.session.connection import Connection
 
 
@@ -33,11 +31,11 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
                 next_step="Leave --stepped out, or use --simulate, which is stepped",
             )
         return PeerPlan(False, options.stepped, None, None)
-    from sim_bus.params import RigParams
+    from sim_bus import RigParams
 
     plant = RigParams()
     if options.plant is not None:
-        from profiles.yaml_loader import load_model
+        from profiles import load_model
 
         plant = load_model(Path(options.plant), RigParams)
     seed = options.seed
@@ -55,12 +53,12 @@ def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
     if connection.drive == "modbus":
-        from tdhil.session.buses.modbus import open_modbus
+        from tdhil.session.buses import open_modbus
 
         with open_modbus(plan, options, connection, data, clock, tap, trace) as modbus:
             yield modbus
     else:
-        from tdhil.session.buses.canopen import open_canopen
+        from tdhil.session.buses import open_canopen
 
         with open_canopen(plan, options, connection, data, clock, tap, trace) as canopen:
             yield canopen
@@ -76,9 +74,9 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
             next_step="Add --simulate, or give --fault to tdhil simulate",
         )
     if drive == "modbus":
-        from sim_bus.modbus.faults import parse_all as parse_modbus
+        from sim_bus.modbus import parse_all as parse_modbus
 
         return replace(plan, faults=parse_modbus(texts, "embedded"))
-    from sim_bus.canopen.faults import parse_all
+    from sim_bus.canopen import parse_all
 
     return replace(plan, faults=parse_all(texts))

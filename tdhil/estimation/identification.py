@@ -9,15 +9,15 @@ from dataclasses import replace
 
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.conclude import conclude
-from tdhil.estimation.cross_checks.second_opinion import cross_checked
+from tdhil.estimation.cross_checks import cross_checked
 from tdhil.estimation.data_checks import check_samples
-from tdhil.estimation.frequency_domain.identify import clear_lines, identify_lines, measured
+from tdhil.estimation.frequency_domain import clear_lines, identify_lines, measured
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.result import Identification, Options, Refused
 from tdhil.estimation.samples import excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched
 from tdhil.estimation.time_domain import identify_record, recorded
-from tdhil.recording.recording import Recording, aborted_stage, before_abort
+from tdhil.recording import Recording, aborted_stage, before_abort
 
 
 def identify(recording: Recording, options: Options | None = None) -> Identification:
