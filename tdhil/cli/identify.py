@@ -35,13 +35,13 @@ def show_settings(
     if peer.embedded:
         why = "as asked for" if options.simulate else connection.nothing_there
         clock = "stepped time" if peer.stepped else "real time"
-        what = "Modbus drive and rig" if connection.drive == "modbus" else "drive and rig on a virtual bus"
+        what = connection.line.simulated_text
         console.print(f"SIMULATED: embedded {what} ({why}), {clock}, seed {peer.seed}", style="magenta")
         for fault in peer.faults:
             console.print(f"SIMULATED: scripted fault {fault.text}", style="magenta", markup=False)
     else:
         for name, value, source in connection.rows():
-            console.print(f"{_PREFIX[connection.drive]} {name:<10} {value}  ({source})", style="dim", markup=False)
+            console.print(f"{connection.line.row_name} {name:<10} {value}  ({source})", style="dim", markup=False)
     for name, value, source in options.rows():
         if source != "default":
             console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
@@ -49,7 +49,6 @@ def show_settings(
         console.print(f"{key:<14} {text}  ({source})", markup=False)
 
 
-_PREFIX = {"canopen": "bus", "modbus": "line"}
 
 
 # ---------------------------------------------------------------------------------------------------------------------

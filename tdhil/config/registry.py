@@ -48,10 +48,10 @@ MODELS: dict[str, Entry] = {
 """What the shaft is taken for."""
 
 BUSES: dict[str, Entry] = {
-    "canopen": Entry("tdhil.session.buses.canopen:open_canopen", "CANopen, CiA 402"),
-    "modbus": Entry("tdhil.session.buses.modbus:open_modbus", "Modbus TCP or RTU"),
+    "canopen": Entry("tdhil.session.buses.canopen:CANOPEN", "CANopen, CiA 402"),
+    "modbus": Entry("tdhil.session.buses.modbus:MODBUS", "Modbus TCP or RTU"),
 }
-"""How a drive is spoken to; each opens one."""
+"""How a drive is spoken to; each a `tdhil.session.connection.BusKind`."""
 
 
 def load(registry: Mapping[str, Entry], name: str) -> Any:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,36 @@ from typing import TYPE_CHECKING, Any
 from drivers import DataFileError, Problem
 from profiles import Profile, load_canopen_profile, load_modbus_profile, load_profile
 from profiles.modbus import ModbusProfile
-from tdhil.config import Origin, RunOptions, Setting
+from tdhil.config import BUSES, Origin, RunOptions, Setting, load
 from tdhil.errors import UsageError
 from tdhil.session.buses import BusConfig, ModbusConfig, asked_for, bus_config, modbus_config
 
 if TYPE_CHECKING:
+    from drivers import Drive
     from profiles import Profile
     from tdhil.config import Rig
 
 MODBUS_PROFILE = "generic/modbus"
 """Worn and spoken where nobody names another; for CANopen it is `tdhil.config.options`' default."""
+
+
+@dataclass(frozen=True)
+class BusKind:
+    """What a run asks of a bus; `tdhil.config.registry.BUSES` lists them by name.
+
+    ``open``: the drive on it, or the embedded simulator's, closed afterwards. ``parse_faults``: of the simulator, from
+    what ``--fault`` says. ``steps_over_a_wire``: can a simulator in another process be stepped over it?
+    """
+
+    open: Callable[..., AbstractContextManager[Drive]]
+    parse_faults: Callable[[Sequence[str]], tuple[Any, ...]]
+    steps_over_a_wire: bool
+
+
+def bus_kind(name: str) -> BusKind:
+    """The bus of that name; its libraries are loaded. KeyError where there is none."""
+    found: BusKind = load(BUSES, name)
+    return found
 
 
 @dataclass(frozen=True)
@@ -37,18 +58,24 @@ class Connection:
         return self.profile.bus
 
     @property
+    def line(self) -> BusConfig | ModbusConfig:
+        """The one that counts."""
+        lines: dict[str, BusConfig | ModbusConfig] = {"canopen": self.bus, "modbus": self.modbus}
+        return lines[self.drive]
+
+    @property
     def configured(self) -> bool:
         """Has anybody said where the drive is? If not, the embedded simulator is meant."""
-        return self.modbus.configured if self.drive == "modbus" else self.bus.configured
+        return self.line.configured
 
     @property
     def nothing_there(self) -> str:
         """Why the embedded simulator runs although nobody asked for it."""
-        return "no Modbus host and no serial device is named" if self.drive == "modbus" else "no CAN bus is configured"
+        return self.line.nothing_there
 
     def rows(self) -> Iterator[tuple[str, str, str]]:
         """(option, value, source) to print and to log."""
-        return self.modbus.rows() if self.drive == "modbus" else self.bus.rows()
+        return self.line.rows()
 
 
 def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> tuple[RunOptions, Connection]:

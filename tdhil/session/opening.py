@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tdhil.errors import UsageError
-from tdhil.session.connection import PeerPlan
+from tdhil.session.connection import PeerPlan, bus_kind
 
 if TYPE_CHECKING:
     from tdhil.config import RunOptions
@@ -24,9 +24,9 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
     """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
     embedded = options.simulate or not connection.configured
     if not embedded:
-        if options.stepped and connection.drive == "modbus":
+        if options.stepped and not bus_kind(connection.drive).steps_over_a_wire:
             raise UsageError(
-                "a Modbus line has no SYNC to step by: over a wire it runs in real time",
+                f"a {connection.drive.capitalize()} line has no SYNC to step by: over a wire it runs in real time",
                 where=options.source("stepped"),
                 next_step="Leave --stepped out, or use --simulate, which is stepped",
             )
@@ -52,16 +52,8 @@ def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data
     """The drive, closed with its bus and simulator afterwards. ``data``: what the bench knows and the drive doesn't."""
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
-    if connection.drive == "modbus":
-        from tdhil.session.buses import open_modbus
-
-        with open_modbus(plan, options, connection, data, clock, tap, trace) as modbus:
-            yield modbus
-    else:
-        from tdhil.session.buses import open_canopen
-
-        with open_canopen(plan, options, connection, data, clock, tap, trace) as canopen:
-            yield canopen
+    with bus_kind(connection.drive).open(plan, options, connection, data, clock, tap, trace) as drive:
+        yield drive
 
 
 def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> PeerPlan:
@@ -73,10 +65,4 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
             "faults can be scripted in the embedded simulator only", where="--fault",
             next_step="Add --simulate, or give --fault to tdhil simulate",
         )
-    if drive == "modbus":
-        from sim_bus.modbus import parse_all as parse_modbus
-
-        return replace(plan, faults=parse_modbus(texts, "embedded"))
-    from sim_bus.canopen import parse_all
-
-    return replace(plan, faults=parse_all(texts))
+    return replace(plan, faults=bus_kind(drive).parse_faults(texts))

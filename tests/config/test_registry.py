@@ -9,7 +9,9 @@ import ast
 import json
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,6 +26,7 @@ from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import Shaft
 from tdhil.cli.main import build_parser, main
+from tdhil.config.options import resolve
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, load, names
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
@@ -37,6 +40,8 @@ from tdhil.run.planning import adaptive, plan_acquisition, refuse_hopeless
 from tdhil.run.preconditions import refuse_by_plan
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.settings import MachineLimits as RunLimits
+from tdhil.session.connection import BusKind, PeerPlan
+from tdhil.session.opening import open_drive, plan_peer, with_faults
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
 from tests.estimation.test_two_mass import MILD
@@ -180,6 +185,41 @@ def test_a_toy_plant_is_read_and_turned(monkeypatch):
         parse_model("plant: {kind: fly}\n", "plant.yaml", RigParams)
     with pytest.raises(DataFileError, match="wheel_kg_m2: must be greater than 0, not -1"):
         parse_model("plant: {kind: flywheel, wheel_kg_m2: -1.0}\n", "plant.yaml", RigParams)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A bus: what opens a drive on it, and one line in the list
+
+
+class ToyDrive:
+    """Nothing but something to be opened and closed."""
+
+    closed = False
+
+
+@contextmanager
+def open_toy(*asked: Any) -> Iterator[Any]:
+    drive = ToyDrive()
+    yield drive
+    drive.closed = True
+
+
+TOY_BUS = BusKind(open_toy, tuple, steps_over_a_wire=False)
+
+
+def test_a_drive_on_a_toy_bus_is_opened(monkeypatch):
+    monkeypatch.setitem(BUSES, "toy", Entry(f"{__name__}:TOY_BUS", "a toy"))
+    assert build_parser("identify").parse_args(["identify", "--drive", "toy"]).drive == "toy"
+    options = resolve({}, Rig.model_validate({"drive": "toy"}))
+    assert options.drive == "toy"
+    connection: Any = SimpleNamespace(drive=options.drive, configured=True)
+    plan = PeerPlan(embedded=True, stepped=True, seed=1, plant=None)
+    assert with_faults(plan, ["bite"], "toy").faults == ("bite",)
+    with open_drive(plan, options, connection, None, lambda *_: None, None) as drive:
+        assert isinstance(drive, ToyDrive) and not drive.closed
+    assert drive.closed
+    with pytest.raises(UsageError, match="no SYNC to step by"):
+        plan_peer(resolve({"drive": "toy", "stepped": True}, None), connection)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

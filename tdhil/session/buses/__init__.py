@@ -9,10 +9,10 @@ if TYPE_CHECKING:
         BusConfig as BusConfig, bus_config as bus_config, link_report as link_report, open_bus as open_bus,
     )
     from tdhil.session.buses.canopen import (
-        open_can as open_can, open_canopen as open_canopen, rated_torque_nm as rated_torque_nm,
+        open_can as open_can, rated_torque_nm as rated_torque_nm,
     )
     from tdhil.session.buses.modbus import (
-        SettingsRefused as SettingsRefused, open_line as open_line, open_modbus as open_modbus,
+        SettingsRefused as SettingsRefused, open_line as open_line,
         open_wire as open_wire,
     )
     from tdhil.session.buses.modbus_line import (
@@ -23,8 +23,8 @@ else:
         __name__,
         {
             "can_bus": ("BusConfig", "bus_config", "link_report", "open_bus"),
-            "canopen": ("open_can", "open_canopen", "rated_torque_nm"),
-            "modbus": ("SettingsRefused", "open_line", "open_modbus", "open_wire"),
+            "canopen": ("open_can", "rated_torque_nm"),
+            "modbus": ("SettingsRefused", "open_line", "open_wire"),
             "modbus_line": ("ModbusConfig", "asked_for", "modbus_config"),
         },
     )

@@ -18,7 +18,7 @@ from configparser import Error as ConfigParserError
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused, Problem
 from tdhil.config import Origin, Rig, Setting, bit_rate_problem
@@ -43,6 +43,10 @@ _VARIABLES = {"interface": "CAN_INTERFACE", "channel": "CAN_CHANNEL", "bitrate":
 @dataclass(frozen=True)
 class BusConfig:
     """Each option of the bus and its origin, in the order in which python-can takes them."""
+
+    nothing_there: ClassVar[str] = "no CAN bus is configured"
+    simulated_text: ClassVar[str] = "drive and rig on a virtual bus"
+    row_name: ClassVar[str] = "bus"
 
     settings: Mapping[str, Setting]
 

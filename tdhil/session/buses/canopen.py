@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivers import Clock, FrameTap
 from drivers.canopen import Cia402Drive
 from drivers.left_behind import LeftBehind
 from profiles.canopen import CanopenProfile
 from tdhil.config import DriveData, RunOptions
-from tdhil.session.connection import Connection, rated_torque_is_told_by_hand
+from tdhil.session.connection import BusKind, Connection, rated_torque_is_told_by_hand
 
 if TYPE_CHECKING:
     import can
@@ -90,3 +90,12 @@ def _embedded(
                           faults=plan.faults)
     )
     return simulated.simulator, can.Bus(interface="virtual", channel=simulated.channel)
+
+
+def _faults(texts: Sequence[str]) -> tuple[Any, ...]:
+    from sim_bus.canopen import parse_all
+
+    return parse_all(texts)
+
+
+CANOPEN = BusKind(open_canopen, _faults, steps_over_a_wire=True)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drivers import Clock, FrameTap, PreflightRefused, TdhilError
 from drivers.modbus import ModbusDrive
 from profiles.modbus import ModbusProfile
 from tdhil.config import DriveData, RunOptions
 from tdhil.session.buses.modbus_line import ModbusConfig
-from tdhil.session.connection import Connection
+from tdhil.session.connection import BusKind, Connection
 
 if TYPE_CHECKING:
     from drivers.modbus import Link
@@ -108,3 +108,12 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
 
     link = EmbeddedLink(drive.serve, clock, on_close=ended)
     return OpenLine(link, profile, rated_nm, {**drive.untold, **data.parameters})
+
+
+def _faults(texts: Sequence[str]) -> tuple[Any, ...]:
+    from sim_bus.modbus import parse_all
+
+    return parse_all(texts, "embedded")
+
+
+MODBUS = BusKind(open_modbus, _faults, steps_over_a_wire=False)     # it has no SYNC

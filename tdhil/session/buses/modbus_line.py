@@ -7,7 +7,7 @@ A host means TCP, a serial device means RTU; the command line's word for one of 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 from pydantic import ValidationError
 
@@ -31,6 +31,10 @@ TCP, RTU = ("host", "port", "unit"), ("serial", "baud", "parity", "stop_bits", "
 @dataclass(frozen=True)
 class ModbusConfig:
     """Each value and its origin; only those that the way to the drive (TCP or RTU) knows."""
+
+    nothing_there: ClassVar[str] = "no Modbus host and no serial device is named"
+    simulated_text: ClassVar[str] = "Modbus drive and rig"
+    row_name: ClassVar[str] = "line"
 
     settings: Mapping[str, Setting]
 
