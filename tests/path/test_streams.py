@@ -143,7 +143,7 @@ def test_nothing_is_loaded_once_the_shaft_may_move(tmp_path, fault):
     """Later there may be no descriptor left to load it with, or no disk."""
     script = f"""
 import sys
-from tdhil.cli import identify as confirm
+from tdhil.session import confirm
 before = set()
 whole = confirm.confirm_motion
 def noted(*args, **named):
