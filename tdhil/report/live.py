@@ -61,6 +61,13 @@ class Painter:
         self._picture = job
         self._begin()
 
+    def line_after_picture(self, job: Job) -> None:
+        """Do this after all that was asked for before, a picture that still waits included. Raises as `line` does."""
+        picture, self._picture = self._picture, None
+        if picture is not None:
+            self.line(picture)
+        self.line(job)
+
     def flush(self, timeout_s: float) -> bool:
         """Wait until all is done, so long at most; whether it is."""
         if self._thread is None:
@@ -197,7 +204,8 @@ class LiveDisplay:
         Waits until all is written, but not for ever.
         """
         view = self._view = replace(self._view, taken=False)
-        self._painter.line(lambda: self._let_go(view))
+        # A picture that came behind would take the terminal back, and what is printed next stand on its last line.
+        self._painter.line_after_picture(lambda: self._let_go(view))
         self._painter.flush(_LONGEST_FLUSH_S)
 
     def say(self, text: str) -> None:

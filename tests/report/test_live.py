@@ -2,6 +2,7 @@
 
 import os
 import pty
+import re
 import threading
 
 import pytest
@@ -116,6 +117,25 @@ def test_leaving_it_waits_for_a_blocked_terminal_but_not_for_ever(monkeypatch):
     stuck.go.set()
 
 
+def test_a_picture_that_comes_late_does_not_take_the_terminal_back():
+    """What is printed next would stand behind its last line, on the same one: a prompt, or the card."""
+    import io
+
+    shown, go = io.StringIO(), threading.Event()
+    display = LiveDisplay(Console(file=shown, force_terminal=True, width=80), show_preflight=False)
+    display.stage_started("setup", 10.0)
+    display.cycle(COMMAND, sample(0.0))
+    assert display._painter.flush(30.0)
+    display._painter.line(lambda: go.wait(30.0))      # a computer with other things to do
+    display.stopped(True)
+    threading.Timer(0.2, go.set).start()
+    display.pause()
+    assert display._painter.flush(30.0)
+    assert shown.getvalue().count("\x1b[?25l") == 1    # taken once,
+    assert shown.getvalue().endswith("\n\x1b[?25h")    # and left on a new line
+    display._painter.end()
+
+
 def test_lines_come_in_order_and_before_it_is_left():
     import io
 
@@ -147,7 +167,9 @@ def test_on_a_terminal_the_last_picture_is_that_of_the_end():
     shown = io.StringIO()
     with LiveDisplay(Console(file=shown, force_terminal=True, width=100), show_preflight=False) as display:
         whole_run(display, cycles=3)
-    assert shown.getvalue().rstrip().splitlines()[-1].startswith("shaft at rest")
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())       # what is left once the cursor is back
+    assert text.rstrip().splitlines()[-1].startswith("shaft at rest")
+    assert text.endswith("\n")
 
 
 def test_a_terminal_that_has_gone_is_no_trouble_of_the_run():
