@@ -83,10 +83,11 @@ def test_the_unit_is_the_one_asked_for(tmp_path):
 
 
 def test_a_dry_run_knows_the_drive(tmp_path):
-    done = tdhil("identify", "--drive", "modbus", "--simulate", "--dry-run", "--json")
+    plain = ("--excitation", "sine", "--frequency", 0.5)          # soon planned
+    done = tdhil("identify", "--drive", "modbus", "--simulate", "--dry-run", "--json", *plain)
     assert done.code == 0, done.err
     assert done.document["mode"] == "torque"
-    options = ("--profile", "schneider/atv320", "--simulate", "--dry-run", "--json")
+    options = ("--profile", "schneider/atv320", "--simulate", "--dry-run", "--json", *plain)
     assert tdhil("identify", *options).document["mode"] == "speed"       # that drive has no torque mode
     refused = tdhil("identify", *options, "--mode", "torque")
     assert refused.code == 4

@@ -66,7 +66,8 @@ def test_a_dry_run_knows_what_lets_go_of_a_string(tmp_path, profile, lets_go):
         "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10, torque_nm: 400, time_s: 900, quick_stop_rad_s2: 2,"
         " probe_torque_nm: 200, probe_travel_rad: 3}\n"
     )
-    done = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile)
+    done = tdhil("identify", "--dry-run", "--simulate", "--rig", rig, "--profile", profile,
+                 "--excitation", "sine", "--frequency", 0.5)
     assert done.code == (4 if lets_go else 0), done.err
     assert ("the drive lets go of it after a quick stop" in done.err) == lets_go
     assert ("quick_stop of the profile" in done.err) == lets_go
