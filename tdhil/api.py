@@ -20,11 +20,12 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import UsageError
 from tdhil.session import RunRecord, read
 
 if TYPE_CHECKING:
     from tdhil.config import Rig
+    from tdhil.errors import ExitCode
     from tdhil.estimation import Identification, InertiaEstimate, Verdict
     from tdhil.session import Attendant, Consent, RunRequest
 
@@ -99,10 +100,14 @@ class CoastDown(Pulses):
 
 @dataclass(frozen=True)
 class Result:
-    """What was identified from one recording. Shows itself as the card: in a terminal, and in a notebook."""
+    """What was identified from one recording. Shows itself as the card: in a terminal, and in a notebook.
+
+    ``exit_code``: how ``tdhil replay`` would end on a whole run, 0 where there is a number to quote, 9 where not.
+    """
 
     identification: Identification
     document: Mapping[str, Any]
+    exit_code: ExitCode
     record: RunRecord = field(repr=False)
 
     @property
@@ -114,14 +119,6 @@ class Result:
     def verdict(self) -> Verdict:
         """Does the number stand?"""
         return self.identification.verdict
-
-    @property
-    def exit_code(self) -> ExitCode:
-        """How ``tdhil replay`` would end: 0 where there is a number to quote, 9 where not."""
-        from tdhil.estimation import Verdict
-
-        stands = self.identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
-        return ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE
 
     @property
     def reason(self) -> str:
@@ -169,7 +166,7 @@ def identify(
     asked = {"model": model, "confidence": confidence, "tolerance": tolerance}
     configuration = recorded.asked({name: value for name, value in asked.items() if value is not None})
     found = conclude(recorded.recording, configuration, recorded.log, recorded.assumed)
-    return Result(found.identification, found.document, recorded)
+    return Result(found.identification, found.document, found.exit_code, recorded)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -43,15 +43,11 @@ def show_settings(
         for name, value, source in connection.rows():
             console.print(f"{connection.line.row_name} {name:<10} {value}  ({source})", style="dim", markup=False)
     for name, value, source in options.rows():
-        if source != "default":
+        if options.given(name):
             console.print(f"{name:<14} {value}  ({source})", style="dim", markup=False)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key:<14} {text}  ({source})", markup=False)
 
-
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""

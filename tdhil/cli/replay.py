@@ -12,7 +12,7 @@ from tdhil.cli.arguments import amount, share
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session import is_log, read, stated_lags
+from tdhil.session import is_log, read
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -72,6 +72,8 @@ def run(namespace: argparse.Namespace) -> int:
             if getattr(namespace, name) is not None:
                 raise UsageError("is for a trace in CSV; this log brings its own", where=f"--{name.replace('_', '-')}")
     else:
+        from tdhil.session import stated_lags
+
         trace = {
             "columns": namespace.columns, "excitation": namespace.excitation,
             "rated_torque_nm": namespace.rated_torque, "torque_limit_nm": namespace.torque_limit,

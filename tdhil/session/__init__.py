@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         refuse_hopeless as refuse_hopeless,
     )
     from tdhil.session.recorded import (
-        RunRecord as RunRecord, is_log as is_log, read as read, stated_lags as stated_lags,
+        RunRecord as RunRecord, is_log as is_log, read as read,
     )
     from tdhil.session.run_session import (
         Attendant as Attendant, Consent as Consent, RunRequest as RunRequest, RunSession as RunSession,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from tdhil.session.stop_signals import stop_on_signals as stop_on_signals
     from tdhil.session.task import (
         bench_of as bench_of, excitation_request as excitation_request, facts as facts,
-        machine_limits as machine_limits, suited as suited,
+        machine_limits as machine_limits, stated_lags as stated_lags, suited as suited,
     )
 else:
     __getattr__, __dir__ = lazy_face(
@@ -57,9 +57,9 @@ else:
             "log_place": ("check_different_files", "check_log_path", "make_room"),
             "opening": ("open_drive", "plan_peer", "with_faults"),
             "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry", "refuse_hopeless"),
-            "recorded": ("RunRecord", "is_log", "read", "stated_lags"),
+            "recorded": ("RunRecord", "is_log", "read"),
             "run_session": ("Attendant", "Consent", "RunRequest", "RunSession"),
             "stop_signals": ("stop_on_signals",),
-            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "suited"),
+            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "stated_lags", "suited"),
         },
     )

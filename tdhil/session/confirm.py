@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import partial
+from typing import TypeVar
 
 from rich.console import Console
 
@@ -16,6 +18,8 @@ from profiles import visible
 from profiles.quantities import RPM
 from tdhil.report import LiveDisplay, minutes
 from tdhil.run import Display, ExcitationRequest, Idle, MachineLimits, Task
+
+T = TypeVar("T")
 
 WORD = "MOVE"
 SPEED_FLAG = "--accept-speed-unit"
@@ -143,15 +147,26 @@ def _taken(unverified: Sequence[str]) -> str:
 
 
 def _ask(idle: Idle) -> str:
-    """A line from the terminal, with a cycle of nothing again and again until it is there."""
-    answers: queue.Queue[str] = queue.Queue()
-    threading.Thread(target=lambda: answers.put(sys.stdin.readline()), name="prompt", daemon=True).start()
+    """A line from the terminal."""
+    line: str = _meanwhile(idle, sys.stdin.readline)
+    return line
+
+
+def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
+    """What ``ask`` gives, or raises what it raises: done in a thread, with a cycle of nothing again and again."""
+    answer: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            answer.set_result(ask())
+        except BaseException as error:         # raised where the answer is awaited
+            answer.set_exception(error)
+
+    threading.Thread(target=work, name="prompt", daemon=True).start()
     while True:
         idle()
-        try:
-            return answers.get_nowait()
-        except queue.Empty:
-            continue
+        if answer.done():
+            return answer.result()
 
 
 class TerminalAttendant:
@@ -208,19 +223,5 @@ class AskingAttendant(TerminalAttendant):
             return
         self._display.pause()
         text = summary(preflight, task.limits, task.request, unverified)
-        answers: queue.Queue[object] = queue.Queue()
-
-        def ask() -> None:
-            try:
-                answers.put(self._ask(text))
-            except BaseException as error:     # raised where the answer is awaited
-                answers.put(error)
-
-        threading.Thread(target=ask, name="confirm", daemon=True).start()
-        while answers.empty():
-            idle()
-        answer = answers.get()
-        if isinstance(answer, BaseException):
-            raise answer
-        if answer is not True:
+        if _meanwhile(idle, partial(self._ask, text)) is not True:
             raise PreflightRefused("not confirmed", where="confirm", next_step="Nothing has moved")

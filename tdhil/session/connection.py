@@ -18,7 +18,6 @@ from tdhil.session.buses import BusConfig, ModbusConfig, asked_for, bus_config, 
 
 if TYPE_CHECKING:
     from drivers import Drive
-    from profiles import Profile
     from tdhil.config import Rig
 
 MODBUS_PROFILE = "generic/modbus"

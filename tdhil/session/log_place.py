@@ -7,13 +7,9 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO
 
 from tdhil.errors import UsageError
-
-if TYPE_CHECKING:
-    pass
-
 
 _LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
 

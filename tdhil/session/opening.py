@@ -6,18 +6,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from tdhil.errors import UsageError
-from tdhil.session.connection import PeerPlan, bus_kind
-
-if TYPE_CHECKING:
-    from tdhil.config import RunOptions
-    from tdhil.session.connection import Connection
 
 from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
 from tdhil.config import DriveData, RunOptions
-from tdhil.session.connection import Connection
+from tdhil.errors import UsageError
+from tdhil.session.connection import Connection, PeerPlan, bus_kind
 
 
 def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:

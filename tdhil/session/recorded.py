@@ -156,26 +156,6 @@ def is_log(path: Path) -> bool:
     return head.startswith(MAGIC[:5]) or (bool(head) and MAGIC.startswith(head))
 
 
-def stated_lags(
-    speed_lag_s: float | None, speed_lag_sd_s: float | None, torque_lag_s: float | None, torque_lag_sd_s: float | None,
-    source: str = "",
-) -> LagPrior:
-    """Reporting lags as somebody states them; without a deviation it is a tenth."""
-    from tdhil.recording import LagPrior
-    from tdhil.session.task import UNKNOWN_LAG_SD_SHARE
-
-    def deviation(lag_s: float | None, stated_s: float | None) -> float:
-        if lag_s is None:
-            return 0.0
-        return UNKNOWN_LAG_SD_SHARE * lag_s if stated_s is None else stated_s
-
-    known = speed_lag_s is not None or torque_lag_s is not None
-    return LagPrior(
-        speed_lag_s, deviation(speed_lag_s, speed_lag_sd_s), torque_lag_s, deviation(torque_lag_s, torque_lag_sd_s),
-        source if known else "",
-    )
-
-
 def _read_log(path: Path) -> RunRecord:
     from tdhil.recording import find_ended, read_run
 

@@ -6,13 +6,8 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING
 
 from tdhil.run import StopRequest
-
-if TYPE_CHECKING:
-    pass
-
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")  # the last three don't exist everywhere
 

@@ -54,7 +54,7 @@ ASSUMED_TORQUE_SCALE_REL_SD = 0.03
 """Where nobody says how good a real drive's torque scale is: inverters know it to some percent."""
 
 UNKNOWN_LAG_SD_SHARE = 0.1
-"""Standard deviation of a lag that rig.yaml states without one."""
+"""Standard deviation of a lag that is stated without one."""
 
 
 def bench_of(identity: Identity, rig: Rig | None) -> Rig:
@@ -113,22 +113,28 @@ def excitation_request(options: RunOptions) -> ExcitationRequest:
     )
 
 
-def lag_prior(bench: Rig) -> LagPrior:
-    """What rig.yaml says of the reporting lags."""
-    data = bench.drive_data
-
+def stated_lags(
+    speed_lag_s: float | None, speed_lag_sd_s: float | None, torque_lag_s: float | None, torque_lag_sd_s: float | None,
+    source: str,
+) -> LagPrior:
+    """Reporting lags as somebody states them, with who that is; a deviation that isn't stated is a tenth."""
     def deviation(lag_s: float | None, stated_s: float | None) -> float:
         if lag_s is None:
             return 0.0
         return stated_s if stated_s is not None else UNKNOWN_LAG_SD_SHARE * lag_s
 
-    known = data.speed_lag_s is not None or data.torque_lag_s is not None
+    known = speed_lag_s is not None or torque_lag_s is not None
     return LagPrior(
-        data.speed_lag_s,
-        deviation(data.speed_lag_s, data.speed_lag_sd_s),
-        data.torque_lag_s,
-        deviation(data.torque_lag_s, data.torque_lag_sd_s),
-        "rig.yaml" if known else "",
+        speed_lag_s, deviation(speed_lag_s, speed_lag_sd_s), torque_lag_s, deviation(torque_lag_s, torque_lag_sd_s),
+        source if known else "",
+    )
+
+
+def lag_prior(bench: Rig) -> LagPrior:
+    """What rig.yaml says of the reporting lags."""
+    data = bench.drive_data
+    return stated_lags(
+        data.speed_lag_s, data.speed_lag_sd_s, data.torque_lag_s, data.torque_lag_sd_s, "rig.yaml"
     )
 
 
