@@ -5,9 +5,9 @@ own kernel the runs take place in the guest of tests/vcan/run_in_guest.sh, and t
 takes two minutes; ``--lanes`` go side by side, each on an interface of its own. That is another question: a guest has
 one processor, and what one lane plans or starts keeps it busy for the others.
 
-On a machine that has other work to do, give the guest weight (its /proc/PID/autogroup, where the kernel has that),
-never a real-time class: under SCHED_FIFO a guest gets no timer tick while one of its processes computes, and all of it
-stands still for more than a second.
+The guest has the weight that run_in_guest.sh asks for, so that other work of the machine doesn't stop its clock. Never
+give it a real-time class: under SCHED_FIFO a guest gets no timer tick while one of its processes computes, and all of
+it stands still for more than a second.
 
 A line a run: lane, seed, exit code, rate, cycles, missed, late, J with its interval; then what all of them show. Exit 1
 where a run ended for lateness (code 5), or 1 % of all cycles or more were missed.

@@ -271,6 +271,7 @@ run_in_guest() {
         "uml_dir=$work/uml/" con=null con0=null,fd:3 con1=null,fd:4 con2=null,fd:5 ssl=null console=tty0 quiet panic=-1 noreboot \
         </dev/null 3>&"$console" 4>&"$out" 5>&"$err" {out}>&- {err}>&- {console}>&- >&3 2>&3 &
     guest=$!
+    give_weight
     exec {out}>&- {err}>&- {console}>&-
     wait "$guest" 2>/dev/null || status=$?
     # Nothing of it may be left, also after a death that was not orderly.
@@ -291,6 +292,18 @@ run_in_guest() {
     fi
     printf '%s: the guest died under the command: %s\n' "$me" "$(reason)" >&2
     return "$DIED"
+}
+
+give_weight() { # to the guest's scheduling group, so that whatever else computes on this machine doesn't stop its clock
+    # It waits most of the time and takes little. Only root may ask, and only a kernel with autogroups knows it: for
+    # anybody else the guest has its ordinary share.
+    local pid
+    for _ in {1..30}; do
+        sleep 0.1
+        pid=$(cat "$work"/uml/*/pid 2>/dev/null) || continue
+        echo -19 2>/dev/null >"/proc/$pid/autogroup" || true
+        return 0
+    done
 }
 
 sweep() { # scratch directories of runs that were killed outright: ours, not fresh, and no longer held
