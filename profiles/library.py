@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +12,7 @@ from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError, Problem
 from profiles.modbus import ModbusProfile
 from profiles.model import DataModel
-from profiles.yaml_loader import load_model
+from profiles.yaml_loader import parse_model, read_text
 
 Profile = CanopenProfile | ModbusProfile
 
@@ -68,7 +69,13 @@ def load_profile(name_or_path: str) -> Profile:
     DataFileError with every problem and its line.
     """
     path = profile_path(name_or_path)
-    return load_model(path, _MODELS[load_model(path, _Head).bus])
+    return _parsed(read_text(path), str(path))
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, name: str) -> Profile:
+    """The same text is parsed once: what comes of it is frozen, and a scan or a table asks for all of them."""
+    return parse_model(text, name, _MODELS[parse_model(text, name, _Head).bus])
 
 
 def load_canopen_profile(name_or_path: str) -> CanopenProfile:

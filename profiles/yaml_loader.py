@@ -452,7 +452,7 @@ def parse_model(text: str, name: str, model: type[M]) -> M:
 
 def load_with_lines(path: Path, model: type[M], *, convert: bool = False) -> Loaded[M]:
     """As `load_model`, with the line of each key besides."""
-    return parse_with_lines(_read(path), str(path), model, convert=convert)
+    return parse_with_lines(read_text(path), str(path), model, convert=convert)
 
 
 def parse_with_lines(text: str, name: str, model: type[M], *, convert: bool = False) -> Loaded[M]:
@@ -483,7 +483,8 @@ def _validated(tree: yaml_tree.Tree, model: type[M]) -> M:
     return model.model_validate_json(json.dumps(tree.data), strict=True)
 
 
-def _read(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The text of the file at ``path``; DataFileError if it can't be read, or is no UTF-8."""
     name = str(path)
     try:
         with path.open("rb") as stream:
@@ -517,4 +518,7 @@ def _all(problems: list[Problem]) -> DataFileError:
     return DataFileError(tuple(shown))
 
 
-__all__ = ["Conversion", "DataModel", "Loaded", "load_model", "load_with_lines", "parse_model", "parse_with_lines"]
+__all__ = [
+    "Conversion", "DataModel", "Loaded", "load_model", "load_with_lines",
+    "parse_model", "parse_with_lines", "read_text",
+]
