@@ -10,7 +10,7 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 import numpy as np
 
 from drivers import Sample
-from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
+from tdhil.recording.recording import BoolArray, Excitation, FloatArray, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Dataclasses from plain values: from JSON's lists and dictionaries, or from a protobuf message.
@@ -105,6 +105,11 @@ class RecordingBuilder:
         """The same, from what a Recording keeps of it."""
         self._values.extend((time_s, speed_rad_s, torque_nm))
         self._flags.append((1 if fresh else 0) | (2 if limited else 0))
+
+    def add_block(self, values: FloatArray, fresh: BoolArray, limited: BoolArray) -> None:
+        """The same of many cycles: ``values`` (n, 3) are time in s, speed in rad/s and torque in N·m."""
+        self._values.frombytes(np.ascontiguousarray(values, np.float64).tobytes())
+        self._flags += (fresh.astype(np.uint8) | limited.astype(np.uint8) << 1).tobytes()
 
     def stage(self, stage: Stage) -> None:
         """A stage that has ended."""

@@ -32,12 +32,14 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 #     Frame    09 time_s:8  10 outgoing:1  1D identifier:4  22 length  data
 #
 # Zeros are written out, where protobuf would leave them away: both read the same, and the layout stays constant.
-# Field numbers and types are those of `channels.MESSAGES`. Raises struct.error for an integer out of its range.
+# Field numbers and types are those of `log_format.MESSAGES`. Raises struct.error for an integer out of its range.
 
 
 _SAMPLE = Struct("<BdBdBdBdBd B?B?B?BBBB BI".replace(" ", ""))
 _DEMAND = Struct("<Bd")
 _COMMAND = Struct("<BdBdBdBB")
+SAMPLE_SIZE: Final = _SAMPLE.size      # bytes without the torque demand, which takes `DEMAND_SIZE` more
+DEMAND_SIZE: Final = _DEMAND.size
 
 
 def pack_sample(sample: Sample) -> bytes:

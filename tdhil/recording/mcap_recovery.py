@@ -82,14 +82,14 @@ def chunk_head(file: BinaryIO, offset: int, size: int) -> ChunkHead | None:
     return ChunkHead(name, uncompressed_size, crc, offset + name_at + name_length + 8, data_length)
 
 
-def contents(file: BinaryIO, offset: int, chunk: ChunkHead) -> Contents | Damage:
-    """The chunk whose head was read at ``offset``, decompressed and checked."""
+def contents(file: BinaryIO, offset: int, chunk: ChunkHead, zstd: zstandard.ZstdDecompressor) -> Contents | Damage:
+    """The chunk whose head was read at ``offset``, decompressed and checked. ``zstd`` bounds the window."""
     if chunk.uncompressed_size > CHUNK_LIMIT or chunk.length > CHUNK_LIMIT:
         return Damage(offset, f"a chunk of {max(chunk.uncompressed_size, chunk.length)} bytes is refused "
                                f"(limit {CHUNK_LIMIT})")
     data = read_at(file, chunk.start, chunk.length)
     try:
-        inflated = _decompress(chunk.compression, data, chunk.uncompressed_size + 1)
+        inflated = _decompress(zstd, chunk.compression, data, chunk.uncompressed_size + 1)
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
         return Damage(offset, f"a chunk can't be decompressed: {' '.join(str(error).split())}")
     if len(inflated) != chunk.uncompressed_size:
@@ -99,10 +99,12 @@ def contents(file: BinaryIO, offset: int, chunk: ChunkHead) -> Contents | Damage
     return Contents(offset, inflated)
 
 
-def _decompress(compression: str, data: bytes, limit: int) -> bytes:
+def _decompress(zstd: zstandard.ZstdDecompressor, compression: str, data: bytes, limit: int) -> bytes:
     """At most ``limit`` bytes of it, and never more than that in memory."""
     if compression == "zstd":
-        with zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT).stream_reader(data) as reader:
+        if 0 <= zstandard.frame_content_size(data) < limit:     # what the frame states is all that is made room for
+            return zstd.decompress(data)
+        with zstd.stream_reader(data) as reader:
             return reader.read(limit)
     if compression == "lz4":
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))
@@ -148,6 +150,7 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
     ``size`` is the length of the file. The magic at its start is the caller's to check.
     """
     offset, total = len(MAGIC), 0
+    zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
     while True:
         head = read_at(file, offset, _RECORD.size)
         opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
@@ -159,7 +162,7 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
             yield Whole() if _is_closed(file, size) else Damage(offset, "the index at the end is cut or damaged")
             return
         if opcode == CHUNK and (chunk := chunk_head(file, offset, size)):
-            found = contents(file, offset, chunk)
+            found = contents(file, offset, chunk, zstd)
             if isinstance(found, Contents):
                 total += len(found.data)
                 if total > TOTAL_LIMIT:

@@ -144,6 +144,7 @@ def _csv(path: Path) -> None:
 def _mcap(path: Path) -> None:
     from tdhil.recording.log_reader import read_frames, read_run, read_samples
     from tdhil.recording.salvage import examine, write_copy
+    from tests.recording.log_runs import same_run
 
     copy = path.with_suffix(".copy")
     found = examine(path)                  # as `tdhil recover`: also where the head is damaged
@@ -151,7 +152,7 @@ def _mcap(path: Path) -> None:
     again = read_run(copy)
     assert again.complete == found.whole
     assert len(again.recording.time_s) == len(found.run.recording.time_s)
-    read_run(path)
+    assert same_run(read_run(path), read_run(path, batch=0))
     for _ in read_samples(path):
         pass
     for _ in read_frames(path):

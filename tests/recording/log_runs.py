@@ -9,6 +9,7 @@ import numpy as np
 from drivers.drive import Command, Mode, PowerState, RawFrame, Sample
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import Event
+from tdhil.recording.log_reader import LoggedRun
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Excitation, LagPrior, Level, Ramp, Recording, Segment, Stage
 
@@ -79,6 +80,13 @@ def make_run(path: Path, cycles: int = 1000, epoch_ns: int = 0) -> RecordingBuil
     with RunWriter(path, epoch_ns=epoch_ns, block=True) as writer:
         fill(writer, builder, cycles)
     return builder
+
+
+def same_run(one: LoggedRun, other: LoggedRun) -> bool:
+    """Equal in all that was read, problems too; the recordings to the last bit."""
+    rest = [(field.name, repr(getattr(one, field.name)) == repr(getattr(other, field.name)))
+            for field in fields(LoggedRun) if field.name != "recording"]
+    return same(one.recording, other.recording) and all(equal for _, equal in rest)
 
 
 def same(one: Recording, other: Recording) -> bool:

@@ -19,7 +19,7 @@ from mcap.writer import Writer
 from tdhil.errors import LogError
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.mcap_container import LIBRARY, MAGIC
-from tests.recording.log_runs import make_run
+from tests.recording.log_runs import make_run, same_run
 
 QUIET = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -56,6 +56,7 @@ def test_cut_anywhere(good, tmp_path, share):
         assert cut < 64
         return
     run, some, few = got
+    assert same_run(run, read_run(tmp_path / "cut.mcap", batch=0))
     assert not run.complete
     assert not run.recording.complete
     assert run.problems
@@ -87,6 +88,7 @@ def test_flipped_bits(good, tmp_path, seed, flips):
         assert damaged[:64] != data[:64]
         return
     run, some, few = got
+    assert same_run(run, read_run(tmp_path / "flip.mcap", batch=0))
     assert len(some) >= len(samples) - flips * 202
     assert is_part(some, samples)
     assert is_part(few, frames)

@@ -1,0 +1,192 @@
+"""Many chunks at once: where their records stand, and what their samples hold, by numpy.
+
+A log of ours has a chunk each 0.2 s of control time, some 150 records in it; walking from record to record in Python
+is most of what reading costs. Here all chunks of a batch are walked in step: the k-th records of all of them together.
+What isn't laid out exactly as our own writer lays it out is not decided here: the caller then goes message by message.
+Pure, over bytes that may be hostile; nothing is taken on trust from indexes.
+"""
+
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from struct import Struct
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.recording.log_messages import DEMAND_SIZE, SAMPLE_SIZE
+
+_HEAD: Final = Struct("<BQ")           # opcode:1  length:8
+_MESSAGE_HEAD: Final = 22              # channel:2  sequence:4  log time:8  publish time:8
+_FEW: Final = 12                       # chunks; below, a loop in Python is quicker than numpy's calls
+_MESSAGE: Final = 0x05
+_DECLARING: Final = (0x03, 0x04)       # schema, channel
+
+_HEAD_ROW: Final = np.dtype([("opcode", "u1"), ("length", "<u8")])
+_MESSAGE_ROW: Final = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time_ns", "<u8")])
+_SAMPLE_ROW: Final = np.dtype([
+    ("tag1", "u1"), ("time_s", "<f8"), ("tag2", "u1"), ("speed_rad_s", "<f8"), ("tag3", "u1"), ("torque_nm", "<f8"),
+    ("tag4", "u1"), ("age_s", "<f8"), ("tag5", "u1"), ("half_width_s", "<f8"), ("tag6", "u1"), ("fresh", "u1"),
+    ("tag7", "u1"), ("limit_active", "u1"), ("tag8", "u1"), ("standstill", "u1"), ("tag9", "u1"), ("state", "u1"),
+    ("tag10", "u1"), ("mode", "u1"), ("tag11", "u1"), ("status", "<u4"),
+])
+"""`log_messages.pack_sample`, byte by byte; a tenth double may follow, behind its tag."""
+_TAGS: Final = tuple(
+    zip((f"tag{k}" for k in range(1, 12)), (0x09, 0x11, 0x19, 0x21, 0x29, 0x30, 0x38, 0x40, 0x48, 0x50, 0x5D),
+        strict=True))
+_VARINTS: Final = ("fresh", "limit_active", "standstill", "state", "mode")
+_DEMAND_TAG: Final = 0x61
+
+Offsets = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """Samples in their order: ``values`` (n, 3) time in s, speed in rad/s, torque in N·m; ``flags``: fresh, limited."""
+
+    values: NDArray[np.float64]
+    fresh: NDArray[np.bool_]
+    limited: NDArray[np.bool_]
+    first_log_time_ns: int
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message as it stands in its chunk, not decoded yet."""
+
+    number: int
+    payload: bytes
+
+
+class ChunkTable:
+    """The records of several chunks, one behind the other.
+
+    ``plain`` tells of each chunk whether it holds messages alone, each of them whole.
+    """
+
+    def __init__(self, chunks: Sequence[bytes]) -> None:
+        self._data = b"".join(chunks)
+        ends = np.cumsum([len(chunk) for chunk in chunks], dtype=np.int64)
+        starts = np.concatenate((np.zeros(1, np.int64), ends[:-1]))
+        at, opcode, length, whole = _records(self._data, starts, ends)
+        chunk_of = np.searchsorted(ends, at, side="right")
+        odd = ((opcode == _MESSAGE) & (length < _MESSAGE_HEAD)) | np.isin(opcode, _DECLARING)
+        whole[chunk_of[odd]] = False
+        self.plain: tuple[bool, ...] = tuple(whole.tolist())
+        kept = opcode == _MESSAGE
+        self._at, self._length = at[kept] + _HEAD.size, length[kept]
+        self._rows = np.searchsorted(self._at, np.concatenate((starts, ends[-1:])))
+
+    def messages(
+        self, first: int, last: int, numbers: Mapping[int, int], samples: int, skipped: frozenset[int]
+    ) -> tuple[SampleBlock | None, list[Message], bool] | None:
+        """The samples of the plain chunks from ``first`` to before ``last``, the other messages, and was any of ours?
+
+        ``numbers``: which channel of the file is which of ours; ``samples``: the one of the samples; ``skipped``: those
+        not wanted. None where a sample isn't laid out exactly as our writer does it.
+        """
+        rows = slice(self._rows[first], self._rows[last])
+        at, length = self._at[rows], self._length[rows]
+        known = np.zeros(2**16, np.uint8)
+        for channel, number in numbers.items():
+            known[channel] = number
+        head = _taken(self._data, at, _MESSAGE_ROW)
+        number_of = known[head["channel"]]
+        is_sample = number_of == samples
+        block = None
+        if is_sample.any():
+            block = self._samples(at[is_sample], length[is_sample], int(head["log_time_ns"][np.argmax(is_sample)]))
+            if block is None:
+                return None
+        others = np.flatnonzero((number_of != 0) & ~is_sample & ~np.isin(number_of, tuple(skipped)))
+        found = [
+            Message(int(number_of[k]), self._data[at[k] + _MESSAGE_HEAD:at[k] + length[k]]) for k in others.tolist()
+        ]
+        return block, found, bool(number_of.any())
+
+    def _samples(self, at: Offsets, length: Offsets, log_time_ns: int) -> SampleBlock | None:
+        size = length - _MESSAGE_HEAD
+        more = size == SAMPLE_SIZE + DEMAND_SIZE
+        if not np.all(more | (size == SAMPLE_SIZE)):
+            return None
+        rows = _taken(self._data, at + _MESSAGE_HEAD, _SAMPLE_ROW)
+        exact = all((rows[name] == tag).all() for name, tag in _TAGS) and all(
+            (rows[name] < 0x80).all() for name in _VARINTS)
+        if exact and more.any():
+            data = np.frombuffer(self._data, np.uint8)
+            exact = bool((data[at[more] + _MESSAGE_HEAD + SAMPLE_SIZE] == _DEMAND_TAG).all())
+        if not exact:
+            return None
+        values = np.empty((len(rows), 3))
+        for column, name in enumerate(("time_s", "speed_rad_s", "torque_nm")):
+            values[:, column] = rows[name]
+        return SampleBlock(values, rows["fresh"] != 0, rows["limit_active"] != 0, log_time_ns)
+
+
+def _taken(data: bytes, at: Offsets, row: np.dtype[np.void]) -> NDArray[np.void]:
+    """A copy of the rows that begin at these bytes; each must lie within ``data``."""
+    if not len(at):
+        return np.empty(0, row)
+    # As plain bytes, which are copied in one go, where fields would be copied one by one.
+    everywhere: NDArray[np.void] = np.ndarray((len(data) - row.itemsize + 1,), f"V{row.itemsize}", data, strides=(1,))
+    return everywhere[at].view(row)
+
+
+def _records(
+    data: bytes, starts: Offsets, ends: Offsets
+) -> tuple[Offsets, NDArray[np.uint8], Offsets, NDArray[np.bool_]]:
+    """Where each record begins, its opcode and its length, in the order of ``data``; and of each chunk: is it whole?"""
+    whole = np.ones(len(starts), np.bool_)
+    places, opcodes, lengths = [], [], []
+    chunk = np.flatnonzero(starts < ends)
+    at = starts[chunk]
+    while len(chunk) >= _FEW:
+        room = ends[chunk] - at - _HEAD.size
+        fits = room >= 0
+        if not fits.all():
+            whole[chunk[~fits]] = False
+            chunk, at, room = chunk[fits], at[fits], room[fits]
+            continue
+        head = _taken(data, at, _HEAD_ROW)
+        fits = head["length"] <= room.astype(np.uint64)
+        if not fits.all():
+            whole[chunk[~fits]] = False
+            chunk, at, head = chunk[fits], at[fits], head[fits]
+        length = head["length"].astype(np.int64)
+        places.append(at)
+        opcodes.append(head["opcode"])
+        lengths.append(length)
+        at = at + _HEAD.size + length
+        going = at < ends[chunk]
+        if not going.all():
+            chunk, at = chunk[going], at[going]
+    for one, start in zip(chunk.tolist(), at.tolist(), strict=True):
+        found, whole[one] = _walk(data, start, int(ends[one]))
+        if found:
+            table = np.frombuffer(found, np.int64).reshape(-1, 3)
+            places.append(table[:, 0])
+            opcodes.append(table[:, 1].astype(np.uint8))
+            lengths.append(table[:, 2])
+    if not places:
+        none = np.empty(0, np.int64)
+        return none, none.astype(np.uint8), none, whole
+    every = np.concatenate(places)
+    order = np.argsort(every, kind="stable")
+    return every[order], np.concatenate(opcodes)[order], np.concatenate(lengths)[order], whole
+
+
+def _walk(data: bytes, at: int, end: int) -> "tuple[array[int], bool]":
+    """The same of one chunk, record by record: place, opcode, length, place, …"""
+    found = array("q")
+    unpack, head = _HEAD.unpack_from, _HEAD.size
+    while at < end:
+        if at + head > end:
+            return found, False
+        opcode, length = unpack(data, at)
+        after = at + head + length
+        if after > end:
+            return found, False
+        found.extend((at, opcode, length))
+        at = after
+    return found, True
