@@ -7,7 +7,9 @@ from profiles.face import lazy_face as lazy_face
 if TYPE_CHECKING:
     from profiles.eds_import import begin_profile as begin_profile
     from profiles.eds_reader import read_eds as read_eds
-    from profiles.entry import Confidence as Confidence, Entry as Entry, Require as Require
+    from profiles.entry import (
+        Confidence as Confidence, DriveProfile as DriveProfile, Entry as Entry, Require as Require,
+    )
     from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError
     from profiles.face import lazy_face as lazy_face
     from profiles.library import (
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     )
     from profiles.model import (
         DataModel as DataModel, Finding as Finding, NonNegative as NonNegative, Positive as Positive,
-        Validated as Validated, refuse_if as refuse_if,
+        Validated as Validated, one_of as one_of, refuse_if as refuse_if,
     )
     from profiles.simulator_marker import (
         CYCLES_END as CYCLES_END, CYCLE_ANSWER as CYCLE_ANSWER, CYCLE_ASKED as CYCLE_ASKED, CYCLE_ID as CYCLE_ID,
@@ -37,14 +39,14 @@ else:
         {
             "eds_import": ("begin_profile",),
             "eds_reader": ("read_eds",),
-            "entry": ("Confidence", "Entry", "Require"),
+            "entry": ("Confidence", "DriveProfile", "Entry", "Require"),
             "errors": ("DataFileError", "Problem", "TdhilError"),
             "face": ("lazy_face",),
             "library": (
                 "Profile", "eds_path", "load_canopen_profile", "load_modbus_profile", "load_profile",
                 "matching_names", "profile_names",
             ),
-            "model": ("DataModel", "Finding", "NonNegative", "Positive", "Validated", "refuse_if"),
+            "model": ("DataModel", "Finding", "NonNegative", "Positive", "Validated", "one_of", "refuse_if"),
             "simulator_marker": (
                 "CYCLES_END", "CYCLE_ANSWER", "CYCLE_ASKED", "CYCLE_ID", "CYCLE_OVER", "LAST_CYCLE_OVER",
                 "MARKER_INDEX", "MARKER_REGISTER", "MARKER_REGISTERS", "MARKER_STAGE", "MARKER_STAGE_REGISTER",

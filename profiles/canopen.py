@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import Confidence, Entry, Positive, ProfileName, Require
+from profiles.entry import DriveProfile, Entry, Positive, Require
 from profiles.model import DataModel, Finding, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -259,13 +259,10 @@ class Cyclic(Entry):
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-class CanopenProfile(DataModel):
+class CanopenProfile(DriveProfile):
     """One drive on CANopen."""
 
-    name: ProfileName = Field(description="vendor/model, as in --profile")
-    title: str = Field(min_length=3, description="one line for tables and reports")
     bus: Literal["canopen"]
-    experimental: bool = Field(default=False, description="second-hand, or never tried on the bus that it names")
     eds: str | None = Field(default=None, description="an EDS file beside this one; null = none needed")
     node: int = Field(default=1, ge=1, le=127, description="node number unless told otherwise")
     identity: IdentityEntry
@@ -332,9 +329,15 @@ class CanopenProfile(DataModel):
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         return (*found, *((f"parameters.{part.name}", part) for part in self.parameters))
 
-    def below(self, confidence: Confidence) -> tuple[str, ...]:
-        """Names of the entries of exactly this confidence."""
-        return tuple(name for name, part in self.entries() if part.confidence == confidence)
+    @property
+    def can_torque(self) -> bool:
+        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        return bool(self.modes.torque) and self.modes.switch_while_enabled
+
+    @property
+    def rated_torque_by_hand(self) -> bool:
+        """Does rig.yaml have to say what 100 % torque is?"""
+        return self.torque.rated_torque_nm_per_lsb is None
 
 
 __all__ = ["CanopenProfile", "ReportingFilter", "Watchdog"]

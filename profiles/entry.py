@@ -1,7 +1,8 @@
 """What every section of a profile carries: where it comes from, and how sure we are of it."""
 
 
-from typing import Annotated, Literal, Self
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -40,3 +41,37 @@ class Entry(DataModel):
 
     source: str = Field(min_length=3, description="the document, file or measurement that says so")
     confidence: Confidence = Field(description="verified, likely or unverified")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+class DriveProfile(DataModel):
+    """What every profile says, whatever its bus; each bus has its own below this, in a module of its name."""
+
+    name: ProfileName = Field(description="vendor/model, as in --profile")
+    title: str = Field(min_length=3, description="one line for tables and reports")
+    bus: str
+    experimental: bool = Field(default=False, description="second-hand, or never tried on the bus that it names")
+
+    def entries(self) -> tuple[tuple[str, Entry], ...]:
+        """(name, entry) of everything that the profile says, with its source and confidence."""
+        raise NotImplementedError
+
+    def below(self, confidence: Confidence) -> tuple[str, ...]:
+        """Names of the entries of exactly this confidence."""
+        return tuple(name for name, part in self.entries() if part.confidence == confidence)
+
+    @property
+    def can_torque(self) -> bool:
+        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        raise NotImplementedError
+
+    @property
+    def rated_torque_by_hand(self) -> bool:
+        """Does rig.yaml have to say what 100 % torque is?"""
+        raise NotImplementedError
+
+    @property
+    def untold(self) -> Sequence[Any]:
+        """The parameters that can't be read over the bus, each with ``name``, ``title`` and ``unit``."""
+        return ()

@@ -4,21 +4,26 @@ import difflib
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any
 
-from pydantic import ConfigDict
+from pydantic import BeforeValidator, ConfigDict
 
 from profiles.canopen import CanopenProfile
 from profiles.errors import DataFileError, Problem
 from profiles.modbus import ModbusProfile
-from profiles.model import DataModel
+from profiles.model import DataModel, one_of
 from profiles.yaml_loader import parse_model, read_text
 
 Profile = CanopenProfile | ModbusProfile
 
 _ROOT = Path(__file__).parent
 _SUFFIXES = (".yaml", ".yml")
-_MODELS: dict[str, type[CanopenProfile] | type[ModbusProfile]] = {"canopen": CanopenProfile, "modbus": ModbusProfile}
+SCHEMAS: dict[str, type[CanopenProfile] | type[ModbusProfile]] = {"canopen": CanopenProfile, "modbus": ModbusProfile}
+"""What a profile says, by the bus that it names."""
+
+
+def _known_bus(value: Any) -> Any:
+    return one_of(tuple(SCHEMAS), value)
 
 
 class _Head(DataModel):
@@ -26,7 +31,7 @@ class _Head(DataModel):
 
     model_config = ConfigDict(extra="ignore")
 
-    bus: Literal["canopen", "modbus"]
+    bus: Annotated[str, BeforeValidator(_known_bus)]
 
 
 def profile_names() -> tuple[str, ...]:
@@ -63,34 +68,35 @@ def profile_path(name_or_path: str) -> Path:
     raise DataFileError((Problem("profile", 0, _unknown(name_or_path, names)),))
 
 
-def load_profile(name_or_path: str) -> Profile:
-    """A profile that ships (``generic/cia402``) or a file of the user's (``./my-drive.yaml``), whatever its bus.
+def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
+    """A profile that ships (``generic/cia402``) or a file of the user's (``./my-drive.yaml``), of any bus or of this.
 
-    DataFileError with every problem and its line.
+    DataFileError with every problem and its line, and for a profile of another bus.
     """
     path = profile_path(name_or_path)
-    return _parsed(read_text(path), str(path))
+    profile = _parsed(read_text(path), str(path))
+    if bus is not None and profile.bus != bus:
+        raise DataFileError((Problem(name_or_path, 0, f"is a profile for {profile.bus}, and --drive says {bus}"),))
+    return profile
 
 
 @lru_cache(maxsize=64)
 def _parsed(text: str, name: str) -> Profile:
     """The same text is parsed once: what comes of it is frozen, and a scan or a table asks for all of them."""
-    return parse_model(text, name, _MODELS[parse_model(text, name, _Head).bus])
+    return parse_model(text, name, SCHEMAS[parse_model(text, name, _Head).bus])
 
 
 def load_canopen_profile(name_or_path: str) -> CanopenProfile:
     """As `load_profile`; DataFileError for a profile of another bus."""
-    profile = load_profile(name_or_path)
-    if not isinstance(profile, CanopenProfile):
-        raise _other_bus(name_or_path, profile.bus, "canopen")
+    profile = load_profile(name_or_path, "canopen")
+    assert isinstance(profile, CanopenProfile)
     return profile
 
 
 def load_modbus_profile(name_or_path: str) -> ModbusProfile:
     """As `load_profile`; DataFileError for a profile of another bus."""
-    profile = load_profile(name_or_path)
-    if not isinstance(profile, ModbusProfile):
-        raise _other_bus(name_or_path, profile.bus, "modbus")
+    profile = load_profile(name_or_path, "modbus")
+    assert isinstance(profile, ModbusProfile)
     return profile
 
 
@@ -104,10 +110,6 @@ def eds_path(name_or_path: str) -> Path | None:
     if not path.is_file():
         raise DataFileError((Problem(str(file), 0, f"eds: no file '{profile.eds}' beside this profile"),))
     return path
-
-
-def _other_bus(name: str, found: str, wanted: str) -> DataFileError:
-    return DataFileError((Problem(name, 0, f"is a profile for {found}, and --drive says {wanted}"),))
 
 
 def _unknown(name: str, names: tuple[str, ...]) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import Confidence, Entry, Positive, ProfileName, Require
+from profiles.entry import Confidence, DriveProfile, Entry, Positive, Require
 from profiles.model import DataModel, Finding, refuse_if
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -333,13 +333,10 @@ class Line(Entry):
     turn_around_s: float = Field(default=0.005, ge=0, le=1, description="from the end of a request to its reply")
 
 
-class ModbusProfile(DataModel):
+class ModbusProfile(DriveProfile):
     """One drive on Modbus."""
 
-    name: ProfileName = Field(description="vendor/model, as in --profile")
-    title: str = Field(min_length=3, description="one line for tables and reports")
     bus: Literal["modbus"]
-    experimental: bool = Field(default=False, description="from second-hand sources throughout")
     line: Line
     control: Control
     modes: ModeSwitch
@@ -415,6 +412,17 @@ class ModbusProfile(DataModel):
         shown = {echo.setpoint for echo in self.echoes}
         return tuple(setpoint for setpoint in used if setpoint not in shown)
 
-    def below(self, confidence: Confidence) -> tuple[str, ...]:
-        """Names of the entries of exactly this confidence."""
-        return tuple(name for name, part in self.entries() if part.confidence == confidence)
+    @property
+    def can_torque(self) -> bool:
+        """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
+        return self.modes.torque and self.modes.switch_while_enabled
+
+    @property
+    def rated_torque_by_hand(self) -> bool:
+        """Does rig.yaml have to say what 100 % torque is?"""
+        return self.rated_torque is None
+
+    @property
+    def untold(self) -> tuple[Parameter, ...]:
+        """The parameters that stand in no register."""
+        return tuple(one for one in self.parameters if one.register_ is None)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic_core import PydanticCustomError, PydanticKnownError
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The base of every parameter set: frozen, strict, no unknown keys, no NaN, no infinity.
@@ -61,6 +61,14 @@ def refuse_if(findings: Sequence[Finding]) -> None:
         text = "; ".join(f"{at}: {message}" if at else message for at, message in findings)
         # Braces would be taken for place-holders of the template.
         raise PydanticCustomError(CROSS_FIELD, "{text}", {"text": text, "findings": list(findings)})
+
+
+def one_of(known: Sequence[str], value: Any) -> Any:
+    """``value``, in a validator: refused with all of ``known`` where it is none of them, as by a Literal."""
+    if value in known:
+        return value
+    *first, last = map(repr, known)
+    raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}" if first else last})
 
 
 def values_of(model: DataModel) -> dict[str, Any]:

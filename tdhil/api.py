@@ -284,7 +284,6 @@ def _request(
     from tdhil.session import (
         Consent,
         RunRequest,
-        can_torque,
         check_log_path,
         check_names,
         connection_of,
@@ -302,7 +301,7 @@ def _request(
     check_log_path(Path(options.log), "log")
     peer = with_faults(plan_peer(options, connection), drive.faults, connection.drive)
     bench = suited(drive.rig, peer.plant)
-    refuse_hopeless(options, bench, can_torque(connection.profile))
+    refuse_hopeless(options, bench, connection.profile.can_torque)
     return RunRequest(options, connection, peer, bench, consent or Consent(), operator, note)
 
 

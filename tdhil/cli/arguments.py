@@ -11,7 +11,8 @@ from pathlib import Path
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config import BUSES
+from tdhil.config import BUSES, DEFAULT_BUS
+from tdhil.session import bus_kinds
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -37,32 +38,19 @@ share = amount(SHARE)
 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Which drive; the group, for what a command has to add to it."""
+    kinds = bus_kinds()
     drive = parser.add_argument_group("drive")
     drive.add_argument("--drive", choices=tuple(BUSES),
-                       help="how the drive is spoken to (default: as the profile is, else canopen)")
-    drive.add_argument("--profile", metavar="NAME",
-                       help="vendor/model, or a .yaml file (default generic/cia402, generic/modbus)")
+                       help=f"how the drive is spoken to (default: as the profile is, else {DEFAULT_BUS})")
+    drive.add_argument("--profile", metavar="NAME", help="vendor/model, or a .yaml file (default "
+                       f"{', '.join(kind.default_profile for kind in kinds)})")
     drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
-    drive.add_argument("--node", type=int, metavar="N", help="CANopen node number (default: the profile's)")
+    for kind in kinds:
+        kind.add_drive_arguments(drive)
     return drive
 
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
-    """Where it is: a Modbus line, or a CAN bus with python-can's own options."""
-    from can.cli import add_bus_arguments
-
-    from profiles.quantities import BIT_RATE
-
-    modbus = parser.add_argument_group("Modbus (what is left out is as the profile says)")
-    modbus.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")
-    modbus.add_argument("--port", type=int, metavar="N", help="TCP port (default 502)")
-    modbus.add_argument("--serial", metavar="DEVICE", help="Modbus RTU: serial device, such as /dev/ttyUSB0")
-    modbus.add_argument("--baud", type=int, metavar="N", help="bit/s of the serial line")
-    modbus.add_argument("--parity", choices=("N", "E", "O"), help="none, even or odd")
-    modbus.add_argument("--stop-bits", type=int, choices=(1, 2), help="of the serial line")
-    modbus.add_argument("--unit", type=int, metavar="N", help="unit (slave) number of the drive")
-    add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
-    bit_rate = amount(BIT_RATE)
-    for action in parser._actions:  # python-can's take no 500k
-        if action.dest in ("bitrate", "data_bitrate"):
-            action.type = lambda text: int(bit_rate(text))
+    """Where it is, on any bus: python-can's own options are the most, and come last."""
+    for kind in reversed(bus_kinds()):
+        kind.add_arguments(parser)

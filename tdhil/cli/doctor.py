@@ -18,11 +18,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.cli.bus_commands import bus_commands
 from tdhil.cli.finding import Finding, bad, note, ok
 from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
-    from tdhil.cli.buses.modbus_doctor import RegisterSeen
+    from tdhil.cli.bus_commands import ValueSeen
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection
 
@@ -158,7 +159,7 @@ def run(namespace: argparse.Namespace) -> int:
     options = resolve(vars(namespace), rig)
     if options.json is True:
         namespace.json = True
-    registers: list[RegisterSeen] = []
+    registers: list[ValueSeen] = []
     found: list[Finding] = []
     for one in findings(vars(namespace), rig, options, registers):
         found.append(one)
@@ -175,12 +176,12 @@ def run(namespace: argparse.Namespace) -> int:
 
 
 def findings(
-    cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[RegisterSeen]
+    cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[ValueSeen]
 ) -> Iterator[Finding]:
-    """From the computer to the drive; ``registers`` is filled with those of a Modbus drive."""
+    """From the computer to the drive; ``registers`` is filled with what a person may compare."""
     from drivers import DataFileError
     from tdhil.cli.finding import note, of_error
-    from tdhil.session import connection_of
+    from tdhil.session import connection_of, plan_peer
 
     yield from host_findings(Path(options.log))
     yield from _left(Path(options.log).parent)
@@ -194,10 +195,10 @@ def findings(
     if not (options.simulate or connection.configured):
         yield note("drive", f"{connection.nothing_there}: no drive was looked at",
                    "Name it, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0")
-    elif connection.drive == "modbus":
-        yield from _modbus(options, connection, rig, registers)
     else:
-        yield from _canopen(options, connection, rig)
+        yield from bus_commands(connection.drive).findings(
+            plan_peer(options, connection), connection, options, rig, registers
+        )
 
 
 def _left(folder: Path) -> Iterator[Finding]:
@@ -242,61 +243,7 @@ def _limits(rig: Rig | None) -> Iterator[Finding]:
         yield note("limits", "none: nothing real will be moved", step)
 
 
-def _canopen(options: RunOptions, connection: Connection, rig: Rig | None) -> Iterator[Finding]:
-    from drivers import TdhilError
-    from profiles.canopen import CanopenProfile
-    from tdhil.cli.buses import canopen_doctor
-    from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.config import DriveData
-    from tdhil.session import link_report, open_can, plan_peer, rated_torque_nm
-
-    profile, bus = connection.profile, connection.bus
-    assert isinstance(profile, CanopenProfile)
-    plan = plan_peer(options, connection)
-    node = options.node if options.node is not None else profile.node
-    if not plan.embedded and bus.interface == "socketcan" and bus.channel:
-        found = attempted("link", lambda: canopen_doctor.link_findings(link_report(bus.channel), bus.channel))
-        yield from found
-        if found and found[-1].name == "link" and found[-1].grade == "bad":
-            return                                     # there is no such link: opening it would say the same
-    elif not plan.embedded:
-        yield canopen_doctor.rate_finding(bus.bitrate, bus.source("bitrate"))
-    try:
-        with open_can(plan, connection, node) as channel:
-            yield ok("adapter", f"opened: {channel.channel_info}")
-            rated_nm = rated_torque_nm(plan, profile, rig.drive_data if rig is not None else DriveData())
-            yield from attempted("drive", lambda: canopen_doctor.drive_findings(channel, profile, node, rated_nm))
-    except TdhilError as error:
-        yield of_error("adapter", error)
-
-
-def _modbus(
-    options: RunOptions, connection: Connection, rig: Rig | None, registers: list[RegisterSeen]
-) -> Iterator[Finding]:
-    from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
-    from tdhil.cli.buses import modbus_doctor
-    from tdhil.cli.finding import attempted, of_error, ok
-    from tdhil.config import DriveData
-    from tdhil.session import open_line, plan_peer
-
-    plan = plan_peer(options, connection)
-    clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
-    unit = connection.modbus.unit
-    try:
-        with open_line(plan, connection, rig.drive_data if rig is not None else DriveData(), clock) as line:
-            yield ok("line", f"open: {line.link.description}")
-            access = modbus_doctor.access_of(line.link, line.profile, unit)
-            yield from attempted(
-                "drive",
-                lambda: modbus_doctor.drive_findings(
-                    access, line.profile, unit, dict(line.given), line.rated_torque_nm, registers.extend
-                ),
-            )
-    except TdhilError as error:
-        yield of_error("line", error)
-
-
-def _show_registers(registers: list[RegisterSeen]) -> None:
+def _show_registers(registers: list[ValueSeen]) -> None:
     """Beside each register what it is taken for: people compare it with the drive's panel."""
     if not registers:
         return
@@ -308,22 +255,14 @@ def _show_registers(registers: list[RegisterSeen]) -> None:
     for heading in ("address", "counts", "is", "meaning"):
         table.add_column(heading, overflow="fold")
     for one in registers:
-        counts = "-" if one.counts is None else str(one.counts)
-        table.add_row(one.use.address, counts, one.shown, one.use.meaning)
+        table.add_row(*one.cells())
     PlainConsole().print(table)
 
 
-def _dump(found: list[Finding], registers: list[RegisterSeen], code: int) -> None:
+def _dump(found: list[Finding], registers: list[ValueSeen], code: int) -> None:
     document = {
         "checks": [asdict(one) for one in found],
-        "registers": [
-            {
-                "name": one.use.name, "address": one.use.register.address, "table": one.use.register.table,
-                "meaning": one.use.meaning, "counts": one.counts, "value": one.value, "unit": one.use.unit,
-                "error": one.error or None,
-            }
-            for one in registers
-        ],
+        "registers": [one.plain() for one in registers],
         "exit_code": int(code),
     }
     json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)

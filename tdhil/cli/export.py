@@ -95,12 +95,13 @@ def _write_frames(to: str, path: Path, target: Path, epoch_ns: int) -> int:
 
 
 def _can_frames(path: Path) -> Iterator[RawFrame]:
-    """Of a run on Modbus none: older logs have its bytes on the topic of CAN frames."""
-    from tdhil.recording import read_frames, read_run
+    """Of a run on another bus none: older logs have a Modbus line's bytes on the topic of CAN frames."""
+    from tdhil.config import BUSES
+    from tdhil.recording import CAN, read_frames, read_run
+    from tdhil.session import bus_kind
 
-    if read_run(path).configuration.get("drive") == "modbus":
-        return iter(())
-    return read_frames(path)
+    bus = read_run(path).configuration.get("drive")
+    return read_frames(path) if bus not in BUSES or bus_kind(bus).frame_channel == CAN else iter(())
 
 
 def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:

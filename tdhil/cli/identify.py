@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 
 def list_faults() -> int:
     """Prints what there is; the exit code."""
-    from sim_bus.canopen import listing
-    from sim_bus.modbus import listing as listing_of_modbus
+    from tdhil.session import bus_kinds
 
-    print(f"--drive canopen\n\n{listing()}\n\n--drive modbus\n\n{listing_of_modbus()}")  # noqa: T201
+    print("\n\n".join(f"--drive {kind.name}\n\n{kind.fault_listing()}" for kind in bus_kinds()))  # noqa: T201
     return 0
 
 
@@ -119,7 +118,6 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.session import (
         Consent,
         RunRequest,
-        can_torque,
         check_names,
         connection_of,
         plan_peer,
@@ -145,11 +143,11 @@ def run(namespace: argparse.Namespace) -> int:
     if namespace.dry_run:
         simulated = options.simulate or not connection.configured
         lets_go = connection.profile.quick_stop.ends == "off"
-        return dry_run(options, rig, simulated, can_torque(connection.profile), lets_go)
+        return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
     bench = suited(rig, peer.plant)
-    refuse_hopeless(options, bench, can_torque(connection.profile))
+    refuse_hopeless(options, bench, connection.profile.can_torque)
     consent = Consent(
         no_watchdog=namespace.accept_no_watchdog,
         shared_watchdog=namespace.accept_shared_watchdog,

@@ -10,7 +10,6 @@ from pydantic import BaseModel
 
 from profiles import Confidence, Entry, Profile, Require
 from profiles.modbus import ModbusProfile, Register
-from tdhil.session import can_torque
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Every register that a Modbus profile names, with its meaning: for `profiles show` and for `doctor`. Pure.
@@ -104,7 +103,7 @@ LEVELS: tuple[Confidence, ...] = ("verified", "likely", "unverified")
 
 def modes_text(profile: Profile) -> str:
     """What can be regulated, as far as a run needs it."""
-    return "speed, torque" if can_torque(profile) else "speed only"
+    return "speed, torque" if profile.can_torque else "speed only"
 
 
 def watchdog_text(profile: Profile) -> str:

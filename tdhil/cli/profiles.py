@@ -20,7 +20,7 @@ from tdhil.cli.profile_text import (
     unit_text,
     watchdog_text,
 )
-from tdhil.session import UNVERIFIED_FLAG, doubtful, rated_torque_is_told_by_hand
+from tdhil.session import UNVERIFIED_FLAG, doubtful
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,8 @@ def show(profile: Profile, console: Console) -> None:
         _filters(profile, console)
         sections: tuple[str, ...] = ("line", "control", "modes", "quick_stop", "watchdog", "name_plate")
     else:
-        _objects(profile, console)
+        if isinstance(profile, CanopenProfile):
+            _objects(profile, console)
         sections = tuple(name for name, _ in profile.entries() if not name.startswith("parameters."))
     for name, entry in profile.entries():
         if name in sections:
@@ -79,8 +80,8 @@ def _by_hand(profile: Profile, console: Console) -> None:
             assert one.require is not None
             table.add_row(one.title, required_text(one.require, unit_text(one.unit)), _advice(one))
         console.print(table)
-    told = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in _untold(profile)]
-    if rated_torque_is_told_by_hand(profile):
+    told = [(f"parameters: {{{one.name}: …}}", one.title, unit_text(one.unit)) for one in profile.untold]
+    if profile.rated_torque_by_hand:
         told.insert(0, ("rated_torque_nm", "torque that is 100 %", "N·m"))
     if told:
         table = _table("to be told in rig.yaml, since the drive does not", "key under drive_data", "what it is", "unit")
@@ -93,13 +94,6 @@ def _by_hand(profile: Profile, console: Console) -> None:
         for one in written:
             table.add_row(one.title, str(one.set_to).replace("_", " "))
         console.print(table)
-
-
-def _untold(profile: Profile) -> tuple[ModbusParameter, ...]:
-    """Parameters that can't be read over the bus."""
-    if not isinstance(profile, ModbusProfile):
-        return ()
-    return tuple(one for one in profile.parameters if one.register_ is None)
 
 
 def _advice(one: Parameter | ModbusParameter) -> str:

@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles import Profile, visible
-from profiles.modbus import ModbusProfile
-from tdhil.cli.found_drive import FoundDrive
+from tdhil.cli.bus_commands import FoundDrive, bus_commands
 from tdhil.cli.profile_text import required_text
-from tdhil.config import Limits, Rig
-from tdhil.session import doubtful, rated_torque_is_told_by_hand
+from tdhil.config import BUSES, Limits, Rig
+from tdhil.session import bus_kind, doubtful
 
 if TYPE_CHECKING:
     from tdhil.config import RunOptions
-    from tdhil.session import Connection, PeerPlan
+    from tdhil.session import Connection
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -45,8 +44,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     ]
     if line:
         parts.append(_section(found.bus, line))
-    if found.bus == "canopen":
-        parts.append(f"node: {found.address}")
+    parts += [f"{key}: {_value(value)}" for key, value in bus_commands(found.bus).keys(found).items()]
     if found.profile is not None:
         parts.append(f"profile: {scalar(found.profile)}    # {_comment(found.why)}")
     else:
@@ -55,7 +53,7 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
     parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value."]
     parts += ["#limits:", *(_blank(name) for name in _LIMITS)]
     parts += ["", "# What the drive does not tell of itself.", "#drive_data:"]
-    if profile is None or rated_torque_is_told_by_hand(profile):
+    if profile is None or profile.rated_torque_by_hand:
         parts.append("#  rated_torque_nm:         # N·m; name plate")
     parts.append("#  torque_scale_rel_sd:     # how right the drive's torque is, 1 sd as a share (0.02 = 2 %)")
     parts += _untold(profile)
@@ -65,10 +63,6 @@ def starter(found: FoundDrive, line: Mapping[str, Any], profile: Profile | None)
 
 def blank_rig(profile: Profile, named: str, load: str) -> str:
     """The file's text with no drive at hand. ``named``: the profile as the operator names it."""
-    line = {
-        "canopen": "#bus: {interface: socketcan, channel: can0, bitrate: 500k}    # python-can's own names",
-        "modbus": "#modbus: {host: 192.0.2.10, unit: 1}    # or {serial: /dev/ttyUSB0, baud: 19200, parity: E}",
-    }[profile.bus]
     parts = [
         "# Written by tdhil rig new. Torque and speed are those of the motor shaft; every key: docs/rig.md,",
         "# which lies where tdhil docs says.",
@@ -77,10 +71,8 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
         "# Where the drive is. Left out, the embedded simulator runs, and says so.",
-        line,
+        *bus_commands(profile.bus).blank,
     ]
-    if profile.bus == "canopen":
-        parts.append("#node:    # CANopen node number, 1 to 127")
     parts += _doubts(profile)
     parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value, in",
               "# the key's unit or with a unit of its own: speed_max_rad_s: 95 rpm"]
@@ -88,7 +80,7 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
     parts += ["", *_load(load)]
     parts += ["", "#gear: {ratio: }    # motor turns for one of the main shaft; without it 1",
               "", "# What the drive does not tell of itself. Leave out what you do not know.", "#drive_data:"]
-    if rated_torque_is_told_by_hand(profile):
+    if profile.rated_torque_by_hand:
         parts.append("#  rated_torque_nm:         # N·m; name plate")
     parts.append("#  torque_scale_rel_sd:     # how right the drive's torque is, 1 sd (2 %)")
     parts += _untold(profile)
@@ -98,8 +90,7 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
 
 def to_fill_in(profile: Profile, load: str) -> list[str]:
     """What a run on a real drive will miss."""
-    found = [f"limits: {', '.join(_LIMITS)}", "where the drive is: bus and node" if profile.bus == "canopen" else
-             "where the drive is: modbus"]
+    found = [f"limits: {', '.join(_LIMITS)}", f"where the drive is: {bus_commands(profile.bus).to_fill_in}"]
     if load == "string":
         found.append(f"{', '.join(_STRING)}: until then the file is refused")
     if doubtful(profile):
@@ -127,8 +118,7 @@ def _blank(name: str) -> str:
 
 
 def _section(bus: str, line: Mapping[str, Any]) -> str:
-    name = "bus" if bus == "canopen" else "modbus"
-    return f"{name}: {{{', '.join(f'{key}: {_value(value)}' for key, value in line.items())}}}"
+    return f"{bus_kind(bus).section}: {{{', '.join(f'{key}: {_value(value)}' for key, value in line.items())}}}"
 
 
 def _value(value: Any) -> str:
@@ -161,10 +151,7 @@ def _doubts(profile: Profile | None) -> list[str]:
 
 def _untold(profile: Profile | None) -> list[str]:
     """Parameters that can't be read over the bus."""
-    if not isinstance(profile, ModbusProfile):
-        return []
-    untold = [one for one in profile.parameters if one.register_ is None]
-    blanks = [f"#    {one.name}:    # {_comment(one.title)}" for one in untold]
+    blanks = [] if profile is None else [f"#    {one.name}:    # {_comment(one.title)}" for one in profile.untold]
     return ["#  parameters:", *blanks] if blanks else []
 
 
@@ -186,9 +173,6 @@ def _comment(text: str) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-LISTEN_S = 1.0
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The bus or line, as for identify; what to ask, and where a starter file goes."""
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments
@@ -196,9 +180,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     drive = add_drive_arguments(parser)
     drive.add_argument("--simulate", action="store_const", const=True, help="look at the embedded simulator")
     scan = parser.add_argument_group("scan")
-    scan.add_argument("--units", metavar="N-M", help="Modbus units to ask, as 1-10,247 (default 1-5; TCP: and 255)")
-    scan.add_argument("--listen", type=_seconds, default=LISTEN_S, metavar="S",
-                      help=f"CANopen: how long to wait for answers and heartbeats (default {LISTEN_S:g} s)")
+    for name in BUSES:
+        bus_commands(name).add_scan_arguments(scan)
     scan.add_argument("--write", type=Path, metavar="rig.yaml", help="a rig.yaml to start from; never over a file")
     scan.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     add_line_arguments(parser)
@@ -220,64 +203,12 @@ def run(namespace: argparse.Namespace) -> int:
             f"{connection.nothing_there}", where="scan",
             next_step="Say where to look, such as -i socketcan -c can0, --host 192.0.2.10 or --serial /dev/ttyUSB0",
         )
-    plan = plan_peer(options, connection)
-    if connection.drive == "modbus":
-        found, remarks = _modbus(plan, connection, namespace.units)
-    else:
-        found, remarks = _canopen(plan, connection, options, namespace.listen)
+    commands = bus_commands(connection.drive)
+    found, remarks = commands.scan(plan_peer(options, connection), connection, options, namespace)
     _print(found, remarks, namespace.json is True)
     if namespace.write is not None:
         _write(namespace.write, found, connection, options)
     return 0
-
-
-def _canopen(
-    plan: PeerPlan, connection: Connection, options: RunOptions, listen_s: float
-) -> tuple[tuple[FoundDrive, ...], list[str]]:
-    from drivers import CommunicationLost
-    from profiles.canopen import CanopenProfile
-    from tdhil.cli.buses.canopen_scan import ask_all, identify_all
-    from tdhil.session import open_can
-
-    profile = connection.profile
-    assert isinstance(profile, CanopenProfile)
-    own = options.node if options.node is not None else profile.node
-    with open_can(plan, connection, own) as bus:
-        link, heard = ask_all(bus, range(1, 128), listen_s)
-        found = identify_all(link, heard)
-        heard.error_frames = link.error_frames
-    silent = sorted(set(heard.states) - set(heard.device_types))
-    remarks = [f"node {node} sends heartbeats ({heard.states[node]}) and answers no SDO" for node in silent]
-    if heard.error_frames:
-        remarks.append(f"{heard.error_frames} error frames came: check bit rate, termination and cable")
-    if found:
-        return found, remarks
-    if heard.error_frames:
-        what = f"no node answers, and {heard.error_frames} error frames came"
-        step = "The bit rate is most likely wrong (-b): compare it with the drives'; else termination or cable"
-    elif heard.frames:
-        what = f"no node answers, though {heard.frames} frames were heard" + "".join(f"; {text}" for text in remarks)
-        step = "Is a drive stopped by NMT, or is this a bus of another protocol? Look with candump"
-    else:
-        what = "no node answers, and nothing was heard"
-        step = "Check that a drive is powered, the bit rate (-b), the cable and its termination (60 ohms)"
-    raise CommunicationLost(what, where=link.name, next_step=step)
-
-
-def _modbus(plan: PeerPlan, connection: Connection, units: str | None) -> tuple[tuple[FoundDrive, ...], list[str]]:
-    from tdhil.cli.buses.modbus_scan import UNITS_RTU, UNITS_TCP, parse_units, scan_lines
-    from tdhil.config import Origin
-    from tdhil.errors import UsageError
-
-    serial = connection.modbus.serial is not None and not plan.embedded
-    own = str(connection.modbus.unit)
-    given = connection.modbus.origin("unit") is Origin.COMMAND_LINE
-    text = units or (own if given else f"{own},{UNITS_RTU if serial else UNITS_TCP}")
-    try:
-        asked = parse_units(text)
-    except ValueError as error:
-        raise UsageError(f"{error}", where="--units", next_step="Write it like 1-10,247") from None
-    return scan_lines(plan, connection, asked, say=lambda line: print(line, file=sys.stderr))  # noqa: T201
 
 
 def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> None:
@@ -318,7 +249,7 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
     profile = load_profile(one.profile) if one.profile is not None else None
     try:
         with path.open("x", encoding="utf-8") as file:
-            file.write(starter(one, _line_of(one, connection), profile))
+            file.write(starter(one, bus_commands(one.bus).section(one, connection), profile))
     except FileExistsError:
         _check_free(path)
         raise
@@ -329,39 +260,15 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
-    from tdhil.config import Origin
     from tdhil.errors import UsageError
 
-    modbus = connection.drive == "modbus"
-    by_flag = modbus and connection.modbus.origin("unit") is Origin.COMMAND_LINE
-    named = connection.modbus.unit if by_flag else options.node
+    commands = bus_commands(connection.drive)
+    named = commands.wanted(connection, options)
     drives = [one for one in found if named in (None, one.address)]
     if named is None and len(drives) > 1:
         drives = [one for one in drives if one.profile is not None] or drives
     if len(drives) == 1:
         return drives[0]
-    flag = "--unit" if modbus else "--node"
     what = f"{len(drives)} drives were found" if drives else f"number {named} did not answer"
-    raise UsageError(f"{what}, and a rig.yaml is for one", where="--write", next_step=f"Name it with {flag}")
-
-
-def _line_of(one: FoundDrive, connection: Connection) -> Mapping[str, Any]:
-    """The section bus: or modbus:."""
-    if one.bus == "modbus":
-        return {**one.line, "unit": one.address}
-    settings = {name: setting.value for name, setting in connection.bus.settings.items()}
-    own = ("interface", "channel", "bitrate")
-    simple = {name: value for name, value in settings.items() if isinstance(value, str | int | float | bool)}
-    line: dict[str, Any] = {name: simple[name] for name in own if name in simple}
-    more = {name: value for name, value in simple.items() if name not in own}
-    return {**line, "options": more} if more else line
-
-
-def _seconds(text: str) -> float:
-    from profiles.quantities import TIME
-    from tdhil.cli.arguments import amount
-
-    value = amount(TIME)(text)
-    if not 0.0 < value <= 60.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a time from 0 to 60 s")
-    return value
+    raise UsageError(f"{what}, and a rig.yaml is for one", where="--write",
+                     next_step=f"Name it with {commands.address_flag}")

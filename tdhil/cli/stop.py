@@ -5,16 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from tdhil.errors import ExitCode, UsageError, exit_code
 
 if TYPE_CHECKING:
-    from drivers import BareStopReport, Clock, Target
-    from tdhil.config import RunOptions
-    from tdhil.session import Connection
+    from drivers import BareStopReport
 
 NO_EMERGENCY_STOP = (
     "tdhil stop is NO emergency stop: it needs this computer, the cable and the drive. "
@@ -54,7 +50,7 @@ def run(namespace: argparse.Namespace) -> int:
     print(NO_EMERGENCY_STOP, file=sys.stderr)  # noqa: T201
     clock = MonotonicClock()
     try:
-        with _open_target(options, connection, clock) as target:
+        with connection.kind.open_target(options, connection, clock) as target:
             report = bare_stop(target, clock)
     except Exception as error:         # no way to the drive, or none any more; an adapter's driver raises what it likes
         if exit_code(error) is ExitCode.USAGE:
@@ -82,33 +78,6 @@ def _not_reached(error: Exception, *, as_json: bool) -> int:
     print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
     print(NOT_CONFIRMED, file=sys.stderr if as_json else sys.stdout)
     return int(code)
-
-
-@contextmanager
-def _open_target(options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
-    from profiles.modbus import ModbusProfile
-
-    profile = connection.profile
-    if isinstance(profile, ModbusProfile):
-        from drivers.modbus import ModbusTarget
-        from tdhil.session import open_wire
-
-        link = open_wire(connection.modbus, clock)
-        try:
-            yield ModbusTarget(link, profile, unit=connection.modbus.unit)
-        finally:
-            link.close()
-        return
-    from drivers.canopen import Cia402Target
-    from tdhil.session import open_bus
-
-    bus = open_bus(connection.bus)
-    node = options.node if options.node is not None else profile.node
-    target = Cia402Target(bus, profile, clock, node=node)
-    try:
-        yield target
-    finally:
-        target.close()
 
 
 def _exit_code(report: BareStopReport) -> ExitCode:

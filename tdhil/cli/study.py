@@ -44,7 +44,7 @@ class SimulatedFieldBench:
         from tdhil.config import resolve
         from tdhil.recording import RunLog, RunWriter
         from tdhil.run import Runner
-        from tdhil.session import PeerPlan, open_drive, simulated_canopen, stop_on_signals
+        from tdhil.session import PeerPlan, open_drive, simulated_connection, stop_on_signals
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -54,7 +54,7 @@ class SimulatedFieldBench:
             log = RunLog(writer, {"tdhil": __version__, "embedded_simulator": True, "seed": wish.seed})
             try:
                 with stop_on_signals() as stop_request, open_drive(
-                    peer, options, simulated_canopen(options), None, log.frame, None
+                    peer, options, simulated_connection(options), None, log.frame, None
                 ) as drive:
                     make_task = partial(_task, options, rig)
                     outcome = Runner(drive, make_task, log, stop_request, _Progress(progress), _no_prompt).run()

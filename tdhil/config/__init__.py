@@ -7,8 +7,8 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.config.options import Origin as Origin, RunOptions as RunOptions, Setting as Setting, resolve as resolve
     from tdhil.config.registry import (
-        BUSES as BUSES, DEFAULT_EXCITATION as DEFAULT_EXCITATION, EXCITATIONS as EXCITATIONS, MODELS as MODELS,
-        has_plateaus as has_plateaus, load as load,
+        BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
+        EXCITATIONS as EXCITATIONS, MODELS as MODELS, has_plateaus as has_plateaus, imported as imported, load as load,
     )
     from tdhil.config.rig import (
         DriveData as DriveData, Limits as Limits, Modbus as Modbus, Registered as Registered, Rig as Rig,
@@ -20,7 +20,10 @@ else:
         __name__,
         {
             "options": ("Origin", "RunOptions", "Setting", "resolve"),
-            "registry": ("BUSES", "DEFAULT_EXCITATION", "EXCITATIONS", "MODELS", "has_plateaus", "load"),
+            "registry": (
+                "BUSES", "DEFAULT_BUS", "DEFAULT_EXCITATION", "EXCITATIONS", "MODELS", "has_plateaus", "imported",
+                "load",
+            ),
             "rig": (
                 "DriveData", "Limits", "Modbus", "Registered", "Rig", "bit_rate_problem", "load_rig",
                 "require_limits", "simulated_default_rig",

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from profiles import messages_of
-from tdhil.config.registry import DEFAULT_EXCITATION
+from tdhil.config.registry import DEFAULT_BUS, DEFAULT_EXCITATION
 from tdhil.config.rig import Rig
 from tdhil.errors import UsageError
 
@@ -69,7 +69,7 @@ class RunOptions:
     None as a value: chosen by the drive's profile or by the plan of the run.
     """
 
-    drive: str = _option("--drive", "drive", "canopen")
+    drive: str = _option("--drive", "drive", DEFAULT_BUS)
     node: int | None = _option("--node", "node")
     profile: str = _option("--profile", "profile", "generic/cia402", beside_rig=True)
     accept_unverified: tuple[str, ...] = _option("--accept-unverified", "accept_unverified", (), joined=True)

@@ -27,6 +27,17 @@ class Entry:
     plateaus: bool = False
 
 
+@dataclass(frozen=True)
+class BusEntry(Entry):
+    """``at``: what a run asks of the bus, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
+
+    ``commands``: what scan, doctor and rig new do on it, a `tdhil.cli.bus_commands.BusCommands`. Both stand in modules
+    that load no library of the bus by themselves: ``--help`` shows the options of every bus.
+    """
+
+    commands: str = ""
+
+
 EXCITATIONS: dict[str, Entry] = {
     "multisine": Entry("tdhil.run.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
     "sine": Entry("tdhil.run.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
@@ -47,16 +58,29 @@ MODELS: dict[str, Entry] = {
 }
 """What the shaft is taken for."""
 
-BUSES: dict[str, Entry] = {
-    "canopen": Entry("tdhil.session.buses.canopen:CANOPEN", "CANopen, CiA 402"),
-    "modbus": Entry("tdhil.session.buses.modbus:MODBUS", "Modbus TCP or RTU"),
+BUSES: dict[str, BusEntry] = {
+    "canopen": BusEntry("tdhil.session.buses.canopen:CANOPEN", "CANopen, CiA 402",
+                        commands="tdhil.cli.buses.canopen:CANOPEN"),
+    "modbus": BusEntry("tdhil.session.buses.modbus:MODBUS", "Modbus TCP or RTU",
+                       commands="tdhil.cli.buses.modbus:MODBUS"),
 }
-"""How a drive is spoken to; each a `tdhil.session.connection.BusKind`."""
+"""How a drive is spoken to.
+
+Two things of a bus stand elsewhere: the schema of its profiles, below all this, in the list of `profiles.library`; its
+section of rig.yaml, a field of `tdhil.config.rig.Rig`.
+"""
+
+DEFAULT_BUS = "canopen"
 
 
 def load(registry: Mapping[str, Entry], name: str) -> Any:
     """Import what stands behind a name. KeyError where there is none of that name."""
-    module, _, attribute = registry[name].at.partition(":")
+    return imported(registry[name].at)
+
+
+def imported(at: str) -> Any:
+    """The object at ``module:attribute``."""
+    module, _, attribute = at.partition(":")
     return getattr(import_module(module), attribute)
 
 

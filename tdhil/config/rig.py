@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
-from pydantic_core import PydanticKnownError, core_schema
+from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
-from profiles import Conversion, DataModel, Finding, load_with_lines, messages_of
+from profiles import Conversion, DataModel, Finding, load_with_lines, messages_of, one_of
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, names
 
 
@@ -49,11 +49,7 @@ class Registered:
         return {"type": "string", "enum": names(self.registry, periodic=self.periodic)}
 
     def _check(self, value: Any) -> Any:
-        known = names(self.registry, periodic=self.periodic)
-        if value in known:
-            return value
-        *first, last = map(repr, known)
-        raise PydanticKnownError("literal_error", {"expected": f"{', '.join(first)} or {last}" if first else last})
+        return one_of(names(self.registry, periodic=self.periodic), value)
 
 
 Positive = Annotated[float, _within(1e-9, 1e9)]

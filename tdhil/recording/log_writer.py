@@ -22,7 +22,7 @@ from typing import Any, Final, Self
 from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogBroken, LogError, LogRefused, LogUnopened
 from tdhil.recording import log_messages
-from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, MODBUS, SAMPLE, Event, log_payload
+from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, LOG, SAMPLE, Event, log_payload
 from tdhil.recording.log_messages import Cold, event_message, pack_command, pack_frames, pack_sample
 from tdhil.recording.mcap_container import Container, LogGone, RawFile
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
@@ -317,7 +317,7 @@ _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 class RunWriter:
     """One run.mcap. ``epoch_ns`` is the wall clock at control time zero.
 
-    ``modbus``: the raw frames are a Modbus line's, on a topic of their own.
+    ``frames``: the channel of the raw frames; each kind of bus has its own topic.
 
     ``queue_size`` counts records; None takes the default of stepped or real time.
     ``block``: a full queue makes the caller wait (stepped time); otherwise the record is dropped, counted in
@@ -341,7 +341,7 @@ class RunWriter:
         min_free_bytes: int = 200_000_000,
         overwrite: bool = True,
         opener: Callable[[Path], RawFile] | None = None,
-        modbus: bool = False,
+        frames: int = CAN,
     ) -> None:
         self.path = path
         self._raised = self._closing = False
@@ -359,7 +359,7 @@ class RunWriter:
             kind = LogRefused if error.errno in _FULL else LogUnopened
             raise self._error(kind, "the log can't be opened", error) from error
         self._block = block
-        self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns, MODBUS if modbus else CAN)
+        self._pump = Pump(self._backlog, container, Syncer(file), epoch_ns, frames)
         self._thread = Thread(target=self._pump.run, name="tdhil-log", daemon=True)
         self._thread.start()
 

@@ -5,16 +5,12 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
-    from tdhil.session.buses import (
-        ModbusConfig as ModbusConfig, SettingsRefused as SettingsRefused, link_report as link_report,
-        open_bus as open_bus, open_can as open_can, open_line as open_line, open_wire as open_wire,
-        rated_torque_nm as rated_torque_nm,
-    )
     from tdhil.session.conclusion import conclude as conclude
     from tdhil.session.confirm import AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant
     from tdhil.session.connection import (
-        Connection as Connection, PeerPlan as PeerPlan, can_torque as can_torque, connection_of as connection_of,
-        rated_torque_is_told_by_hand as rated_torque_is_told_by_hand, simulated_canopen as simulated_canopen,
+        BusKind as BusKind, Connection as Connection, LineConfig as LineConfig, PeerPlan as PeerPlan,
+        bus_kind as bus_kind, bus_kinds as bus_kinds, connection_of as connection_of,
+        simulated_connection as simulated_connection,
     )
     from tdhil.session.consent import (
         UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
@@ -43,15 +39,11 @@ else:
     __getattr__, __dir__ = lazy_face(
         __name__,
         {
-            "buses": (
-                "ModbusConfig", "SettingsRefused", "link_report", "open_bus", "open_can", "open_line", "open_wire",
-                "rated_torque_nm",
-            ),
             "conclusion": ("conclude",),
             "confirm": ("AskingAttendant", "TerminalAttendant"),
             "connection": (
-                "Connection", "PeerPlan", "can_torque", "connection_of", "rated_torque_is_told_by_hand",
-                "simulated_canopen",
+                "BusKind", "Connection", "LineConfig", "PeerPlan", "bus_kind", "bus_kinds", "connection_of",
+                "simulated_connection",
             ),
             "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
             "log_place": ("check_different_files", "check_log_path", "make_room"),

@@ -1,66 +1,153 @@
-"""How the drive is spoken to: which bus, which profile, and where on that bus; each with who had the say."""
+"""How the drive is spoken to: which bus, which profile, and where on that bus; each with who had the say.
+
+Nothing here, nor above, names a bus: `BusKind` is what a run asks of one, and `tdhil.config.registry.BUSES` lists them.
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from drivers import DataFileError, Problem
-from profiles import Profile, load_canopen_profile, load_modbus_profile, load_profile
-from profiles.modbus import ModbusProfile
-from tdhil.config import BUSES, Origin, RunOptions, Setting, load
+from profiles import Profile, load_profile
+from tdhil.config import BUSES, DEFAULT_BUS, Origin, RunOptions, Setting, load
 from tdhil.errors import UsageError
-from tdhil.session.buses import BusConfig, ModbusConfig, asked_for, bus_config, modbus_config
 
 if TYPE_CHECKING:
-    from drivers import Drive
-    from tdhil.config import Rig
-
-MODBUS_PROFILE = "generic/modbus"
-"""Worn and spoken where nobody names another; for CANopen it is `tdhil.config.options`' default."""
+    from drivers import Clock, Drive, FrameTap, Target
+    from tdhil.config import DriveData, Rig
 
 
 @dataclass(frozen=True)
-class BusKind:
-    """What a run asks of a bus; `tdhil.config.registry.BUSES` lists them by name.
+class LineConfig(ABC):
+    """Where a drive is: every value with the place that it came from. What is there to ask for is its bus's own."""
 
-    ``open``: the drive on it, or the embedded simulator's, closed afterwards. ``parse_faults``: of the simulator, from
-    what ``--fault`` says. ``steps_over_a_wire``: can a simulator in another process be stepped over it?
+    nothing_there: ClassVar[str]       # why the embedded simulator runs although nobody asked for it
+    simulated_text: ClassVar[str]      # what that is then, in words
+    row_name: ClassVar[str] = "bus"    # what stands before each row
+
+    settings: Mapping[str, Setting] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    @abstractmethod
+    def configured(self) -> bool:
+        """Has anybody said where the drive is? If not, the embedded simulator is meant."""
+
+    def value(self, name: str, default: Any = None) -> Any:
+        """What an option is; ``default`` where nobody said it."""
+        return self.settings[name].value if name in self.settings else default
+
+    def source(self, name: str) -> str:
+        """Where an option's value came from, in words; '' where nobody said it."""
+        return self.settings[name].source if name in self.settings else ""
+
+    def origin(self, name: str) -> Origin | None:
+        """Who said it, None where nobody did."""
+        return self.settings[name].origin if name in self.settings else None
+
+    def rows(self) -> Iterator[tuple[str, str, str]]:
+        """(option, value, source) to print."""
+        for name, setting in self.settings.items():
+            yield name, str(setting.value), setting.source
+
+
+class BusKind(ABC):
+    """What a run asks of a bus: its options, where they put the drive, and how that is opened.
+
+    An object of it stands where `tdhil.config.registry.BUSES` says. Its module is imported for every ``--help``: what
+    loads a library of the bus is imported where it is used.
     """
 
-    open: Callable[..., AbstractContextManager[Drive]]
-    parse_faults: Callable[[Sequence[str]], tuple[Any, ...]]
-    steps_over_a_wire: bool
+    name: ClassVar[str]                # as in BUSES, --drive, and `bus:` of a profile
+    title: ClassVar[str]               # as people write it
+    named_by: ClassVar[str]            # the options that name a drive on it, in words
+    section: ClassVar[str] = ""        # its section in rig.yaml; '' where it has none …
+    place_keys: ClassVar[str] = ""     # … and which keys of that say where a drive is
+    flags: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Options of the command line that no other bus has: name in the namespace → flag."""
+    default_profile: ClassVar[str]     # worn and spoken where nobody names another
+    steps_over_a_wire: ClassVar[bool] = False     # can a simulator in another process be stepped over it?
+
+    @property
+    def frame_channel(self) -> int:
+        """The log's channel for its raw frames (`tdhil.recording.CHANNELS`)."""
+        from tdhil.recording import CAN
+
+        return CAN
+
+    @abstractmethod
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Its options, in a group of their own."""
+
+    def add_drive_arguments(self, drive: argparse._ArgumentGroup) -> None:
+        """What stands among the options that say which drive."""
+        return
+
+    @abstractmethod
+    def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> LineConfig:
+        """Where the drive is, by all who have a say. Raises UsageError and DataFileError for what can't be used."""
+
+    @property
+    @abstractmethod
+    def nowhere(self) -> LineConfig:
+        """The same where nobody was asked: an embedded simulator is meant."""
+
+    @abstractmethod
+    def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
+             tap: FrameTap, trace: Path | None) -> AbstractContextManager[Drive]:
+        """The drive, or the embedded simulator's; closed afterwards, with all that was opened for it."""
+
+    @abstractmethod
+    def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> AbstractContextManager[Target]:
+        """What ``tdhil stop`` needs of the drive, and no more; closed afterwards."""
+
+    @abstractmethod
+    def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
+        """Faults of the embedded simulator, from what ``--fault`` says. Raises UsageError."""
+
+    @abstractmethod
+    def fault_listing(self) -> str:
+        """What ``--fault list`` shows of it."""
+
+    def asked_for(self, cli: Mapping[str, Any]) -> str | None:
+        """The flag on the command line that only this bus has; None if there is none."""
+        return next((flag for name, flag in self.flags.items() if cli.get(name) is not None), None)
+
+    def placed_in(self, rig: Rig) -> bool:
+        """Does rig.yaml say where a drive on this bus is?"""
+        return False
 
 
 def bus_kind(name: str) -> BusKind:
-    """The bus of that name; its libraries are loaded. KeyError where there is none."""
+    """The bus of that name. KeyError where there is none."""
     found: BusKind = load(BUSES, name)
     return found
 
 
+def bus_kinds() -> tuple[BusKind, ...]:
+    """All of them, in their order."""
+    return tuple(bus_kind(name) for name in BUSES)
+
+
 @dataclass(frozen=True)
 class Connection:
-    """One of ``bus`` and ``modbus`` counts, as the profile's bus says."""
+    """Which bus, what is known of the drive on it, and where that is."""
 
+    kind: BusKind
     profile: Profile
-    bus: BusConfig
-    modbus: ModbusConfig
+    line: LineConfig
 
     @property
     def drive(self) -> str:
-        """``canopen`` or ``modbus``."""
-        return self.profile.bus
-
-    @property
-    def line(self) -> BusConfig | ModbusConfig:
-        """The one that counts."""
-        lines: dict[str, BusConfig | ModbusConfig] = {"canopen": self.bus, "modbus": self.modbus}
-        return lines[self.drive]
+        """The bus's name, as --drive has it."""
+        return self.kind.name
 
     @property
     def configured(self) -> bool:
@@ -80,37 +167,37 @@ class Connection:
 def connection_of(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -> tuple[RunOptions, Connection]:
     """The options with drive and profile decided, and the way to the drive.
 
-    UsageError for options of the other bus, DataFileError for a profile that can't be used.
+    UsageError for options of another bus, DataFileError for a profile that can't be used.
     """
     options = choose_drive(cli, rig, options)
-    if options.drive == "modbus":
-        profile = load_modbus_profile(options.profile)
-        _refuse_canopen_flags(cli)
-        found = Connection(profile, NO_BUS, modbus_config(cli, rig, profile))
-        _refuse_the_other_bus(found, rig, options)
-        return options, found
-    flag = asked_for(cli)
-    if flag is not None:
-        raise UsageError("belongs to Modbus", where=flag, next_step="Add --drive modbus, or leave it out")
-    found = Connection(load_canopen_profile(options.profile), bus_config(cli, rig), NO_MODBUS)
-    _refuse_the_other_bus(found, rig, options)
+    kind = bus_kind(options.drive)
+    for other in bus_kinds():
+        flag = None if other.name == kind.name else other.asked_for(cli)
+        if flag is not None:
+            raise UsageError(
+                f"belongs to {other.title}", where=flag,
+                next_step=f"A {kind.title} drive is named by {kind.named_by}; for {other.title} say "
+                f"--drive {other.name}",
+            )
+    profile = load_profile(options.profile, kind.name)
+    found = Connection(kind, profile, kind.line(cli, rig, profile))
+    _refuse_another_bus(found, rig, options)
     return options, found
 
 
-def _refuse_the_other_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
-    """A rig.yaml that says where a drive is, but on the other bus: nobody meant the simulator. Raises DataFileError."""
+def _refuse_another_bus(found: Connection, rig: Rig | None, options: RunOptions) -> None:
+    """A rig.yaml that says where a drive is, but on another bus: nobody meant the simulator. Raises DataFileError."""
     if rig is None or found.configured or options.simulate:
         return
-    if found.drive == "canopen" and (rig.modbus.host or rig.modbus.serial):
-        section, missing = "modbus", "bus: (interface, channel)"
-    elif found.drive == "modbus" and rig.bus.interface:
-        section, missing = "bus", "modbus: (host or serial)"
-    else:
+    kind = found.kind
+    other = next((one for one in bus_kinds() if one.name != kind.name and one.placed_in(rig)), None)
+    if other is None:
         return
+    missing = f"{kind.section}: ({kind.place_keys})" if kind.section else kind.named_by
     raise DataFileError((Problem(
-        rig.file or "rig.yaml", rig.line(section),
-        f"{section}: says where a drive is, but the drive is on {found.drive} ({options.source('drive')}), and nothing"
-        f" says where; give {missing}, name the other drive, or take the simulated one with --simulate",
+        rig.file or "rig.yaml", rig.line(other.section),
+        f"{other.section}: says where a drive is, but the drive is on {kind.name} ({options.source('drive')}), and"
+        f" nothing says where; give {missing}, name the other drive, or take the simulated one with --simulate",
     ),))
 
 
@@ -120,36 +207,28 @@ def choose_drive(cli: Mapping[str, Any], rig: Rig | None, options: RunOptions) -
         if options.given("profile"):
             profile = load_profile(options.profile)
             options = options.replaced(drive=Setting(profile.bus, f"profile {profile.name}", Origin.PROFILE))
-        elif (flag := asked_for(cli)) is not None:
-            options = options.replaced(drive=Setting.by_flag("modbus", flag))
-        elif rig is not None and rig.bus.interface is None and (rig.modbus.host or rig.modbus.serial):
-            options = options.replaced(drive=Setting.by_rig("modbus", rig, "modbus"))
-    if options.drive == "modbus" and not options.given("profile"):
-        options = options.replaced(profile=Setting(MODBUS_PROFILE, "default", Origin.BUILT_IN))
+        elif (setting := _bus_by_place(cli, rig)) is not None:
+            options = options.replaced(drive=setting)
+    if not options.given("profile") and (named := bus_kind(options.drive).default_profile) != options.profile:
+        options = options.replaced(profile=Setting(named, "default", Origin.BUILT_IN))
     return options
 
 
-def simulated_canopen(options: RunOptions) -> Connection:
-    """The way to an embedded CANopen drive."""
-    return Connection(load_canopen_profile(options.profile), NO_BUS, NO_MODBUS)
+def _bus_by_place(cli: Mapping[str, Any], rig: Rig | None) -> Setting | None:
+    """The bus on which the command line, or else rig.yaml, has the drive; None for the usual one."""
+    others = [kind for kind in bus_kinds() if kind.name != DEFAULT_BUS]
+    for kind in others:
+        if (flag := kind.asked_for(cli)) is not None:
+            return Setting.by_flag(kind.name, flag)
+    if rig is None or bus_kind(DEFAULT_BUS).placed_in(rig):
+        return None
+    return next((Setting.by_rig(kind.name, rig, kind.section) for kind in others if kind.placed_in(rig)), None)
 
 
-def can_torque(profile: Profile) -> bool:
-    """Can torque be regulated over the bus, and be switched to while the shaft turns?"""
-    has = profile.modes.torque if isinstance(profile, ModbusProfile) else bool(profile.modes.torque)
-    return has and profile.modes.switch_while_enabled
-
-
-NO_BUS = BusConfig(MappingProxyType({}))
-NO_MODBUS = ModbusConfig(MappingProxyType({}))
-_CANOPEN_FLAGS = {"node": "--node", "interface": "--interface", "channel": "--channel", "bitrate": "--bitrate"}
-
-
-def _refuse_canopen_flags(cli: Mapping[str, Any]) -> None:
-    for name, flag in _CANOPEN_FLAGS.items():
-        if cli.get(name) is not None:
-            step = "A Modbus drive is named by --host or --serial, and --unit; for CANopen say --drive canopen"
-            raise UsageError("belongs to CANopen", where=flag, next_step=step)
+def simulated_connection(options: RunOptions) -> Connection:
+    """The way to an embedded drive on the bus of the options."""
+    kind = bus_kind(options.drive)
+    return Connection(kind, load_profile(options.profile, kind.name), kind.nowhere)
 
 
 @dataclass(frozen=True)
@@ -167,10 +246,3 @@ class PeerPlan:
     def epoch_ns(self) -> int:
         """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
         return time.time_ns()
-
-
-def rated_torque_is_told_by_hand(profile: Profile) -> bool:
-    """Does rig.yaml have to say what 100 % torque is?"""
-    if isinstance(profile, ModbusProfile):
-        return profile.rated_torque is None
-    return profile.torque.rated_torque_nm_per_lsb is None

@@ -17,9 +17,9 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
     """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
     embedded = options.simulate or not connection.configured
     if not embedded:
-        if options.stepped and not bus_kind(connection.drive).steps_over_a_wire:
+        if options.stepped and not connection.kind.steps_over_a_wire:
             raise UsageError(
-                f"a {connection.drive.capitalize()} line has no SYNC to step by: over a wire it runs in real time",
+                f"a {connection.kind.title} line has no SYNC to step by: over a wire it runs in real time",
                 where=options.source("stepped"),
                 next_step="Leave --stepped out, or use --simulate, which is stepped",
             )
@@ -45,7 +45,7 @@ def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data
     """The drive, closed with its bus and simulator afterwards. ``data``: what the bench knows and the drive doesn't."""
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
-    with bus_kind(connection.drive).open(plan, options, connection, data, clock, tap, trace) as drive:
+    with connection.kind.open(plan, options, connection, data, clock, tap, trace) as drive:
         yield drive
 
 

@@ -90,7 +90,7 @@ class RunSession:
         self._request, self._attendant = request, attendant
         self._place = place = LogPlace(Path(options.log))
         writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
-                           modbus=request.connection.drive == "modbus")
+                           frames=request.connection.kind.frame_channel)
         writer.path = place.path
         if place.live:
             attendant.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")

@@ -5,13 +5,15 @@ Everything that a toy needs stands in this file, and one line puts it in; nothin
 
 from __future__ import annotations
 
+import argparse
 import ast
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,20 +21,28 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import tdhil
-from drivers.errors import DataFileError
+from drivers.drive import RawFrame
+from drivers.errors import CommunicationLost, DataFileError
+from profiles.entry import DriveProfile
+from profiles.entry import Entry as ProfileEntry
+from profiles.library import SCHEMAS
 from profiles.model import Positive
 from profiles.yaml_loader import parse_model
 from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import Shaft
+from tdhil.cli.bus_commands import BusCommands, FoundDrive
+from tdhil.cli.finding import Finding, ok
 from tdhil.cli.main import build_parser, main
-from tdhil.config.options import resolve
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, load, names
+from tdhil.config.options import Setting
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, Entry, load, names
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
+from tdhil.recording.log_format import MODBUS
+from tdhil.recording.log_reader import read_frames, read_run
 from tdhil.run.excitation import ExcitationKind, MachineLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
 from tdhil.run.excitation.pulses import SwingKind, SwingPlan
 from tdhil.run.excitation.signals import unit_peak
@@ -40,11 +50,11 @@ from tdhil.run.planning import adaptive, plan_acquisition, refuse_hopeless
 from tdhil.run.preconditions import refuse_by_plan
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.settings import MachineLimits as RunLimits
-from tdhil.session.connection import BusKind, PeerPlan
-from tdhil.session.opening import open_drive, plan_peer, with_faults
+from tdhil.session.connection import BusKind, LineConfig, PeerPlan
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
 from tests.estimation.test_two_mass import MILD
+from tests.run.line_drive import Line, LineDrive
 from tests.run.test_design import KNOWN
 
 ROOT = Path(__file__).parents[2]
@@ -188,38 +198,207 @@ def test_a_toy_plant_is_read_and_turned(monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# A bus: what opens a drive on it, and one line in the list
+# A bus: its options, how a drive is opened, scan and doctor, the schema of its profiles; and one line in two lists
 
 
-class ToyDrive:
-    """Nothing but something to be opened and closed."""
+class Stated(ProfileEntry):
+    """A section of a toy's profile."""
 
-    closed = False
-
-
-@contextmanager
-def open_toy(*asked: Any) -> Iterator[Any]:
-    drive = ToyDrive()
-    yield drive
-    drive.closed = True
+    ends: Literal["off", "held"] = "held"
+    kind: str = "lease"
+    reaction: str = "quick_stop"
 
 
-TOY_BUS = BusKind(open_toy, tuple, steps_over_a_wire=False)
+class ToyProfile(DriveProfile):
+    """What is known of a drive on the toy bus."""
+
+    bus: Literal["toy"]
+    quick_stop: Stated
+    watchdog: Stated
+    parameters: tuple[Any, ...] = ()
+
+    def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
+        return (("quick_stop", self.quick_stop), ("watchdog", self.watchdog))
+
+    @property
+    def can_torque(self) -> bool:
+        return True
+
+    @property
+    def rated_torque_by_hand(self) -> bool:
+        return False
 
 
-def test_a_drive_on_a_toy_bus_is_opened(monkeypatch):
-    monkeypatch.setitem(BUSES, "toy", Entry(f"{__name__}:TOY_BUS", "a toy"))
+@dataclass(frozen=True)
+class ToyLine(LineConfig):
+    nothing_there = "no peg is named"
+    simulated_text = "toy on a string"
+
+    @property
+    def configured(self) -> bool:
+        return self.value("peg") is not None
+
+
+class ToyKind(BusKind):
+    """Its drive is the one of `tests.run.line_drive`, which no bus of ours knows."""
+
+    name, title, named_by = "toy", "Toy", "--peg"
+    flags = MappingProxyType({"peg": "--peg"})
+    default_profile = "toy.yaml"
+
+    def __init__(self) -> None:
+        self.drives: list[LineDrive] = []
+        self.closed = 0
+
+    @property
+    def frame_channel(self) -> int:
+        return MODBUS
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--peg", type=int)
+
+    def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Any) -> ToyLine:
+        return ToyLine({"peg": Setting.by_flag(cli["peg"], "--peg")} if cli.get("peg") is not None else {})
+
+    @property
+    def nowhere(self) -> ToyLine:
+        return ToyLine()
+
+    @contextmanager
+    def open(self, plan: PeerPlan, options: Any, connection: Any, data: Any, clock: Any, tap: Any,
+             trace: Any) -> Iterator[LineDrive]:
+        drive = LineDrive(Line(0.1), seed=plan.seed or 0, clock=clock)
+        self.drives.append(drive)
+        tap(RawFrame(0.0, True, 3, b"hello"))
+        yield drive
+        self.closed += 1
+
+    @contextmanager
+    def open_target(self, options: Any, connection: Any, clock: Any) -> Iterator[Any]:
+        raise CommunicationLost("nobody there", where=f"peg {connection.line.value('peg')}")
+        yield
+
+    def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
+        return tuple(SimpleNamespace(text=text) for text in texts)
+
+    def fault_listing(self) -> str:
+        return "bite: the toy bites"
+
+
+@dataclass(frozen=True)
+class Peg:
+    """A value of the toy's."""
+
+    number: int
+
+    def cells(self) -> tuple[str, str, str, str]:
+        return f"peg {self.number}", "1", "1 toy", "what it is"
+
+    def plain(self) -> dict[str, Any]:
+        return {"peg": self.number}
+
+
+class ToyCommands(BusCommands):
+    address, address_flag, blank, to_fill_in = "peg", "--peg", ("#peg:",), "a peg"
+
+    def scan(self, plan: Any, connection: Any, options: Any, asked: Any) -> tuple[tuple[FoundDrive, ...], list[str]]:
+        return (FoundDrive("toy", connection.line.value("peg"), "a toy", "wood", plan.embedded),), ["it is asleep"]
+
+    def findings(self, plan: Any, connection: Any, options: Any, rig: Any, seen: list[Any]) -> Iterator[Finding]:
+        yield ok("toy", f"peg {connection.line.value('peg')} answers")
+        seen.append(Peg(7))
+
+    def wanted(self, connection: Any, options: Any) -> int | None:
+        return None
+
+    def section(self, found: FoundDrive, connection: Any) -> Mapping[str, Any]:
+        return {}
+
+    def keys(self, found: FoundDrive) -> Mapping[str, Any]:
+        return {"rate_hz": 20.0}
+
+
+TOY_BUS, TOY_COMMANDS = ToyKind(), ToyCommands()
+
+
+@pytest.fixture
+def toy_bus(monkeypatch, tmp_path) -> ToyKind:
+    """The bus in both lists, and a folder with a profile of it."""
+    monkeypatch.setitem(SCHEMAS, "toy", ToyProfile)
+    monkeypatch.setitem(BUSES, "toy", BusEntry(f"{__name__}:TOY_BUS", "a toy", commands=f"{__name__}:TOY_COMMANDS"))
+    monkeypatch.chdir(tmp_path)
+    sure = "{source: carved by hand, confidence: verified}"
+    (tmp_path / "toy.yaml").write_text(
+        f"name: wood/toy\ntitle: A toy of wood\nbus: toy\nquick_stop: {sure}\nwatchdog: {sure}\n"
+    )
+    TOY_BUS.drives.clear()
+    TOY_BUS.closed = 0
+    return TOY_BUS
+
+
+def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
+    code = main(["identify", "--drive", "toy", "--simulate", "--seed", "3", "--json", "--model", "rigid",
+                 "--excitation", "multisine", "--periods", "3"])
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert (code, document["verdict"]) == (0, "valid"), err
+    estimate = document["inertia_kg_m2"]
+    assert estimate["low_total"] < 104.0 < estimate["high_total"]
+    assert "embedded toy on a string" in err
+    (drive,) = toy_bus.drives
+    assert drive.cycles > 500 and toy_bus.closed == 1
+    logged = read_run(Path("run.mcap")).configuration
+    assert (logged["drive"], logged["profile"]["name"]) == ("toy", "wood/toy")
+    assert [frame.data for frame in read_frames(Path("run.mcap"))] == [b"hello"]
+    assert main(["export", "run.mcap", "--to", "candump"]) == 2           # the toy's frames are no CAN frames
+    assert "has no CAN frames in it" in capsys.readouterr().err
+
+
+def test_scan_and_doctor_ask_the_toy_bus(toy_bus, capsys):
+    assert main(["scan", "--peg", "7", "--write", "rig.yaml"]) == 0
+    assert "peg 7: a toy" in capsys.readouterr().out
+    rig = load_rig(Path("rig.yaml"))
+    assert (rig.drive, rig.rate_hz) == ("toy", 20.0)
+    main(["doctor", "--peg", "7", "--profile", "toy.yaml", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    assert {"grade": "ok", "name": "toy", "said": "peg 7 answers", "do": ""} in document["checks"]
+    assert document["registers"] == [{"peg": 7}]
+    main(["doctor", "--peg", "7"])
+    assert "peg 7" in capsys.readouterr().out
+    assert main(["profiles", "show", "toy.yaml"]) == 0
+    assert "A toy of wood" in capsys.readouterr().out
+    assert main(["rig", "new", "new.yaml", "--profile", "toy.yaml", "--load", "none"]) == 0
+    assert "where the drive is: a peg" in capsys.readouterr().err
+    assert "#peg:" in Path("new.yaml").read_text()
+
+
+def test_the_command_line_tells_a_toy_from_the_other_buses(toy_bus, capsys):
     assert build_parser("identify").parse_args(["identify", "--drive", "toy"]).drive == "toy"
-    options = resolve({}, Rig.model_validate({"drive": "toy"}))
-    assert options.drive == "toy"
-    connection: Any = SimpleNamespace(drive=options.drive, configured=True)
-    plan = PeerPlan(embedded=True, stepped=True, seed=1, plant=None)
-    assert with_faults(plan, ["bite"], "toy").faults == ("bite",)
-    with open_drive(plan, options, connection, None, lambda *_: None, None) as drive:
-        assert isinstance(drive, ToyDrive) and not drive.closed
-    assert drive.closed
-    with pytest.raises(UsageError, match="no SYNC to step by"):
-        plan_peer(resolve({"drive": "toy", "stepped": True}, None), connection)
+    assert main(["stop", "--peg", "7"]) == 8
+    assert "peg 7: nobody there" in capsys.readouterr().err
+    for arguments, said in (
+        (["--drive", "toy", "--host", "a"], "--host: belongs to Modbus. A Toy drive is named by --peg"),
+        (["--drive", "modbus", "--peg", "7"], "--peg: belongs to Toy."),
+        (["--drive", "toy", "--profile", "generic/modbus"], "is a profile for modbus, and --drive says toy"),
+        (["--peg", "7", "--stepped"], "a Toy line has no SYNC to step by"),
+    ):
+        assert main(["identify", *arguments]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+    Path("wired.yaml").write_text("drive: toy\nbus: {interface: socketcan, channel: can0}\n")
+    assert main(["identify", "--rig", "wired.yaml"]) == 2
+    assert "wired.yaml:2: bus: says where a drive is, but the drive is on toy" in capsys.readouterr().err
+    assert main(["identify", "--fault", "list"]) == 0
+    assert "--drive toy\n\nbite: the toy bites" in capsys.readouterr().out
+
+
+def test_nothing_is_compared_with_the_name_of_a_bus():
+    found = []
+    for path in sorted((*(ROOT / "tdhil").rglob("*.py"), *(ROOT / "profiles").rglob("*.py"))):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Compare | ast.MatchValue | ast.MatchOr):
+                told = {one.value for one in ast.walk(node) if isinstance(one, ast.Constant)} & set(BUSES)
+                found += [f"{path.relative_to(ROOT)}:{node.lineno}: {name}" for name in told]
+    assert found == []
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ One seed here; twenty, and how often the interval covers: `benchmarks/every_prof
 import pytest
 
 from profiles.library import load_profile, profile_names
-from tdhil.session.connection import can_torque
 from tests.path.path_runs import Shaft, identify
 
 TRUE_KG_M2 = 104.0
@@ -36,6 +35,6 @@ def test_the_inertia(name, tmp_path):
     assert inertia["low"] < TRUE_KG_M2 < inertia["high"]
     outcomes = dict(done.outcomes)
     assert [outcomes[stage] for stage in ("setup", "speed", "acquire")] == ["ok"] * 3
-    if not can_torque(profile):                        # no torque mode, or none under way
+    if not profile.can_torque:                        # no torque mode, or none under way
         assert (outcomes["torque"], outcomes["hold"]) == ("skipped", "skipped")
     Shaft.read(trace).assert_at_rest()

@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from tdhil.cli.main import main
 from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import CHANNELS, CLASSES, Event
+from tdhil.recording.log_format import CHANNELS, CLASSES, MODBUS, Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
 from tests.recording.log_runs import FACTS, PERIOD_S, fill, make_run
@@ -53,7 +53,7 @@ def test_events_are_a_log_that_viewers_know(tmp_path):
 
 def test_modbus_bytes_stand_on_their_own_topic(tmp_path):
     path = tmp_path / "run.mcap"
-    with RunWriter(path, epoch_ns=0, block=True, modbus=True) as writer:
+    with RunWriter(path, epoch_ns=0, block=True, frames=MODBUS) as writer:
         logged = fill(writer, RecordingBuilder(), 50)
     assert decoded(path, "/can") == []
     assert sum(len(one.frames) for _, _, one in decoded(path, "/modbus")) == len(logged)
@@ -118,7 +118,7 @@ def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch)
     there.write_text("mine")
     monkeypatch.setattr("tdhil.cli.export.find_spec", lambda name: None)
     modbus = tmp_path / "modbus.mcap"
-    with RunWriter(modbus, epoch_ns=0, block=True, modbus=True) as writer:
+    with RunWriter(modbus, epoch_ns=0, block=True, frames=MODBUS) as writer:
         writer.configuration({"drive": "modbus"}, {})
         fill(writer, RecordingBuilder(), 5)
         writer.configuration({"drive": "modbus"}, {"simulated": FACTS["simulated"]})

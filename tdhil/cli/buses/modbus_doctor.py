@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from drivers import NO_WATCHDOG_FLAG, ObjectRefused, PowerState, Table
 from drivers.modbus import (
@@ -42,6 +43,18 @@ class RegisterSeen:
         if self.use.per_lsb is None:
             return f"{self.counts & 0xFFFF:04X}h"
         return f"{self.value:.9g} {self.use.unit}".strip() if self.value is not None else "scale not known"
+
+    def cells(self) -> tuple[str, str, str, str]:
+        """Address, counts, value, meaning."""
+        return self.use.address, "-" if self.counts is None else str(self.counts), self.shown, self.use.meaning
+
+    def plain(self) -> dict[str, Any]:
+        """As the JSON document has it."""
+        return {
+            "name": self.use.name, "address": self.use.register.address, "table": self.use.register.table,
+            "meaning": self.use.meaning, "counts": self.counts, "value": self.value, "unit": self.use.unit,
+            "error": self.error or None,
+        }
 
 
 def access_of(link: Link, profile: ModbusProfile, unit: int) -> Access:

@@ -26,10 +26,12 @@ from drivers.modbus import (
 )
 from profiles import load_profile, profile_names, visible
 from profiles.modbus import ModbusProfile, Register
-from tdhil.cli.found_drive import FoundDrive
+from tdhil.cli.bus_commands import FoundDrive
 from tdhil.cli.profile_text import register_uses
 from tdhil.config import DriveData, Origin, Setting
-from tdhil.session import Connection, ModbusConfig, SettingsRefused, open_line
+from tdhil.session import Connection
+from tdhil.session.buses.modbus import SettingsRefused, config_of, open_line
+from tdhil.session.buses.modbus_line import ModbusConfig
 
 if TYPE_CHECKING:
     from tdhil.session import PeerPlan
@@ -192,10 +194,10 @@ def scan_lines(
     garbled = tried = 0
     where = ""
     refused: SettingsRefused | None = None
-    for setting in _settings(plan, connection.modbus):
+    for setting in _settings(plan, config_of(connection)):
         clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
         try:
-            with open_line(plan, replace(connection, modbus=setting), DriveData(), clock) as line:
+            with open_line(plan, replace(connection, line=setting), DriveData(), clock) as line:
                 where = line.link.description
                 if setting.serial is not None and not plan.embedded:
                     say(f"asking {len(units)} units at {setting.baud} baud 8{setting.parity}{setting.stop_bits} …")
@@ -216,7 +218,7 @@ def scan_lines(
             next_step="Check baud rate and parity at the drive, the polarity of the wires, termination and shielding",
         )
     step = "Check the drive's unit number (--units 1-247 asks all), that Modbus TCP is on, and its address"
-    if connection.modbus.serial is not None:
+    if config_of(connection).serial is not None:
         step = "Check the drive's unit number (--units 1-247 asks all), its baud rate, the two wires and their polarity"
     raise CommunicationLost(f"nobody answers ({asked})", where=where, next_step=step)
 

@@ -12,17 +12,18 @@ import os
 import shutil
 import socket
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, cast
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused, Problem
 from tdhil.config import Origin, Rig, Setting, bit_rate_problem
 from tdhil.errors import UsageError
+from tdhil.session.connection import LineConfig
 
 if TYPE_CHECKING:
     import can
@@ -41,14 +42,11 @@ _VARIABLES = {"interface": "CAN_INTERFACE", "channel": "CAN_CHANNEL", "bitrate":
 
 
 @dataclass(frozen=True)
-class BusConfig:
+class BusConfig(LineConfig):
     """Each option of the bus and its origin, in the order in which python-can takes them."""
 
-    nothing_there: ClassVar[str] = "no CAN bus is configured"
-    simulated_text: ClassVar[str] = "drive and rig on a virtual bus"
-    row_name: ClassVar[str] = "bus"
-
-    settings: Mapping[str, Setting]
+    nothing_there = "no CAN bus is configured"
+    simulated_text = "drive and rig on a virtual bus"
 
     @property
     def configured(self) -> bool:
@@ -57,23 +55,15 @@ class BusConfig:
 
     @property
     def interface(self) -> str | None:
-        return str(self.settings["interface"].value) if "interface" in self.settings else None
+        return str(self.value("interface")) if "interface" in self.settings else None
 
     @property
     def channel(self) -> str:
-        return str(self.settings["channel"].value) if "channel" in self.settings else ""
+        return str(self.value("channel", ""))
 
     @property
     def bitrate(self) -> int | None:
-        return self.settings["bitrate"].value if "bitrate" in self.settings else None
-
-    def source(self, option: str) -> str:
-        return self.settings[option].source if option in self.settings else ""
-
-    def rows(self) -> Iterator[tuple[str, str, str]]:
-        """(option, value, source) to print."""
-        for name, setting in self.settings.items():
-            yield name, str(setting.value), setting.source
+        return cast("int | None", self.value("bitrate"))
 
     def kwargs(self) -> dict[str, Any]:
         """What `can.Bus` takes; it looks at the same places again, but finds nothing there that isn't here."""

@@ -1,22 +1,26 @@
-"""A CANopen drive on an open bus, or the embedded simulator on a virtual one."""
+"""CANopen: its options, and a drive on an open bus, or the embedded simulator on a virtual one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from drivers import Clock, FrameTap
-from drivers.canopen import Cia402Drive
-from drivers.left_behind import LeftBehind
+from profiles import Profile
 from profiles.canopen import CanopenProfile
-from tdhil.config import DriveData, RunOptions
-from tdhil.session.connection import BusKind, Connection, rated_torque_is_told_by_hand
+from profiles.quantities import BIT_RATE, read
+from tdhil.config import DriveData, Rig, RunOptions
+from tdhil.session.buses import can_bus
+from tdhil.session.buses.can_bus import BusConfig, bus_config
+from tdhil.session.connection import BusKind, Connection
 
 if TYPE_CHECKING:
     import can
 
+    from drivers import Clock, Drive, FrameTap, Target
     from sim_bus.canopen import Simulator
     from tdhil.session.connection import PeerPlan
 
@@ -24,29 +28,116 @@ PLAIN = "generic/cia402"
 """What the simulator is when it wears no profile."""
 
 
-@contextmanager
-def open_canopen(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
-                 tap: FrameTap, trace: Path | None) -> Iterator[Cia402Drive]:
-    """The node that the options, or else the profile, name."""
-    profile = connection.profile
-    assert isinstance(profile, CanopenProfile)
-    node = options.node if options.node is not None else profile.node
-    with open_can(plan, connection, node, trace) as channel:
-        yield Cia402Drive(
-            channel,
-            profile,
-            clock,
-            node=node,
-            rate_hz=options.rate_hz,
-            rated_torque_nm=rated_torque_nm(plan, profile, data),
-            tap=tap,
-            left=None if plan.embedded else LeftBehind(Path(options.log).parent, f"node{node}"),
-        )
+class CanopenKind(BusKind):
+    """CiA 402 over any adapter of python-can's; of its nodes, the one that the options, or else the profile, name."""
+
+    name, title = "canopen", "CANopen"
+    named_by = "--interface and --channel, and --node"
+    section, place_keys = "bus", "interface, channel"
+    flags = MappingProxyType({
+        "node": "--node", "interface": "--interface", "channel": "--channel", "bitrate": "--bitrate",
+    })
+    default_profile = PLAIN
+    steps_over_a_wire = True
+
+    def add_drive_arguments(self, drive: argparse._ArgumentGroup) -> None:
+        """The node."""
+        drive.add_argument("--node", type=int, metavar="N", help="CANopen node number (default: the profile's)")
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """python-can's own."""
+        from can.cli import add_bus_arguments
+
+        add_bus_arguments(parser, group_title="CAN bus (python-can's own options)")
+        for action in parser._actions:  # python-can's take no 500k
+            if action.dest in ("bitrate", "data_bitrate"):
+                action.type = _bit_rate
+
+    def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> BusConfig:
+        """As python-can is configured."""
+        return bus_config(cli, rig)
+
+    @property
+    def nowhere(self) -> BusConfig:
+        """No bus."""
+        return BusConfig()
+
+    def placed_in(self, rig: Rig) -> bool:
+        """Does ``bus:`` name an interface?"""
+        return rig.bus.interface is not None
+
+    @contextmanager
+    def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
+             tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
+        """The bus, shut down afterwards, and the drive on it."""
+        from drivers.canopen import Cia402Drive
+        from drivers.left_behind import LeftBehind
+
+        profile, node = profile_of(connection), node_of(options, connection)
+        with open_can(plan, connection, node, trace) as channel:
+            yield Cia402Drive(
+                channel,
+                profile,
+                clock,
+                node=node,
+                rate_hz=options.rate_hz,
+                rated_torque_nm=rated_torque_nm(plan, profile, data),
+                tap=tap,
+                left=None if plan.embedded else LeftBehind(Path(options.log).parent, f"node{node}"),
+            )
+
+    @contextmanager
+    def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
+        """The node alone, on an open bus."""
+        from drivers.canopen import Cia402Target
+
+        bus = can_bus.open_bus(config_of(connection))
+        target = Cia402Target(bus, profile_of(connection), clock, node=node_of(options, connection))
+        try:
+            yield target
+        finally:
+            target.close()
+
+    def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
+        """Of `sim_bus.canopen`."""
+        from sim_bus.canopen import parse_all
+
+        return parse_all(texts)
+
+    def fault_listing(self) -> str:
+        """All faults of the simulated CANopen drive."""
+        from sim_bus.canopen import listing
+
+        return listing()
+
+
+def _bit_rate(text: str) -> int:
+    try:
+        return int(read(text, BIT_RATE))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text[:60]!r}: {error}") from None
+
+
+def profile_of(connection: Connection) -> CanopenProfile:
+    """What is known of the drive."""
+    assert isinstance(connection.profile, CanopenProfile)
+    return connection.profile
+
+
+def config_of(connection: Connection) -> BusConfig:
+    """Which CAN bus."""
+    assert isinstance(connection.line, BusConfig)
+    return connection.line
+
+
+def node_of(options: RunOptions, connection: Connection) -> int:
+    """The node that the options name, or else the profile."""
+    return options.node if options.node is not None else profile_of(connection).node
 
 
 def rated_torque_nm(plan: PeerPlan, profile: CanopenProfile, data: DriveData) -> float | None:
     """As rig.yaml has it; a simulated motor has no plate to read it from."""
-    if data.rated_torque_nm is None and plan.embedded and rated_torque_is_told_by_hand(profile):
+    if data.rated_torque_nm is None and plan.embedded and profile.rated_torque_by_hand:
         return float(plan.plant.drive.rated_torque_nm)
     return data.rated_torque_nm
 
@@ -60,9 +151,7 @@ def open_can(plan: PeerPlan, connection: Connection, node: int, trace: Path | No
             # Before the simulator runs out by itself: what comes then is no part of the run.
             stack.callback(lambda: plan.never_came.extend(simulator.faults_waiting))
         else:
-            from tdhil.session.buses.can_bus import open_bus
-
-            channel = open_bus(connection.bus)
+            channel = can_bus.open_bus(config_of(connection))
         stack.callback(channel.shutdown)
         yield channel
 
@@ -71,8 +160,7 @@ def _embedded(
     stack: ExitStack, plan: PeerPlan, connection: Connection, node: int, trace: Path | None
 ) -> tuple[Simulator, can.BusABC]:
     """The simulator and the host's bus to it: in this thread where it is stepped, else in one of its own."""
-    worn = None if connection.profile.name == PLAIN else connection.profile
-    assert worn is None or isinstance(worn, CanopenProfile)
+    worn = None if connection.profile.name == PLAIN else profile_of(connection)
     if plan.stepped:
         from sim_bus.canopen import InlineSimulator
 
@@ -92,10 +180,4 @@ def _embedded(
     return simulated.simulator, can.Bus(interface="virtual", channel=simulated.channel)
 
 
-def _faults(texts: Sequence[str]) -> tuple[Any, ...]:
-    from sim_bus.canopen import parse_all
-
-    return parse_all(texts)
-
-
-CANOPEN = BusKind(open_canopen, _faults, steps_over_a_wire=True)
+CANOPEN = CanopenKind()

@@ -1,21 +1,23 @@
-"""A Modbus drive on TCP or on a serial line, or the embedded simulator that wears its profile."""
+"""Modbus: its options, and a drive on TCP or on a serial line, or the embedded simulator that wears its profile."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivers import Clock, FrameTap, PreflightRefused, TdhilError
-from drivers.modbus import ModbusDrive
+from drivers import PreflightRefused, TdhilError
+from profiles import Profile
 from profiles.modbus import ModbusProfile
-from tdhil.config import DriveData, RunOptions
-from tdhil.session.buses.modbus_line import ModbusConfig
+from tdhil.config import DriveData, Rig, RunOptions
+from tdhil.session.buses.modbus_line import FLAGS, ModbusConfig, modbus_config
 from tdhil.session.connection import BusKind, Connection
 
 if TYPE_CHECKING:
+    from drivers import Clock, Drive, FrameTap, Target
     from drivers.modbus import Link
     from tdhil.session.connection import PeerPlan
 
@@ -24,20 +26,100 @@ class SettingsRefused(PreflightRefused):
     """The serial device is there, but not with these settings."""
 
 
-@contextmanager
-def open_modbus(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
-                tap: FrameTap, trace: Path | None) -> Iterator[ModbusDrive]:
-    """The unit that the options, or else the profile, name."""
-    with open_line(plan, connection, data, clock, trace) as line:
-        yield ModbusDrive(
-            line.link,
-            line.profile,
-            unit=connection.modbus.unit,
-            rate_hz=options.rate_hz,
-            rated_torque_nm=line.rated_torque_nm,
-            given=line.given,
-            tap=tap,
-        )
+class ModbusKind(BusKind):
+    """TCP where a host is named, else a serial line; of its units, the one that the options, or the profile, name."""
+
+    name, title = "modbus", "Modbus"
+    named_by = "--host or --serial, and --unit"
+    section, place_keys = "modbus", "host or serial"
+    flags = FLAGS
+    default_profile = "generic/modbus"
+    steps_over_a_wire = False          # it has no SYNC
+
+    @property
+    def frame_channel(self) -> int:
+        """Requests and replies (PDU)."""
+        from tdhil.recording import MODBUS
+
+        return MODBUS
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Of a TCP or a serial line."""
+        group = parser.add_argument_group("Modbus (what is left out is as the profile says)")
+        group.add_argument("--host", metavar="NAME", help="Modbus TCP: name or address of the drive")
+        group.add_argument("--port", type=int, metavar="N", help="TCP port (default 502)")
+        group.add_argument("--serial", metavar="DEVICE", help="Modbus RTU: serial device, such as /dev/ttyUSB0")
+        group.add_argument("--baud", type=int, metavar="N", help="bit/s of the serial line")
+        group.add_argument("--parity", choices=("N", "E", "O"), help="none, even or odd")
+        group.add_argument("--stop-bits", type=int, choices=(1, 2), help="of the serial line")
+        group.add_argument("--unit", type=int, metavar="N", help="unit (slave) number of the drive")
+
+    def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> ModbusConfig:
+        """As configured; for the rest as the drive leaves the factory."""
+        assert isinstance(profile, ModbusProfile)
+        return modbus_config(cli, rig, profile)
+
+    @property
+    def nowhere(self) -> ModbusConfig:
+        """No line."""
+        return ModbusConfig()
+
+    def placed_in(self, rig: Rig) -> bool:
+        """Does ``modbus:`` name a host or a device?"""
+        return bool(rig.modbus.host or rig.modbus.serial)
+
+    @contextmanager
+    def open(self, plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData, clock: Clock,
+             tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
+        """The line, closed afterwards, and the drive on it."""
+        from drivers.modbus import ModbusDrive
+
+        with open_line(plan, connection, data, clock, trace) as line:
+            yield ModbusDrive(
+                line.link,
+                line.profile,
+                unit=config_of(connection).unit,
+                rate_hz=options.rate_hz,
+                rated_torque_nm=line.rated_torque_nm,
+                given=line.given,
+                tap=tap,
+            )
+
+    @contextmanager
+    def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> Iterator[Target]:
+        """The unit alone, on an open line."""
+        from drivers.modbus import ModbusTarget
+
+        config = config_of(connection)
+        link = open_wire(config, clock)
+        try:
+            yield ModbusTarget(link, profile_of(connection), unit=config.unit)
+        finally:
+            link.close()
+
+    def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
+        """Of `sim_bus.modbus`, as far as the embedded drive has them."""
+        from sim_bus.modbus import parse_all
+
+        return parse_all(texts, "embedded")
+
+    def fault_listing(self) -> str:
+        """All faults of the simulated Modbus drive."""
+        from sim_bus.modbus import listing
+
+        return listing()
+
+
+def profile_of(connection: Connection) -> ModbusProfile:
+    """What is known of the drive."""
+    assert isinstance(connection.profile, ModbusProfile)
+    return connection.profile
+
+
+def config_of(connection: Connection) -> ModbusConfig:
+    """Which line."""
+    assert isinstance(connection.line, ModbusConfig)
+    return connection.line
 
 
 @dataclass(frozen=True)
@@ -55,12 +137,11 @@ def open_line(
     plan: PeerPlan, connection: Connection, data: DriveData, clock: Clock, trace: Path | None = None
 ) -> Iterator[OpenLine]:
     """Closed afterwards. Raises what opening it raises, with what to do."""
-    profile = connection.profile
-    assert isinstance(profile, ModbusProfile)
+    profile, config = profile_of(connection), config_of(connection)
     if plan.embedded:
-        line = _embedded(plan, profile, connection.modbus.unit, data, clock, trace)
+        line = _embedded(plan, profile, config.unit, data, clock, trace)
     else:
-        line = OpenLine(open_wire(connection.modbus, clock), profile, data.rated_torque_nm, data.parameters)
+        line = OpenLine(open_wire(config, clock), profile, data.rated_torque_nm, data.parameters)
     try:
         yield line
     finally:
@@ -110,10 +191,4 @@ def _embedded(plan: PeerPlan, profile: ModbusProfile, unit: int, data: DriveData
     return OpenLine(link, profile, rated_nm, {**drive.untold, **data.parameters})
 
 
-def _faults(texts: Sequence[str]) -> tuple[Any, ...]:
-    from sim_bus.modbus import parse_all
-
-    return parse_all(texts, "embedded")
-
-
-MODBUS = BusKind(open_modbus, _faults, steps_over_a_wire=False)     # it has no SYNC
+MODBUS = ModbusKind()

@@ -4,10 +4,10 @@ Command line, then rig.yaml's ``modbus:``, then the profile's ``line:``, which s
 A host means TCP, a serial device means RTU; the command line's word for one of them undoes rig.yaml's for the other.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, Literal, cast
 
 from pydantic import ValidationError
 
@@ -15,8 +15,9 @@ from profiles import messages_of
 from profiles.modbus import Line, ModbusProfile
 from tdhil.config import Modbus, Origin, Rig, Setting
 from tdhil.errors import UsageError
+from tdhil.session.connection import LineConfig
 
-FLAGS = {
+FLAGS: Mapping[str, str] = MappingProxyType({
     "host": "--host",
     "port": "--port",
     "serial": "--serial",
@@ -24,19 +25,17 @@ FLAGS = {
     "parity": "--parity",
     "stop_bits": "--stop-bits",
     "unit": "--unit",
-}
+})
 TCP, RTU = ("host", "port", "unit"), ("serial", "baud", "parity", "stop_bits", "unit")
 
 
 @dataclass(frozen=True)
-class ModbusConfig:
+class ModbusConfig(LineConfig):
     """Each value and its origin; only those that the way to the drive (TCP or RTU) knows."""
 
-    nothing_there: ClassVar[str] = "no Modbus host and no serial device is named"
-    simulated_text: ClassVar[str] = "Modbus drive and rig"
-    row_name: ClassVar[str] = "line"
-
-    settings: Mapping[str, Setting]
+    nothing_there = "no Modbus host and no serial device is named"
+    simulated_text = "Modbus drive and rig"
+    row_name = "line"
 
     @property
     def configured(self) -> bool:
@@ -45,46 +44,31 @@ class ModbusConfig:
 
     @property
     def host(self) -> str | None:
-        return cast("str | None", self._value("host"))
+        return cast("str | None", self.value("host"))
 
     @property
     def port(self) -> int:
-        return cast(int, self._value("port"))
+        return cast(int, self.value("port"))
 
     @property
     def serial(self) -> str | None:
-        return cast("str | None", self._value("serial"))
+        return cast("str | None", self.value("serial"))
 
     @property
     def baud(self) -> int:
-        return cast(int, self._value("baud"))
+        return cast(int, self.value("baud"))
 
     @property
     def parity(self) -> Literal["N", "E", "O"]:
-        return cast(Literal["N", "E", "O"], self._value("parity"))
+        return cast(Literal["N", "E", "O"], self.value("parity"))
 
     @property
     def stop_bits(self) -> Literal[1, 2]:
-        return cast(Literal[1, 2], self._value("stop_bits"))
+        return cast(Literal[1, 2], self.value("stop_bits"))
 
     @property
     def unit(self) -> int:
-        return cast(int, self._value("unit"))
-
-    def source(self, name: str) -> str:
-        return self.settings[name].source if name in self.settings else ""
-
-    def origin(self, name: str) -> Origin | None:
-        """Who said it, None where nobody did."""
-        return self.settings[name].origin if name in self.settings else None
-
-    def rows(self) -> Iterator[tuple[str, str, str]]:
-        """(option, value, source) to print."""
-        for name, setting in self.settings.items():
-            yield name, str(setting.value), setting.source
-
-    def _value(self, name: str) -> Any:
-        return self.settings[name].value if name in self.settings else None
+        return cast(int, self.value("unit"))
 
 
 def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfile | None) -> ModbusConfig:
@@ -119,11 +103,6 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
             next_step="Give the drive's own with --unit",
         )
     return found
-
-
-def asked_for(cli: Mapping[str, Any]) -> str | None:
-    """The flag on the command line that only a Modbus drive has; None if there is none."""
-    return next((flag for name, flag in FLAGS.items() if cli.get(name) is not None), None)
 
 
 _STANDARD = Line(transports=("tcp", "rtu"), source="the Modbus specification", confidence="verified")

@@ -1,0 +1,85 @@
+"""Modbus for scan, doctor and rig new."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from tdhil.cli.bus_commands import BusCommands, FoundDrive, ValueSeen
+
+if TYPE_CHECKING:
+    from tdhil.cli.finding import Finding
+    from tdhil.config import Rig, RunOptions
+    from tdhil.session import Connection, PeerPlan
+
+
+class ModbusCommands(BusCommands):
+    """Units are asked one by one, on a serial line at its usual settings; a drive is looked at register by register."""
+
+    address, address_flag = "unit", "--unit"
+    blank = ("#modbus: {host: 192.0.2.10, unit: 1}    # or {serial: /dev/ttyUSB0, baud: 19200, parity: E}",)
+    to_fill_in = "modbus"
+
+    def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
+        """Which units to ask."""
+        scan.add_argument("--units", metavar="N-M", help="Modbus units to ask, as 1-10,247 (default 1-5; TCP: and 255)")
+
+    def scan(
+        self, plan: PeerPlan, connection: Connection, options: RunOptions, asked: argparse.Namespace
+    ) -> tuple[tuple[FoundDrive, ...], list[str]]:
+        """Everybody at the first setting of the line at which anybody answers."""
+        from tdhil.cli.buses.modbus_scan import UNITS_RTU, UNITS_TCP, parse_units, scan_lines
+        from tdhil.config import Origin
+        from tdhil.errors import UsageError
+        from tdhil.session.buses import modbus
+
+        line = modbus.config_of(connection)
+        own = str(line.unit)
+        usual = UNITS_RTU if line.serial is not None and not plan.embedded else UNITS_TCP
+        text = asked.units or (own if line.origin("unit") is Origin.COMMAND_LINE else f"{own},{usual}")
+        try:
+            units = parse_units(text)
+        except ValueError as error:
+            raise UsageError(f"{error}", where="--units", next_step="Write it like 1-10,247") from None
+        return scan_lines(plan, connection, units, say=lambda line: print(line, file=sys.stderr))  # noqa: T201
+
+    def findings(
+        self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
+    ) -> Iterator[Finding]:
+        """Line, drive, and each register of the profile."""
+        from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
+        from tdhil.cli.buses import modbus_doctor
+        from tdhil.cli.finding import attempted, of_error, ok
+        from tdhil.config import DriveData
+        from tdhil.session.buses import modbus
+
+        clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
+        unit = modbus.config_of(connection).unit
+        try:
+            with modbus.open_line(plan, connection, rig.drive_data if rig is not None else DriveData(), clock) as line:
+                yield ok("line", f"open: {line.link.description}")
+                access = modbus_doctor.access_of(line.link, line.profile, unit)
+                yield from attempted(
+                    "drive",
+                    lambda: modbus_doctor.drive_findings(
+                        access, line.profile, unit, dict(line.given), line.rated_torque_nm, seen.extend
+                    ),
+                )
+        except TdhilError as error:
+            yield of_error("line", error)
+
+    def wanted(self, connection: Connection, options: RunOptions) -> int | None:
+        """As --unit has it: the profile's, or rig.yaml's, is but where to begin."""
+        from tdhil.config import Origin
+
+        line = connection.line
+        return line.value("unit") if line.origin("unit") is Origin.COMMAND_LINE else None
+
+    def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
+        """How the line was set when the drive answered, and its unit."""
+        return {**found.line, "unit": found.address}
+
+
+MODBUS = ModbusCommands()
