@@ -133,3 +133,61 @@ class StringRelease:
             if self._side and self._since_side_s < FASTEST_SWING_S:
                 self._impedance = min(2.0 * self._impedance, self._stiffest)
             self._side, self._since_side_s = side, 0.0
+
+
+MEAN_TORQUE_S = 8.0
+"""What flows on average is a mean over about this time: longer than most strings swing."""
+
+SMOOTH_S = 0.2
+"""The torque is smoothed over this time, so that a loop behind late reports stays stable whatever the drive's gain."""
+
+
+class SwingDamper:
+    """Fed with every sample of a turning string; the speed to command next: ω₀ − (T − T̄)/Z, within bounds.
+
+    T̄ is the mean torque of the last `MEAN_TORQUE_S`, so that friction and bit don't move the mean speed. The bounds:
+    a tenth of the speed limit either way, forward, and below the speed limit.
+    """
+
+    def __init__(self, torque_limit_nm: float, speed_limit_rad_s: float, target_rad_s: float, period_s: float) -> None:
+        self._target_rad_s = target_rad_s
+        self._most_rad_s = SPEED_SHARE * speed_limit_rad_s
+        self._highest_rad_s = (1.0 - 0.5 * SPEED_SHARE) * speed_limit_rad_s
+        self._impedance = torque_limit_nm / (IMPEDANCE_SPEED_SHARE * speed_limit_rad_s)
+        self._stiffest = STIFFEST * self._impedance
+        self._residual_nm = RESIDUAL_SHARE * torque_limit_nm
+        self._period_s = period_s
+        self._seen = 0
+        self._mean_nm = self._smooth_nm = self._side = self._since_side_s = 0.0
+
+    def step(self, torque_nm: float) -> float:
+        """The speed, rad/s; anything not finite counts as unheard."""
+        if not math.isfinite(torque_nm):
+            return self._bounded(0.0)
+        if self._seen == 0:
+            self._mean_nm = self._smooth_nm = torque_nm
+        self._seen += 1
+        self._mean_nm += max(1.0 / self._seen, self._period_s / MEAN_TORQUE_S) * (torque_nm - self._mean_nm)
+        self._smooth_nm += self._period_s / (self._period_s + SMOOTH_S) * (torque_nm - self._smooth_nm)
+        swing_nm = self._smooth_nm - self._mean_nm
+        self._watch_sign(swing_nm)
+        return self._bounded(-swing_nm / self._impedance)
+
+    def _bounded(self, deviation_rad_s: float) -> float:
+        speed = self._target_rad_s + max(-self._most_rad_s, min(self._most_rad_s, deviation_rad_s))
+        return max(0.0, min(max(self._target_rad_s, self._highest_rad_s), speed))
+
+    def _watch_sign(self, swing_nm: float) -> None:
+        """As `StringRelease`: an oscillation faster than any string's is the loop's own, and Z is doubled."""
+        self._since_side_s += self._period_s
+        if abs(swing_nm) <= self._residual_nm:
+            return
+        side = math.copysign(1.0, swing_nm)
+        if side != self._side:
+            if self._side and self._since_side_s < LOOP_SWING_S:
+                self._impedance = min(2.0 * self._impedance, self._stiffest)
+            self._side, self._since_side_s = side, 0.0
+
+
+LOOP_SWING_S = 0.5
+"""Half a swing shorter than this is no string's lowest mode, which is what is to be damped."""

@@ -22,7 +22,7 @@ from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.speed import mean_speeds
-from tdhil.run.stages.steady import trace, wait_until_steady
+from tdhil.run.stages.steady import CALM_S, calm_string, swing_of, trace, wait_until_steady
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The braking probe's pulse: how strong, how long, and what it would do on a drive that takes it the wrong way. Pure.
@@ -53,6 +53,9 @@ from tdhil.run.stages.steady import trace, wait_until_steady
 # With a drill string the torque comes down and up again on ramps, of torque_ramp_nm_s or, where friction would bring
 # the shaft to rest meanwhile, as slow as half a second each allows. That ramp is for letting go of trapped torque for
 # good; here the string keeps its twist, since the shaft neither stops nor turns back.
+#
+# A string that swings pushes and brakes on its own. It is damped beforehand; what is left of its swing, at its worst
+# for all of the pulse, counts as noise of the speed, and where that hides the answer there is no pulse.
 
 
 UP_SHARE, DOWN_SHARE = 0.8, 0.6
@@ -72,6 +75,10 @@ LONGEST_S = 1.0
 STRING_EDGE_S = 0.5
 CLEAR, WANTED_CLEAR = 2.0, 6.0
 """The change must be, and should be, so many times what counts as noise."""
+
+STRING_CLEAR = 4.0
+"""The change of torque must be so many times what the string swings by: until the answer is heard, it pushes for about
+twice as long as the pulse."""
 
 
 @dataclass(frozen=True)
@@ -105,11 +112,15 @@ class NoPulse:
 
 @dataclass(frozen=True)
 class Before:
-    """The steady rotation that it starts from: what flows (less its offset), and what counts as noise of a report."""
+    """The steady rotation that it starts from: what flows (less its offset), and what counts as noise of a report.
+
+    ``swing_nm``: what a drill string on it may push with meanwhile, either way.
+    """
 
     speed_rad_s: float
     flowing_nm: float
     speed_noise_rad_s: float
+    swing_nm: float = 0.0
 
 
 def plan_pulse(
@@ -157,6 +168,11 @@ def plan_pulse(
             "Use --mode speed, or raise limits.probe_torque_nm",
         )
     exposed_s = (cycles + 2 * edge) * period_s + reaction_s
+    if change_nm < STRING_CLEAR * before.swing_nm:
+        return NoPulse(
+            f"the string swings by ±{before.swing_nm:.3g} N·m, which would hide what {change_nm:.3g} N·m do to it",
+            "Use --mode speed, or let the string come to rest: lift the bit off bottom, or take weight off it",
+        )
     highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
     return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)
 
@@ -181,6 +197,9 @@ def _whole(time_s: float, period_s: float) -> int:
 # The reported speed decides, since it is the shaft itself: whichever comes first, half of the expected change
 # downwards or as much upwards. Reported torque and torque demand are quicker: should either clearly rise, it is over
 # at once. That they fall proves nothing about the shaft, and is no condition.
+#
+# A demand that is reported may still be that of the speed loop when torque mode has just been displayed: it counts once
+# it has followed the switch, or would have had to.
 
 
 MEAN_S = 0.05
@@ -208,7 +227,11 @@ def speed_noise_rad_s(steady: Sequence[Sample], resolution_rad_s: float) -> floa
 class Listener:
     """Compares what comes with the steady rotation before; ``why`` says in words what was seen last."""
 
-    def __init__(self, pulse: Pulse, steady: Sequence[Sample], period_s: float) -> None:
+    def __init__(
+        self, pulse: Pulse, steady: Sequence[Sample], period_s: float, reaction_s: float = 0.0,
+        demand_nm: float | None = None,
+    ) -> None:
+        """``steady``: in speed mode; ``demand_nm``: what was seen last of the drive's demand, in torque mode."""
         before = trace(steady)
         self.before_rad_s = self.speed_rad_s = float(before.speed_rad_s.mean())
         self.before_nm = self.torque_nm = self.lowest_nm = float(before.torque_nm.mean())
@@ -216,7 +239,8 @@ class Listener:
         self._change_rad_s = SPEED_SHARE * pulse.slowing_rad_s
         change_nm = ANSWER_TORQUE_SHARE * (pulse.flowing_nm - pulse.torque_nm)
         self._rise_nm = max(change_nm, NOISE_SD * float(before.torque_nm.std()))
-        self._demand_rise_nm = change_nm
+        followed = demand_nm is not None and demand_nm < pulse.flowing_nm + self._rise_nm
+        self._demand_deaf = 0 if followed else math.ceil(reaction_s / period_s - 1e-9)
         self._recent: deque[tuple[float, float]] = deque(maxlen=max(1, round(MEAN_S / period_s)))
         self.why = ""
 
@@ -235,7 +259,10 @@ class Listener:
             self.why = f"the reported torque went from {self.before_nm:.1f} to {self.torque_nm:.1f} N·m"
             return Answer.FASTER
         demand = sample.torque_demand_nm
-        if demand is not None and demand >= self._pulse.flowing_nm + self._demand_rise_nm:
+        risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
+        # Deaf at most until the reaction time is over, and no longer than until the demand has once been what flows.
+        self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
+        if risen and self._demand_deaf <= 0:
             self.why = f"the drive's torque demand went from {self._pulse.flowing_nm:.1f} to {demand:.1f} N·m"
             return Answer.FASTER
         if full and self.speed_rad_s <= self.before_rad_s - self._change_rad_s:
@@ -267,7 +294,10 @@ def slow_down(
     loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, from_rad_s: float,
     speed_resolution_rad_s: float,
 ) -> tuple[Sample, ...]:
-    """Down to the probe's speed in speed mode; the samples of steady rotation there. LimitHit if it gets none."""
+    """Down to the probe's speed in speed mode; the samples of steady rotation there. LimitHit if it gets none.
+
+    Of a drill string so many that its swing shows in them.
+    """
     target = slow_speed(limits)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
     rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2)
@@ -276,6 +306,9 @@ def slow_down(
         loop.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
     command = Command(Mode.SPEED, target, 0.0)
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    if limits.load == "string":
+        calmed = calm_string(loop, limits, target, tolerance)
+        return tuple(calmed.samples[-loop.cycles(CALM_S) :])
     loop.hold(command, assumptions.largest_speed_lag_s)
     settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
     return tuple(settled[-loop.cycles(STEADY_S) :])
@@ -293,15 +326,19 @@ def probe_braking(
     """
     samples: list[Sample] = []
     unclear = ""
+    # Under speed control the torque shows what the string does; behind the switch it is what is commanded.
+    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.load == "string" else 0.0
+    steady = steady[-loop.cycles(STEADY_S) :]
     for _ in range(TRIES):
         noise = speed_noise_rad_s(steady, speed_resolution_rad_s)
-        before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise)
+        before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise, swing_nm)
         pulse = plan_pulse(limits, model, assumptions, before, loop.period_s)
         if isinstance(pulse, NoPulse):
             loop.guard.no_braking, loop.guard.to_brake = pulse.why, pulse.next_step
             loop.log.event(loop.now_s, "probe", f"no braking torque in this run: {pulse.why}")
             return samples
-        listener = Listener(pulse, steady, loop.period_s)
+        demand_nm = None if loop.last is None else loop.last.torque_demand_nm
+        listener = Listener(pulse, steady, loop.period_s, assumptions.reaction_s, demand_nm)
         answer, seen = _try(loop, pulse, listener, before.speed_rad_s, assumptions)
         samples += seen
         if answer is Answer.FASTER:

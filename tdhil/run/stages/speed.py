@@ -18,7 +18,7 @@ from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.speed_check import Onlooker, SpeedLook
-from tdhil.run.stages.steady import SteadyLevel, steady_level, trace, wait_until_steady
+from tdhil.run.stages.steady import SteadyLevel, calm_string, hold_damped, steady_level, trace, wait_until_steady
 
 LEVEL_S = 6.0
 FIRST_RAMP_S = 8.0
@@ -26,6 +26,10 @@ FIRST_RAMP_S = 8.0
 
 GOOD_ENOUGH = 0.2
 """Relative uncertainty of the rough inertia that is good enough to plan with."""
+
+STRING_ERROR = 0.75
+"""Relative uncertainty of the rough inertia of a drill string's shaft: what the motor feels at a frequency is anything
+from its own inertia to all of the string's. A plan has to leave room for it, and a harder ramp tells no more."""
 
 TRIES = 4
 NOBODY = Onlooker()
@@ -83,24 +87,25 @@ def run_speed(
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
     look = SpeedLook(loop, limits, assumptions, speed_resolution_rad_s, onlooker)
     look.ramp(speed_now, low_rad_s, rate)
-    low_samples = _settle_and_hold(loop, low_rad_s, tolerance_rad_s, assumptions, before_level=look.level)
+    low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, look.level).level
     look.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
+    good_enough = STRING_ERROR if limits.load == "string" else GOOD_ENOUGH
     for _ in range(TRIES):
-        between = _ramp(loop, low_rad_s, high_rad_s, rate)
-        ramped = len(between)
-        high_samples = _settle_and_hold(loop, high_rad_s, tolerance_rad_s, assumptions, between)
+        ramped = _ramp(loop, low_rad_s, high_rad_s, rate)
+        high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
+        between, high_samples = [*ramped, *high_held.settling], high_held.level
         held = loop.cycles(LEVEL_S)
         low, high = steady_level(low_samples[-held:]), steady_level(high_samples[-held:])
         moved = trace([*low_samples[-held:], *between, *high_samples[-held:]])
         rough = rough_inertia(
             moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
         )
-        if rough is not None and rough.rel_error <= GOOD_ENOUGH:
+        if rough is not None and rough.rel_error <= good_enough:
             break
         rate *= 4.0
         loop.log.event(loop.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
         _ramp(loop, high_rad_s, low_rad_s, rate)
-        low_samples = _settle_and_hold(loop, low_rad_s, tolerance_rad_s, assumptions)
+        low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions).level
     if rough is None or not rough.inertia_kg_m2 > 0.0:
         found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
         raise DriveFault(
@@ -112,7 +117,7 @@ def run_speed(
         rough.inertia_kg_m2,
         max(0.0, rough.friction.viscous_nm_s_rad),
         max(0.0, rough.friction.coulomb_nm),
-        min(0.8, max(GOOD_ENOUGH, rough.rel_error)),
+        min(0.8, max(good_enough, rough.rel_error)),
     )
     loop.guard.model = model
     return SpeedResult(
@@ -123,18 +128,28 @@ def run_speed(
         Ramp(low.level.end_s, high.level.start_s),
         tuple(high_samples[-loop.cycles(0.5) :]),
         tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
-        _course(low_samples[-held:], between[:ramped], [*between[ramped:], *high_samples[-held:]], mean_speeds(limits)),
+        _course(low_samples[-held:], ramped, high_held, mean_speeds(limits)),
     )
 
 
-def _course(low: list[Sample], ramp: list[Sample], high: list[Sample], speeds_rad_s: tuple[float, float]) -> Course:
+@dataclass(frozen=True)
+class _Held:
+    """Settling and level at a speed; ``setpoints_rad_s``, one a sample of both."""
+
+    settling: list[Sample]
+    level: list[Sample]
+    setpoints_rad_s: list[float]
+
+
+def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tuple[float, float]) -> Course:
     low_rad_s, high_rad_s = speeds_rad_s
     setpoint = np.concatenate([
         np.full(len(low), low_rad_s),
         low_rad_s + (high_rad_s - low_rad_s) * np.arange(1, len(ramp) + 1) / len(ramp),
-        np.full(len(high), high_rad_s),
+        np.array(high.setpoints_rad_s),
     ])
-    rows = np.array([(one.time_s, one.speed_rad_s, one.fresh) for one in (*low, *ramp, *high)], dtype=np.float64)
+    after = (*high.settling, *high.level)
+    rows = np.array([(one.time_s, one.speed_rad_s, one.fresh) for one in (*low, *ramp, *after)], dtype=np.float64)
     fresh = rows[:, 2] > 0.0
     return Course(rows[fresh, 0], setpoint[fresh], rows[fresh, 1])
 
@@ -156,17 +171,23 @@ def _ramp(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: 
 
 def _settle_and_hold(
     loop: ControlLoop,
+    limits: MachineLimits,
     speed_rad_s: float,
     tolerance_rad_s: float,
     assumptions: ControlAssumptions,
-    into: list[Sample] | None = None,
     before_level: Callable[[], None] = lambda: None,
-) -> list[Sample]:
-    """Settle, let the reporting lags run out, then the level; the settling is appended to ``into``."""
+) -> _Held:
+    """Settle, let the reporting lags run out, then the level. The top of a drill string yields all the while."""
+    lags_s = 2.0 * assumptions.largest_speed_lag_s
+    if limits.load == "string":
+        calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
+        later, asked_later = hold_damped(loop, calmed.damper, lags_s)
+        before_level()
+        level, asked = hold_damped(loop, calmed.damper, LEVEL_S)
+        return _Held([*calmed.samples, *later], level, [*calmed.setpoints_rad_s, *asked_later, *asked])
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
     settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
-    settling += loop.hold(command, 2.0 * assumptions.largest_speed_lag_s)
-    if into is not None:
-        into += settling
+    settling += loop.hold(command, lags_s)
     before_level()
-    return loop.hold(command, LEVEL_S)
+    level = loop.hold(command, LEVEL_S)
+    return _Held(settling, level, [speed_rad_s] * (len(settling) + len(level)))

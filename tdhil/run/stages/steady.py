@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from drivers import Command, LimitHit, Sample
+from drivers import Command, LimitHit, Mode, Sample
 from tdhil.recording import FloatArray, Level
 from tdhil.run.control_loop import ControlLoop
+from tdhil.run.settings import MachineLimits
+from tdhil.run.string_release import SwingDamper
 
 
 @dataclass(frozen=True)
@@ -79,3 +82,151 @@ def wait_until_steady(
         where=f"at {loop.now_s:.1f} s",
         next_step=helps,
     )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A drill string is steady when it swings no more, not when the shaft has its speed: behind a stiff speed loop waves run
+# up and down for minutes while the top hardly shows it. So the top yields (`SwingDamper`) until the torque is calm. A
+# string under load is never quite calm: its bit disturbs. Once yielding takes nothing more away, what is left is taken
+# for what there is, unless it is a swing that feeds itself: a bit that sticks and slips, on which nothing can be
+# measured.
+
+
+CALM_SHARE = 0.02
+"""Of the torque limit, within which the torque of a calm string swings, either way of its mean."""
+
+CALM_S = 6.0
+"""For so long: half a swing of a string that swings in 12 s."""
+
+LOOK_S = 12.0
+NO_CALMER = 0.75
+"""Of what it was over the time before: a swing that is still above this share gets no smaller."""
+
+STICK_SLIP_SPEED_SHARE, STICK_SLIP_REGULAR = 0.04, 0.6
+"""Of the mean speed, that the top swings by at least in stick-slip; the least autocorrelation after one period."""
+
+SHORTEST_SWING_S = 1.5
+MOST_CALMING_S = 120.0
+
+
+@dataclass(frozen=True)
+class Swing:
+    """How a string swings: half of peak to peak; ``period_s`` 0 and ``regular`` 0 where nothing repeats."""
+
+    torque_nm: float
+    speed_rad_s: float
+    period_s: float
+    regular: float
+
+
+@dataclass(frozen=True)
+class Calmed:
+    """``setpoints_rad_s``: one a sample. ``swing``: what is left of it. ``damper`` goes on with it."""
+
+    samples: list[Sample]
+    setpoints_rad_s: list[float]
+    swing: Swing
+    damper: SwingDamper
+
+
+def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
+    """From means over half a second, so that noise of the reports doesn't count."""
+    width = max(1, round(BLOCK_S / 2.0 / period_s))
+    seen = trace(samples)
+    blocks = len(seen.time_s) // width
+    if blocks < 2:
+        return Swing(0.0, 0.0, 0.0, 0.0)
+    torque, speed = (part[-blocks * width:].reshape(blocks, width).mean(axis=1)
+                     for part in (seen.torque_nm, seen.speed_rad_s))
+    after_s, regular = _repeats(torque, width * period_s)
+    return Swing(0.5 * float(np.ptp(torque)), 0.5 * float(np.ptp(speed)), after_s, regular)
+
+
+def _repeats(torque_nm: FloatArray, step_s: float) -> tuple[float, float]:
+    """After what time it repeats, and how well: the first of the highest of the autocorrelation's peaks."""
+    x = torque_nm - torque_nm.mean()
+    count = len(x)
+    alike = np.zeros(count // 2 + 1)
+    for lag in range(len(alike)):
+        early, late = x[: count - lag], x[lag:]
+        scale = math.sqrt(float(early @ early) * float(late @ late))
+        alike[lag] = float(early @ late) / scale if scale > 0.0 else 0.0
+    dips = np.flatnonzero(alike < 0.0)
+    first = max(int(dips[0]) if len(dips) else len(alike), math.ceil(SHORTEST_SWING_S / step_s))
+    if first >= len(alike) or np.max(alike[first:]) <= 0.0:
+        return 0.0, 0.0
+    high = first + int(np.flatnonzero(alike[first:] >= 0.9 * np.max(alike[first:]))[0])
+    fallen = np.flatnonzero(alike[high:] < 0.0)
+    best = high + int(np.argmax(alike[high : high + int(fallen[0]) if len(fallen) else None]))
+    return best * step_s, max(0.0, float(alike[best]))
+
+
+def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple[list[Sample], list[float]]:
+    """The samples of a time in which the top yields, and the speeds that were asked for."""
+    samples: list[Sample] = []
+    setpoints: list[float] = []
+    for _ in range(loop.cycles(seconds)):
+        last = loop.last
+        setpoints.append(damper.step(last.torque_nm if last is not None and last.fresh else math.nan))
+        samples.append(loop.cycle(Command(Mode.SPEED, setpoints[-1], 0.0)))
+    return samples, setpoints
+
+
+def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, tolerance_rad_s: float) -> Calmed:
+    """Turn at a speed, yielding, until the string is calm or gets no calmer.
+
+    Raises LimitHit where the mean speed isn't had in time, and where the string sticks and slips.
+    """
+    damper = SwingDamper(limits.torque_nm, limits.speed_max_rad_s, target_rad_s, loop.period_s)
+    samples: list[Sample] = []
+    setpoints: list[float] = []
+    calm, look = loop.cycles(CALM_S), loop.cycles(LOOK_S)
+    for _ in range(round(MOST_CALMING_S / BLOCK_S)):
+        seen, asked = hold_damped(loop, damper, BLOCK_S)
+        samples += seen
+        setpoints += asked
+        if len(samples) < calm:
+            continue
+        last = swing_of(samples[-calm:], loop.period_s)
+        there = abs(_mean_speed(samples[-calm:]) - target_rad_s) <= tolerance_rad_s
+        if there and last.torque_nm <= CALM_SHARE * limits.torque_nm:
+            return Calmed(samples, setpoints, last, damper)
+        if len(samples) < 2 * look:
+            continue
+        now = swing_of(samples[-look:], loop.period_s)
+        before = swing_of(samples[-2 * look : -look], loop.period_s)
+        if now.torque_nm >= NO_CALMER * before.torque_nm:
+            left = swing_of(samples[-2 * look :], loop.period_s)
+            if left.regular >= STICK_SLIP_REGULAR and left.speed_rad_s >= STICK_SLIP_SPEED_SHARE * target_rad_s:
+                raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
+            if abs(_mean_speed(samples[-look:]) - target_rad_s) <= 2.0 * tolerance_rad_s:
+                loop.log.event(
+                    loop.now_s, "string",
+                    f"the string gets no calmer at {target_rad_s:.2f} rad/s: its torque goes ±{left.torque_nm:.0f} N·m",
+                )
+                return Calmed(samples, setpoints, left, damper)
+    left = swing_of(samples[-2 * look :], loop.period_s)
+    mean = _mean_speed(samples[-look:])
+    torque, helps = loop.guard.torque_told(float(trace(samples[-look:]).torque_nm.mean()), samples[-1].limit_active)
+    raise LimitHit(
+        f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
+        f" rad/s, torque swinging by ±{left.torque_nm:.0f} N·m"
+        + (f" every {left.period_s:.1f} s" if left.regular >= STICK_SLIP_REGULAR else "") + f"); {torque}",
+        where=f"at {loop.now_s:.1f} s",
+        next_step=helps,
+    )
+
+
+def stick_slip(swing: Swing, speed_rad_s: float, where: str) -> LimitHit:
+    """The error of a string whose swing feeds itself."""
+    return LimitHit(
+        f"the string sticks and slips at {speed_rad_s:.2f} rad/s: its torque swings by ±{swing.torque_nm:.0f} N·m every"
+        f" {swing.period_s:.1f} s, the top by ±{swing.speed_rad_s:.2f} rad/s, and yielding does not end it",
+        where=where,
+        next_step="Lift the bit off bottom, take weight off it, or raise limits.speed_min_rad_s above the speed at"
+        " which it turns steadily",
+    )
+
+
+def _mean_speed(samples: Sequence[Sample]) -> float:
+    return math.fsum(sample.speed_rad_s for sample in samples) / len(samples)
