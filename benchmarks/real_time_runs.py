@@ -31,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 TRUE_J = 104.0                 # of the simulated rig (sim_bus.params)
 MOTION = ("--frequency", "0.2", "--periods", "4")
 ALLOWED_MISSED = 0.01
-HOG = "while True: pass"
+HOG = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: pass"    # ends with whoever began it
 SECONDS_A_RUN = 240
 
 
