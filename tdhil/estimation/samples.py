@@ -268,10 +268,11 @@ def stretches(samples: Samples, segments: tuple[Segment, ...]) -> tuple[Stretch,
         if not segment.lines_hz or not (segment.period_s > 0.0 and math.isfinite(segment.period_s)):
             continue
         start, end = excited_window(segment)
-        last_time = float(samples.time_s[-1]) if len(samples) else start
-        end = min(end, last_time + interval)
-        whole = max(0, math.floor((end - start) / segment.period_s + 1e-6))
         longest_gap = max(_LONGEST_GAP / max(segment.lines_hz), 3.0 * interval)
+        last_time = float(samples.time_s[-1]) if len(samples) else start
+        # a record that ends a little early has a hole at its end, no longer than any other may be
+        end = min(end, last_time + longest_gap)
+        whole = max(0, math.floor((end - start) / segment.period_s + 1e-6))
         kept, index = [], []
         for number in range(whole):
             begin = start + number * segment.period_s

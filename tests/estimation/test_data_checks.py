@@ -136,3 +136,19 @@ def test_a_drift_is_told_with_its_size():
     rates = np.array([one.rate for one in found])
     assert np.mean(rates) == pytest.approx(0.2, abs=4 * np.std(rates) / np.sqrt(200))
     assert np.sqrt(np.mean([one.variance for one in found])) == pytest.approx(np.std(rates), rel=0.15)
+
+
+@pytest.mark.parametrize(("missing_s", "whole"), [(0.02, 6), (0.2, 6), (0.3, 5)])
+def test_the_last_period_counts_where_the_record_ends_a_little_early(missing_s, whole):
+    """As much may be missing at the end as anywhere else: a tenth of the fastest cycle, here 0.25 s."""
+    recording = closed_form(offsets=(4.0,), rate_hz=100.0)
+    until = recording.time_s < 70.0 - missing_s + 1e-9
+    cut = replace(recording, **{
+        name: getattr(recording, name)[until] for name in ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")
+    })
+    (stretch,) = stretches(usable_samples(cut), cut.excitation.segments)
+    assert len(stretch.periods) == whole
+    exact = period_lines(stretches(usable_samples(recording), recording.excitation.segments)[0],
+                         usable_samples(recording))
+    lines = period_lines(stretch, usable_samples(cut))
+    assert lines.speed == pytest.approx(exact.speed[:whole], rel=1e-3)
