@@ -10,6 +10,7 @@ from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
 from tdhil.estimation.frequency_domain.friction_levels import warming_of
 from tdhil.estimation.frequency_domain.spectrum import period_lines
 from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
+from tdhil.estimation.time_domain.identify import cut_off
 from tests.estimation.analytic import closed_form
 
 
@@ -152,3 +153,24 @@ def test_the_last_period_counts_where_the_record_ends_a_little_early(missing_s, 
                          usable_samples(recording))
     lines = period_lines(stretch, usable_samples(cut))
     assert lines.speed == pytest.approx(exact.speed[:whole], rel=1e-3)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
+def test_a_calm_coarse_plateau_is_not_cut_off(noise):
+    """A speed that is ramped by three steps a sample and held in between: most steps are large, but not for noise."""
+    t = np.arange(1200) / 10.0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        knots = np.cumsum(np.tile([2.0, 1.2, 2.0, 0.4], 22) * rng.uniform(0.8, 1.2, 88))
+        levels = np.tile([9.0, 9.0, 2.0, 2.0], 22)
+        x = np.interp(t, knots, levels) + noise * rng.standard_normal(len(t))
+        assert cut_off(np.round(x / 0.1) * 0.1, 0.1) is None, seed
+
+
+@pytest.mark.parametrize(("quantum", "noise"), [(0.01, 0.03), (0.001, 0.03)])
+def test_a_noisy_record_that_was_cut_off_is_seen(quantum, noise):
+    for seed in range(10):
+        x = wave(seed, quantum, noise)
+        x = np.minimum(x, np.round(np.quantile(x, 0.85) / quantum) * quantum)
+        assert cut_off(x, quantum) == pytest.approx(0.15, abs=0.05)
+        assert cut_off(-x, quantum) == pytest.approx(0.15, abs=0.05)

@@ -4,10 +4,12 @@
 seen through smooth windows at the frequencies that stand clear of the noise?  4. Is that a number?
 """
 
+import math
 from dataclasses import replace
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tdhil.estimation.case import Case, Finding, Words
 from tdhil.estimation.frequency_domain import (
@@ -23,18 +25,20 @@ from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.solve import Solved, solve
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
-from tdhil.recording import FloatArray, Recording
+from tdhil.recording import BoolArray, FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What kind of motion a record holds, in words: a refusal should name what is missing, not only that something is.
 
 
+IntArray = NDArray[np.intp]
 _STEADY_SHARE = 0.05       # of the speed: less excursion than this is a constant speed
 _IDLE_SHARE = 0.02         # of the torque's span: torque this small is none
 _LIMIT_SHARE = 0.005
 _AT_LIMIT = 0.98
 _FLAT_SHARE = 0.01
-_LIVELY = 1.5             # median step between neighbours, in quanta: noise is seen
+_LIVELY = 1.5             # median step between neighbours from noise alone, in quanta: it is seen
+_BESIDE = 20              # samples on either side of a plateau
 _ALIKE = 8                # samples in a row that noise would not leave alike
 _TURNS = 2                 # changes of acceleration that one ramp has
 _BLOCKS = 60
@@ -64,7 +68,7 @@ def check_signals(recording: Recording, samples: Samples) -> None:
             raise Refused(f"the torque was at its limit of {limit:g} N·m for {at_limit:.1%} of the record", advice)
     for name, signal, quantum in (("torque", torque, recording.torque_resolution_nm),
                                   ("speed", speed, recording.speed_resolution_rad_s)):
-        share = _cut_off(signal, quantum)
+        share = cut_off(signal, quantum)
         if share is not None:
             raise Refused(f"the {name} is cut off flat for {share:.1%} of the record", advice)
 
@@ -100,20 +104,40 @@ def _blocks(signal: FloatArray) -> FloatArray:
     return np.array([float(np.mean(part)) for part in np.array_split(signal, min(_BLOCKS, len(signal)))])
 
 
-def _cut_off(signal: FloatArray, quantum: float) -> float | None:
-    """Share of samples at one extreme, where noise would not leave so many in a row alike; standstill is none."""
-    steps = np.abs(np.diff(signal))
-    if float(np.median(steps)) < _LIVELY * quantum or not np.any(steps):
-        return None
+def cut_off(signal: FloatArray, quantum: float) -> float | None:
+    """Share of samples at one extreme, where noise would not leave so many in a row alike; standstill is none.
+
+    Whether there is noise is asked beside the plateaus: a record whose ramps climb many steps a sample may well be
+    calm while it is held, and then a plateau is a speed that was held.
+    """
     for extreme in (float(signal.max()), float(signal.min())):
         if abs(extreme) <= quantum:
             continue
-        there = np.concatenate([[False], signal == extreme, [False]])
-        edges = np.flatnonzero(there[1:] != there[:-1])
-        share = float(np.mean(there))
-        if share > _FLAT_SHARE and int(np.max(edges[1::2] - edges[::2])) >= _ALIKE:
+        at = signal == extreme
+        share = float(np.mean(at))
+        there = np.concatenate([[False], at, [False]])
+        edges = np.flatnonzero(there[1:] != there[:-1]).reshape(-1, 2)
+        plateaus = edges[edges[:, 1] - edges[:, 0] >= _ALIKE]
+        if share > _FLAT_SHARE and len(plateaus) and _lively_beside(signal, at, plateaus, quantum):
             return share
     return None
+
+
+def _lively_beside(signal: FloatArray, at: BoolArray, plateaus: IntArray, quantum: float) -> bool:
+    """Do the samples next to the plateaus [begin, end) wobble by more than rounding makes of a ramp?
+
+    By second differences, which a ramp has none of; white noise makes them √3 of its first ones. Only of samples none
+    of which is at the extreme.
+    """
+    beside = np.zeros(len(signal), dtype=np.bool_)
+    for begin, end in plateaus.tolist():
+        beside[max(begin - _BESIDE, 0) : end + _BESIDE] = True
+    clear = beside & ~at
+    whole = np.flatnonzero(clear[:-2] & clear[1:-1] & clear[2:])
+    if len(whole) == 0:
+        return False
+    wobble = np.abs(signal[whole] - 2.0 * signal[whole + 1] + signal[whole + 2])
+    return float(np.median(wobble)) > math.sqrt(3.0) * _LIVELY * quantum
 
 
 # ---------------------------------------------------------------------------------------------------------------------
