@@ -6,6 +6,7 @@
     ├── UsageError                  --node 300: must be at most 127                              2
     ├── DataFileError               rig.yaml:12: unknown key 'speed_max'                         2
     ├── PreflightRefused            the drive's identity is not the profile's; nothing moved     4
+    │   └── DriveHeld               in `tdhil.session`: another process has the drive; names it  4
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged                5
     ├── DriveFault                  EMCY 7305h in motion; state machine stuck                    6
     │   └── ModeNotConfirmed        6061h did not follow 6060h in time                           6

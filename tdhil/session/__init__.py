@@ -16,6 +16,9 @@ if TYPE_CHECKING:
         UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
         is_accepted as is_accepted,
     )
+    from tdhil.session.holder import (
+        DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
+    )
     from tdhil.session.log_place import (
         check_different_files as check_different_files, check_log_path as check_log_path, make_room as make_room,
     )
@@ -46,6 +49,7 @@ else:
                 "simulated_connection",
             ),
             "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
+            "holder": ("DriveHeld", "Holder", "address_of", "hold", "holder_of"),
             "log_place": ("check_different_files", "check_log_path", "make_room"),
             "opening": ("open_drive", "plan_peer", "with_faults"),
             "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry", "refuse_hopeless"),

@@ -6,6 +6,7 @@ Nothing here, nor above, names a bus: `BusKind` is what a run asks of one, and `
 from __future__ import annotations
 
 import argparse
+import socket
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -107,6 +108,13 @@ class BusKind(ABC):
     @abstractmethod
     def open_target(self, options: RunOptions, connection: Connection, clock: Clock) -> AbstractContextManager[Target]:
         """What ``tdhil stop`` needs of the drive, and no more; closed afterwards."""
+
+    def address(self, options: RunOptions, connection: Connection) -> str | None:
+        """The drive's place as one text, the same for every program that means this drive: what `hold` locks.
+
+        None where other processes can't reach it. Unless a bus knows better, all that was said of the place.
+        """
+        return " ".join((self.name, *(f"{name} {value}" for name, value, _ in connection.line.rows())))
 
     @abstractmethod
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
@@ -246,3 +254,12 @@ class PeerPlan:
     def epoch_ns(self) -> int:
         """Wall clock at control time zero, for the log's time stamps; in stepped time the clock runs ahead of it."""
         return time.time_ns()
+
+
+def one_host(name: str) -> str:
+    """The host's first address, so that its name and its number are one; the name where nobody knows it."""
+    try:
+        found = sorted({str(one[4][0]) for one in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)})
+    except (OSError, UnicodeError):
+        return name.lower()
+    return "127.0.0.1" if "127.0.0.1" in found else found[0]

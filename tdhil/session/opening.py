@@ -11,6 +11,7 @@ from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
 from tdhil.config import DriveData, RunOptions
 from tdhil.errors import UsageError
 from tdhil.session.connection import Connection, PeerPlan, bus_kind
+from tdhil.session.holder import address_of, hold
 
 
 def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
@@ -42,10 +43,14 @@ def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
 @contextmanager
 def open_drive(plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData | None, tap: FrameTap,
                trace: Path | None) -> Iterator[Drive]:
-    """The drive, closed with its bus and simulator afterwards. ``data``: what the bench knows and the drive doesn't."""
+    """The drive, held against others, closed with its bus and simulator afterwards.
+
+    ``data``: what the bench knows and the drive doesn't. Raises DriveHeld where another process has it.
+    """
     clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
     data = data or DriveData()
-    with connection.kind.open(plan, options, connection, data, clock, tap, trace) as drive:
+    address = None if plan.embedded else address_of(connection, options)
+    with hold(address), connection.kind.open(plan, options, connection, data, clock, tap, trace) as drive:
         yield drive
 
 

@@ -15,7 +15,7 @@ from profiles.quantities import BIT_RATE, read
 from tdhil.config import DriveData, Rig, RunOptions
 from tdhil.session.buses import can_bus
 from tdhil.session.buses.can_bus import BusConfig, bus_config
-from tdhil.session.connection import BusKind, Connection
+from tdhil.session.connection import BusKind, Connection, one_host
 
 if TYPE_CHECKING:
     import can
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 PLAIN = "generic/cia402"
 """What the simulator is when it wears no profile."""
+_ADAPTER = ("host", "port", "serial", "unique_hardware_id", "app_name")     # what names it, beside its channel
 
 
 class CanopenKind(BusKind):
@@ -97,6 +98,17 @@ class CanopenKind(BusKind):
             yield target
         finally:
             target.close()
+
+    def address(self, options: RunOptions, connection: Connection) -> str | None:
+        """Adapter, channel and node; python-can's virtual bus is this process's alone."""
+        config = config_of(connection)
+        if config.interface == "virtual":
+            return None
+        named = {name: str(config.value(name)) for name in _ADAPTER if name in config.settings}
+        if "host" in named:
+            named["host"] = one_host(named["host"])
+        words = (f"canopen {config.interface} {config.channel}", *map(" ".join, named.items()))
+        return " ".join((*words, f"node {node_of(options, connection)}"))
 
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
         """Of `sim_bus.canopen`."""

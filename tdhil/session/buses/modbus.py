@@ -14,7 +14,7 @@ from profiles import Profile
 from profiles.modbus import ModbusProfile
 from tdhil.config import DriveData, Rig, RunOptions
 from tdhil.session.buses.modbus_line import FLAGS, ModbusConfig, modbus_config
-from tdhil.session.connection import BusKind, Connection
+from tdhil.session.connection import BusKind, Connection, one_host
 
 if TYPE_CHECKING:
     from drivers import Clock, Drive, FrameTap, Target
@@ -96,6 +96,13 @@ class ModbusKind(BusKind):
             yield ModbusTarget(link, profile_of(connection), unit=config.unit)
         finally:
             link.close()
+
+    def address(self, options: RunOptions, connection: Connection) -> str | None:
+        """Host and port, or the serial device whatever links lead to it, and the unit."""
+        line = config_of(connection)
+        if line.host is not None:
+            return f"modbus tcp {one_host(line.host)} port {line.port} unit {line.unit}"
+        return f"modbus rtu {Path(str(line.serial)).resolve()} unit {line.unit}"
 
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
         """Of `sim_bus.modbus`, as far as the embedded drive has them."""
