@@ -97,9 +97,7 @@ def quieten() -> None:
     loaded, again and again, for garbage that isn't there takes a tenth of one.
     """
     import scipy.optimize
-    import scipy.signal
-    import scipy.special
-    import scipy.stats  # noqa: F401
+    import scipy.special  # noqa: F401
 
     import tdhil.estimation  # noqa: F401
 

@@ -219,9 +219,7 @@ def load_what_the_end_needs(report: bool) -> None:
     import traceback  # noqa: F401
 
     import scipy.optimize
-    import scipy.signal
-    import scipy.special
-    import scipy.stats  # noqa: F401
+    import scipy.special  # noqa: F401
     from rich.console import Console
 
     from tdhil.estimation import (

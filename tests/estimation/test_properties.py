@@ -180,3 +180,14 @@ def test_descent_against_scipy(seed):
     assert np.all((found.theta >= low) & (found.theta <= high))
 
 
+
+
+@settings(max_examples=50)
+@given(ratio=st.floats(-1.0, 1e3), above=st.floats(1.0, 1e3), below=st.floats(0.5, 1e6), share=st.floats(0.5, 0.999))
+def test_tails_and_quantiles_against_scipys_distributions(ratio, above, below, share):
+    from scipy.stats import f, t
+
+    from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
+
+    assert fisher_tail(ratio, above, below) == pytest.approx(f.sf(ratio, above, below), rel=1e-12)
+    assert student_quantile(share, below) == pytest.approx(t.ppf(0.5 + 0.5 * share, below), rel=1e-12)

@@ -29,6 +29,21 @@ def course(gain, integral, lag_s, period_s, ramp=np.inf, noise=0.0):
     return np.array(rows).T
 
 
+def test_its_filters_are_scipys():
+    from scipy.signal import lfilter
+
+    from tdhil.run.excitation.speed_loop import _GRID_S, _response
+
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        wanted, (zero, first, second, lag) = rng.normal(size=300).cumsum(), np.exp(rng.uniform(-5.0, 1.5, 4))
+        k = 2.0 / _GRID_S
+        top = [1.0 + zero * k, 2.0, 1.0 - zero * k]
+        bottom = [1.0 + first * k + second * k * k, 2.0 - 2.0 * second * k * k, 1.0 - first * k + second * k * k]
+        late = lfilter([1.0, 1.0], [1.0 + lag * k, 1.0 - lag * k], lfilter(top, bottom, wanted))
+        assert _response(wanted, zero, first, second, lag) == pytest.approx(late, rel=1e-9, abs=1e-12)
+
+
 @settings(max_examples=6, deadline=None)
 @given(gain=st.floats(1.5, 8.0), damping=st.floats(0.7, 1.3), period_s=st.sampled_from([0.02, 0.05, 0.1]))
 def test_the_loop_is_read_off_a_ramp(gain, damping, period_s):

@@ -31,7 +31,7 @@ from tdhil.estimation.cross_checks.momentum import (
     through,
 )
 from tdhil.estimation.cross_checks.momentum_fit import UNKNOWN_DELAY, Delay, Density, Resolution, fit_momentum
-from tdhil.estimation.frequency_domain import Levels, student_quantile
+from tdhil.estimation.frequency_domain import Levels, fisher_tail, student_quantile
 from tdhil.estimation.result import Estimate, FrictionPoint, Options
 from tdhil.estimation.samples import Samples, excited_window
 from tdhil.recording import FloatArray, Recording
@@ -209,8 +209,6 @@ def _columns(points: list[Point]) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _straight(points: list[Point], density: Density) -> float:
     """The p-value of a straight line: F test of what it leaves against the disturbance's density."""
-    from scipy.stats import f
-
     design, torque, weight = _columns(points)
     design = np.delete(design, 1, axis=1)
     left = len(points) - design.shape[1]
@@ -218,7 +216,7 @@ def _straight(points: list[Point], density: Density) -> float:
         return 1.0
     fitted = np.linalg.lstsq(design * weight[:, None], torque * weight, rcond=None)[0]
     rest = float(np.sum(((torque - design @ fitted) * weight) ** 2))
-    return float(f.sf(rest / left, left, density.dof))
+    return fisher_tail(rest / left, left, density.dof)
 
 
 def _bend(points: list[Point]) -> tuple[float, float]:

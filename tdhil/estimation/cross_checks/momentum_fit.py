@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from tdhil.estimation.cross_checks.momentum import Balances, Kind, Row, overlap_s
-from tdhil.estimation.frequency_domain import student_quantile
+from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
 from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01
@@ -139,12 +139,10 @@ def _design(rows: list[Row], delay_s: float, direction: float) -> FloatArray:
 
 
 def _pooled(levels: Density, rest: float, left: int) -> Density | None:
-    from scipy.stats import f
-
     own = rest / left if left > 0 else 0.0
     if levels.dof < 1.0 or not levels.value > 0.0:
         return Density(own, float(left)) if left >= _LEAST_DOF else None
-    if left > 0 and float(f.sf(own / levels.value, left, levels.dof)) < _ROWS_DIFFER_P:
+    if left > 0 and fisher_tail(own / levels.value, left, levels.dof) < _ROWS_DIFFER_P:
         return Density(own, float(left))
     total = levels.dof + left
     return Density((levels.dof * levels.value + rest) / total, total)

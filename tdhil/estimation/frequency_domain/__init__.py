@@ -13,7 +13,8 @@ if TYPE_CHECKING:
         clear_lines as clear_lines, identify_lines as identify_lines, measured as measured,
     )
     from tdhil.estimation.frequency_domain.inference import (
-        profile_edge as profile_edge, rejects as rejects, student_quantile as student_quantile,
+        fisher_tail as fisher_tail, profile_edge as profile_edge, rejects as rejects,
+        student_quantile as student_quantile,
         torque_scale_line as torque_scale_line, widened_most_by_scale as widened_most_by_scale,
         with_total as with_total,
     )
@@ -40,8 +41,8 @@ else:
             "friction_levels": ("Levels", "ViscousConstraint", "measure_levels", "tie_viscous", "warming_warning"),
             "identify": ("clear_lines", "identify_lines", "measured"),
             "inference": (
-                "profile_edge", "rejects", "student_quantile", "torque_scale_line", "widened_most_by_scale",
-                "with_total",
+                "fisher_tail", "profile_edge", "rejects", "student_quantile", "torque_scale_line",
+                "widened_most_by_scale", "with_total",
             ),
             "model": ("GaussianPrior", "Model"),
             "optimiser": ("Box", "Fit"),

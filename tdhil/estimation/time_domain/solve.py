@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain import Fit, GaussianPrior, profile_edge, student_quantile
+from tdhil.estimation.frequency_domain import Fit, GaussianPrior, fisher_tail, profile_edge, student_quantile
 from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest
 from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
@@ -69,10 +69,8 @@ def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTe
     extra = dof_model - fitted - dof_line
     if dof_line < 8 or extra < 2 or by_line <= 0.0:
         return None
-    from scipy.stats import f
-
     statistic = (by_model - by_line) / extra / (by_line / dof_line) / factor**2
-    return ResidualTest(float(statistic), float(extra), float(f.sf(statistic, extra, 0.5 * dof_line)))
+    return ResidualTest(float(statistic), float(extra), fisher_tail(float(statistic), extra, 0.5 * dof_line))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
