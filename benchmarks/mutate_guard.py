@@ -131,7 +131,7 @@ SUBJECTS = {
         "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
     ),
     "stop_on_signals": Subject(
-        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_NAMES", "stop_on_signals"})
+        "tdhil/session/stop_signals.py", ("cli/test_identify_end.py",), frozenset({"_NAMES", "stop_on_signals"})
     ),
 }
 NAMED: tuple[tuple[str, str, str], ...] = (

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tdhil.api import RunRecord as RunRecord
     from tdhil.api import Sine as Sine
     from tdhil.api import Step as Step
+    from tdhil.api import StopRequest as StopRequest
     from tdhil.api import identify as identify
     from tdhil.api import open_drive as open_drive
     from tdhil.api import read as read
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from tdhil.errors import TdhilError as TdhilError
 
 _API = (
-    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify",
-    "open_drive", "read", "run", "simulate",
+    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "StopRequest",
+    "identify", "open_drive", "read", "run", "simulate",
 )
 __all__ = ["TdhilError", "__version__", *_API]  # noqa: PLE0604 - strings, by the line above
 

@@ -21,17 +21,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import UsageError
+from tdhil.run import StopRequest
 from tdhil.session import RunRecord, read
 
 if TYPE_CHECKING:
-    from tdhil.config import Rig
+    from tdhil.config import Rig, RunOptions
     from tdhil.errors import ExitCode
     from tdhil.estimation import Identification, InertiaEstimate, Verdict
-    from tdhil.session import Attendant, Consent, RunRequest
+    from tdhil.session import Attendant, Connection, PeerPlan, RunRequest
 
 __all__ = [
-    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "identify",
-    "open_drive", "read", "run", "simulate",
+    "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "StopRequest",
+    "identify", "open_drive", "read", "run", "simulate",
 ]
 
 
@@ -192,7 +193,7 @@ def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
     from tdhil.config import load_rig
 
     handle = DriveHandle(load_rig(Path(rig)), dict(options))
-    _request(handle, Multisine(), {})
+    _peer(handle, {})
     yield handle
 
 
@@ -216,7 +217,7 @@ def simulate(
     }
     given = {name: value for name, value in asked.items() if value is not None}
     handle = DriveHandle(None if rig is None else load_rig(Path(rig)), given, tuple(faults))
-    _request(handle, Multisine(), {})
+    _peer(handle, {})
     yield handle
 
 
@@ -231,29 +232,34 @@ def run(
     max_time_s: float | None = None,
     operator: str | None = None,
     note: str | None = None,
+    stop: StopRequest | None = None,
     **consent: Any,
 ) -> RunRecord:
     """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
 
     ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
     it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``consent``: fields of
-    `tdhil.session.Consent`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread.
+    `tdhil.session.Consent`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread; in
+    another one give a ``stop``, and ``ask()`` it: signals are not looked at there.
 
     Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
     where it was not seen at rest: use the hard-wired stop then.
     """
     from tdhil.run import not_confirmed
-    from tdhil.session import Consent, RunSession
+    from tdhil.session import Consent, RunRequest, RunSession
 
     unknown = set(consent) - {one.name for one in fields(Consent)}
     if unknown:
         raise UsageError(f"no such consent: {', '.join(sorted(unknown))}", where="tdhil.run")
-    asked = {"log": str(log), "mode": mode, "tolerance": tolerance, "max_time_s": max_time_s}
-    request = _request(drive, motion or Multisine(), {name: one for name, one in asked.items() if one is not None},
-                       Consent(**consent), operator, note)
+    asked: dict[str, Any] = {"log": str(log), "mode": mode, "tolerance": tolerance, "max_time_s": max_time_s}
+    motion = motion or Multisine()
+    asked |= {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()}
+    options, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
+    request = RunRequest.of(options, connection, peer, drive.rig, consent=Consent(**consent), operator=operator,
+                            note=note)
     session = RunSession(request, _attendant(request, confirm))
     try:
-        outcome = session.move()
+        outcome = session.move(stop)
     except BaseException:
         session.abandon()
         raise
@@ -271,38 +277,16 @@ def run(
     return RunRecord(recording, configuration, str(session.path))
 
 
-def _request(
-    drive: DriveHandle,
-    motion: Motion,
-    asked: Mapping[str, Any],
-    consent: Consent | None = None,
-    operator: str | None = None,
-    note: str | None = None,
-) -> RunRequest:
-    """The same checks, in the same order, as the command line's. Raises UsageError, DataFileError, PreflightRefused."""
+def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
+    """What would be opened: the command line's checks, in its order. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
-    from tdhil.session import (
-        Consent,
-        RunRequest,
-        check_log_path,
-        check_names,
-        connection_of,
-        plan_peer,
-        refuse_hopeless,
-        suited,
-        with_faults,
-    )
+    from tdhil.session import check_log_path, check_names, connection_of, plan_peer, with_faults
 
-    given = {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()
-             if value is not None}
-    cli = {**drive.options, **asked, **given}
+    cli = {**drive.options, **asked}
     options, connection = connection_of(cli, drive.rig, resolve(cli, drive.rig))
     check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
     check_log_path(Path(options.log), "log")
-    peer = with_faults(plan_peer(options, connection), drive.faults, connection.drive)
-    bench = suited(drive.rig, peer.plant)
-    refuse_hopeless(options, bench, connection.profile.can_torque)
-    return RunRequest(options, connection, peer, bench, consent or Consent(), operator, note)
+    return options, connection, with_faults(plan_peer(options, connection), drive.faults, connection.drive)
 
 
 def _attendant(request: RunRequest, confirm: Callable[[str], bool] | None) -> Attendant:

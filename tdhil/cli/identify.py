@@ -115,16 +115,7 @@ def run(namespace: argparse.Namespace) -> int:
     from tdhil.cli.dry_run import dry_run
     from tdhil.config import load_rig, resolve
     from tdhil.report import stderr_console
-    from tdhil.session import (
-        Consent,
-        RunRequest,
-        check_names,
-        connection_of,
-        plan_peer,
-        refuse_hopeless,
-        suited,
-        with_faults,
-    )
+    from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, with_faults
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -146,8 +137,6 @@ def run(namespace: argparse.Namespace) -> int:
         return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
-    bench = suited(rig, peer.plant)
-    refuse_hopeless(options, bench, connection.profile.can_torque)
     consent = Consent(
         no_watchdog=namespace.accept_no_watchdog,
         shared_watchdog=namespace.accept_shared_watchdog,
@@ -155,8 +144,9 @@ def run(namespace: argparse.Namespace) -> int:
         speed_unit=namespace.accept_speed_unit,
         reset_fault=namespace.reset_fault,
     )
-    request = RunRequest(
-        options, connection, peer, bench, consent, namespace.operator, namespace.note, namespace.real_time_priority
+    request = RunRequest.of(
+        options, connection, peer, rig, consent=consent, operator=namespace.operator, note=namespace.note,
+        real_time_priority=namespace.real_time_priority,
     )
     return _run(request, console, namespace.report)
 

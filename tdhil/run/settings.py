@@ -1,5 +1,6 @@
 """What a run is allowed to do and asked to do: plain numbers, SI at the motor shaft."""
 
+import signal
 from dataclasses import dataclass, replace
 
 from tdhil.config import DEFAULT_EXCITATION
@@ -60,14 +61,14 @@ REACTION_CYCLES = 3.0
 
 
 class StopRequest:
-    """A wish to stop, set from a signal handler: one assignment, nothing else. The first cause stays."""
+    """A wish to stop, set from a signal handler or from another thread: one assignment. The first cause stays."""
 
     def __init__(self) -> None:
         self.signum: int | None = None
         self.count = 0
 
-    def ask(self, signum: int) -> None:
-        """Called by the signal handler."""
+    def ask(self, signum: int = signal.SIGINT) -> None:
+        """Ask for the stop; the run sees it in its next cycle, and ends as on that signal."""
         self.count += 1
         if self.signum is None:
-            self.signum = signum
+            self.signum = int(signum)

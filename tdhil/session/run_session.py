@@ -16,14 +16,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 from tdhil.config import Rig, RunOptions
 from tdhil.errors import LogError
 from tdhil.recording import RunLog, RunWriter
-from tdhil.run import Display, Idle, Runner, RunOutcome, Task
+from tdhil.run import Display, Idle, Runner, RunOutcome, StopRequest, Task
 from tdhil.session.connection import Connection, PeerPlan
 from tdhil.session.consent import accepted_lines, note, require_accepted
 from tdhil.session.log_place import LogPlace
 from tdhil.session.opening import open_drive
+from tdhil.session.plan_ahead import refuse_hopeless
 from tdhil.session.real_time import real_time_priority
 from tdhil.session.stop_signals import stop_on_signals
-from tdhil.session.task import bench_of, excitation_request, facts, machine_limits
+from tdhil.session.task import bench_of, excitation_request, facts, machine_limits, suited
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -54,6 +55,16 @@ class RunRequest:
     operator: str | None = None
     note: str | None = None
     real_time_priority: bool = False
+
+    @classmethod
+    def of(
+        cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, consent: Consent,
+        operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
+    ) -> RunRequest:
+        """The rig suited to the simulated plant. Raises PreflightRefused for what no shaft could do in its limits."""
+        bench = suited(rig, peer.plant)
+        refuse_hopeless(options, bench, connection.profile.can_torque)
+        return cls(options, connection, peer, bench, consent, operator, note, real_time_priority)
 
 
 class Attendant(Protocol):
@@ -110,13 +121,16 @@ class RunSession:
         stopped = self._outcome is not None and self._outcome.stop is not None
         return not (self._place.motion or stopped)
 
-    def move(self) -> RunOutcome:
-        """Connect, five stages, stop, close. Raises what kept the drive from being opened."""
+    def move(self, stop: StopRequest | None = None) -> RunOutcome:
+        """Connect, five stages, stop, close. Raises what kept the drive from being opened.
+
+        ``stop``: asked from elsewhere; signals go there too, where this is the main thread.
+        """
         request, log, attendant = self._request, self.log, self._attendant
         options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
         trace = None if options.trace is None else Path(options.trace)
         data = rig.drive_data if rig is not None else None
-        with stop_on_signals() as stop_request, open_drive(
+        with stop_on_signals(stop) as stop_request, open_drive(
             peer, options, connection, data, log.frame, trace
         ) as drive, attendant.watch() as display, real_time_priority(
             request.real_time_priority, stepped=peer.stepped

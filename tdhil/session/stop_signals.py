@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -13,9 +14,16 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")  # the last thre
 
 
 @contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
-    """Handlers that only note the wish; the former ones come back afterwards. A second Ctrl-C changes nothing."""
-    request = StopRequest()
+def stop_on_signals(request: StopRequest | None = None) -> Iterator[StopRequest]:
+    """Handlers that only note the wish, in ``request`` or one of its own; the former ones come back afterwards.
+
+    A second Ctrl-C changes nothing. Python hands signals to the main thread: in another one they stay with whoever has
+    that, and only ``request`` stops.
+    """
+    request = StopRequest() if request is None else request
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
 
     def handler(signum: int, frame: FrameType | None) -> None:
         request.ask(signum)

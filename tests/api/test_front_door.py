@@ -2,8 +2,11 @@
 
 import contextlib
 import json
+import os
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,8 +15,9 @@ import tdhil
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
 from tdhil.cli.main import main
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, Interrupted, UsageError
 from tdhil.session.confirm import AskingAttendant, TerminalAttendant
+from tdhil.session.stop_signals import stop_on_signals
 
 SHORT = tdhil.Multisine(frequency_hz=0.5, periods=6)
 EXAMPLE = Path(__file__).parents[2] / "examples" / "identify_in_python.py"
@@ -106,6 +110,58 @@ def test_what_was_refused_before_motion_is_said_and_leaves_the_last_log(record):
 def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
     with pytest.raises(tdhil.TdhilError, match=said), tdhil.simulate(seed=7, **wrong):
         pass
+
+
+def test_a_drive_is_named_without_a_motion_being_planned(tmp_path):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("run: {amplitude_rad_s: 50.0}\n")             # no motion of this bench fits its limits
+    with tdhil.simulate(rig=rig) as drive, pytest.raises(PreflightRefused, match="plan of stage 5"):
+        tdhil.run(drive, tdhil.Multisine())
+    with tdhil.open_drive(rig, simulate=True) as drive:
+        assert drive.rig.run.amplitude_rad_s == 50.0
+
+
+class AskedLater(tdhil.StopRequest):
+    """Asks by itself once it was looked at so often: a moment that no clock decides."""
+
+    polls = 1500
+
+    @property
+    def signum(self):
+        self.polls -= 1
+        return int(signal.SIGINT) if self.polls < 0 else None
+
+    @signum.setter
+    def signum(self, value):
+        assert value is None
+
+
+def test_a_run_in_a_thread_is_stopped_by_its_request_and_leaves_the_signals_alone(tmp_path):
+    former = signal.getsignal(signal.SIGINT)
+    handlers = set()
+
+    def run():
+        with tdhil.simulate(seed=7) as drive:
+            handlers.add(signal.getsignal(signal.SIGINT))
+            return tdhil.run(drive, SHORT, log=tmp_path / "run.mcap", stop=AskedLater())
+
+    with ThreadPoolExecutor(1) as pool, pytest.raises(Interrupted, match="Ctrl-C") as caught:
+        pool.submit(run).result()
+    assert handlers == {former} and signal.getsignal(signal.SIGINT) is former
+    assert any(str(tmp_path / "run.mcap") in note for note in caught.value.__notes__)
+    recording = tdhil.read(tmp_path / "run.mcap").recording
+    assert recording.speed_rad_s.max() > 0.4 and abs(recording.speed_rad_s[-1]) < 0.1
+
+
+def test_a_request_of_ones_own_hears_of_signals_too_in_the_main_thread():
+    mine = tdhil.StopRequest()
+    with stop_on_signals(mine) as request:
+        assert request is mine
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert (mine.signum, mine.count) == (signal.SIGTERM, 1)
+    other = tdhil.StopRequest()
+    other.ask()
+    assert other.signum == signal.SIGINT
 
 
 def test_a_consent_that_there_is_not_is_refused():
