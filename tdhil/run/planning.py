@@ -26,7 +26,7 @@ from tdhil.run.design import (
 from tdhil.run.excitation import (
     LEAST_COUNTED,
     ExcitationWish,
-    MachineLimits,
+    MotionLimits,
     Plan,
     PlanRefused,
     RigGuess,
@@ -127,8 +127,8 @@ def adaptive(request: ExcitationRequest) -> bool:
 
 
 def as_followed(
-    guess: RigGuess, limits: MachineLimits, course: Course, speed_lag_s: float
-) -> tuple[RigGuess, MachineLimits]:
+    guess: RigGuess, limits: MotionLimits, course: Course, speed_lag_s: float
+) -> tuple[RigGuess, MotionLimits]:
     """Rig and limits as the drive's own speed control leaves them, seen in the ramp of stage 2."""
     signals = course.time_s, course.setpoint_rad_s, course.reported_rad_s
     ramp = held_back_to(*signals)
@@ -138,7 +138,7 @@ def as_followed(
 
 
 def plan_acquisition(
-    request: ExcitationRequest, mode: str, limits: MachineLimits, guess: RigGuess, known: Knowledge, left_s: float
+    request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: Knowledge, left_s: float
 ) -> Planned:
     """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
     if isinstance(excitation_kind(request.kind), SwingKind):
@@ -159,7 +159,7 @@ RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
 
 
 def refuse_hopeless(
-    request: ExcitationRequest, modes: tuple[str, ...], limits: MachineLimits, guess: RigGuess, known: Knowledge
+    request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: Knowledge
 ) -> None:
     """PlanRefused where what is asked for fits no rig, in none of ``modes``: that is known before anything moves.
 
@@ -188,7 +188,7 @@ def refuse_hopeless(
 def _swings(
     request: ExcitationRequest,
     mode: str,
-    limits: MachineLimits,
+    limits: MotionLimits,
     guess: RigGuess,
     known: Knowledge,
     left_s: float,

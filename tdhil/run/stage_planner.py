@@ -41,7 +41,7 @@ class StagePlanner:
         """
         loop = self._loop
         request, limits, model = task.request, task.limits, speed.model
-        room = excitation.MachineLimits(
+        room = excitation.MotionLimits(
             limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
         )
         course = speed.course if mode is Mode.SPEED else None
@@ -120,7 +120,7 @@ class StagePlanner:
 def _reckon(
     request: ExcitationRequest,
     mode: Mode,
-    room: excitation.MachineLimits,
+    room: excitation.MotionLimits,
     model: RigGuess,
     prior: LagPrior,
     assumed: Noise,

@@ -87,14 +87,14 @@ def _mode(options: RunOptions, can_torque: bool) -> str:
     return wanted or ("torque" if can_torque else "speed")
 
 
-def _room(options: RunOptions, limits: MachineLimits) -> excitation.MachineLimits:
+def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits:
     """What a plan may use of the limits at the rate that was asked for."""
     from tdhil.run import ControlAssumptions, Guard, excitation
 
     assumptions = ControlAssumptions()
     if options.rate_hz:
         assumptions = assumptions.at_period(1.0 / options.rate_hz)
-    return excitation.MachineLimits(
+    return excitation.MotionLimits(
         limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
     )
 

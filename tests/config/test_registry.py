@@ -43,13 +43,12 @@ from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
 from tdhil.recording.log_format import MODBUS
 from tdhil.recording.log_reader import read_frames, read_run
-from tdhil.run.excitation import ExcitationKind, MachineLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
+from tdhil.run.excitation import ExcitationKind, MotionLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
 from tdhil.run.excitation.pulses import SwingKind, SwingPlan
 from tdhil.run.excitation.signals import unit_peak
 from tdhil.run.planning import adaptive, plan_acquisition, refuse_hopeless
 from tdhil.run.preconditions import refuse_by_plan
-from tdhil.run.settings import ExcitationRequest
-from tdhil.run.settings import MachineLimits as RunLimits
+from tdhil.run.settings import ExcitationRequest, MachineLimits
 from tdhil.session.connection import BusKind, LineConfig, PeerPlan
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
@@ -58,7 +57,7 @@ from tests.run.line_drive import Line, LineDrive
 from tests.run.test_design import KNOWN
 
 ROOT = Path(__file__).parents[2]
-LIMITS, GUESS = MachineLimits(0.5, 10.0, 400.0, 0.9), RigGuess(104.0, 8.0, 60.0)
+LIMITS, GUESS = MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(104.0, 8.0, 60.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -119,7 +118,7 @@ def test_what_a_toy_excitation_says_of_itself_is_heeded():
     assert isinstance(planned.plan, SwingPlan)
     with pytest.raises(PlanRefused, match="stairs needs a drive in torque mode: for the test's sake"):
         refuse_hopeless(ExcitationRequest("stairs"), ("speed",), LIMITS, GUESS, KNOWN)
-    string = RunLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)
+    string = MachineLimits(0.5, 10.0, 400.0, 900.0, load="string", torque_ramp_nm_s=50.0)
     refuse_by_plan(string, ExcitationRequest("two-tones"), lets_go=False)
     with pytest.raises(tdhil.TdhilError, match="stairs was asked for, and a drill string"):
         refuse_by_plan(string, ExcitationRequest("stairs"), lets_go=False)

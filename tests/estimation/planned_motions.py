@@ -2,10 +2,10 @@
 
 import math
 
-from tdhil.run.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
+from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
 from tests.estimation.shaft_bench import Motion
 
-LIMITS = MachineLimits(0.5, 10.0, 400.0)
+LIMITS = MotionLimits(0.5, 10.0, 400.0)
 
 
 def planned(wish: ExcitationWish | None = None, guess: RigGuess | None = None) -> tuple[Motion, Plan]:

@@ -12,13 +12,13 @@ from tdhil.errors import Interrupted
 from tdhil.recording.recording import Excitation, Recording
 from tdhil.run.adaptive_duration import Decision, decide
 from tdhil.run.design.stopping_rule import Look
-from tdhil.run.excitation import ExcitationWish, MachineLimits, RigGuess, make_plan
+from tdhil.run.excitation import ExcitationWish, MotionLimits, RigGuess, make_plan
 from tdhil.run.planning import Stopping, counted_in, extension_s, pilot_dof
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.stages.acquire import run_acquire
 from tdhil.run.stages.hold import MeanSpeedControl
 
-PLAN = make_plan(MachineLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), ExcitationWish(periods=3))
+PLAN = make_plan(MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), ExcitationWish(periods=3))
 RULE = Stopping(0.01, 0.95, 20.0, 6, 10, 600.0, True)
 
 

@@ -9,7 +9,7 @@ from tdhil.estimation.samples import Samples
 from tdhil.recording.recording import LagPrior
 from tdhil.run.design import Knowledge, Noise, assumed_noise, choose, expected_half_width, measured_noise
 from tdhil.run.design.prediction import assumed_theta
-from tdhil.run.excitation import ExcitationWish, MachineLimits, PlanRefused, RigGuess, make_plan
+from tdhil.run.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan
 from tdhil.run.guard import Guard
 from tdhil.run.settings import ControlAssumptions
 from tdhil.studies.coverage.bound import density
@@ -17,13 +17,13 @@ from tdhil.studies.coverage.plants import FLEET
 
 FORESIGHT_S = Guard.foresight_s(ControlAssumptions())
 PLANTS = {plant.name: plant for plant in FLEET}
-LIMITS = MachineLimits(0.5, 10.0, 400.0, FORESIGHT_S)
+LIMITS = MotionLimits(0.5, 10.0, 400.0, FORESIGHT_S)
 GUESS = RigGuess(104.0, 8.0, 60.0)
 KNOWN = Knowledge(assumed_noise(400.0, 10.0), LagPrior())
 
 
 def machine(plant):
-    limits = MachineLimits(*plant.window_rad_s, plant.torque_limit_nm, FORESIGHT_S)
+    limits = MotionLimits(*plant.window_rad_s, plant.torque_limit_nm, FORESIGHT_S)
     return limits, RigGuess(plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.coulomb_nm)
 
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdhil.config.registry import EXCITATIONS, names
-from tdhil.run.excitation import ExcitationWish, MachineLimits, PlanRefused, RigGuess, make_plan, make_transition
+from tdhil.run.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan, make_transition
 
-LIMITS = MachineLimits(0.5, 10.0, 400.0)
+LIMITS = MotionLimits(0.5, 10.0, 400.0)
 GUESS = RigGuess(104.0, 8.0, 60.0)
 KINDS = names(EXCITATIONS, periodic=True)
 MODES = ("torque", "speed")
@@ -118,7 +118,7 @@ def test_refuses_by_name(wish, word):
 )
 def test_refuses_impossible_machines(limits, guess, word):
     with pytest.raises(PlanRefused, match=word):
-        make_plan(MachineLimits(*limits), RigGuess(*guess))
+        make_plan(MotionLimits(*limits), RigGuess(*guess))
 
 
 def test_wishes_are_kept():
@@ -144,7 +144,7 @@ def test_transition_hands_over_without_a_step():
 
 def test_transition_refuses_where_friction_takes_all():
     with pytest.raises(PlanRefused, match="torque limit"):
-        make_transition(1.0, 2.0, MachineLimits(0.5, 10.0, 70.0), GUESS)
+        make_transition(1.0, 2.0, MotionLimits(0.5, 10.0, 70.0), GUESS)
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -156,7 +156,7 @@ def test_transition_refuses_where_friction_takes_all():
     mode=st.sampled_from(MODES),
 )
 def test_any_rig_is_planned_inside_its_limits_or_refused(scale, low, width, kind, mode):
-    limits = MachineLimits(low, low + width, 400.0 * scale)
+    limits = MotionLimits(low, low + width, 400.0 * scale)
     try:
         guess = RigGuess(104.0 * scale, 8.0 * scale, 60.0 * scale)
         plan = make_plan(limits, guess, ExcitationWish(kind=kind, mode=mode))

@@ -6,15 +6,14 @@ A setpoint that the guard rejects is a mistake of this program, and ends the run
 import pytest
 
 from drivers.drive import Mode
-from tdhil.run.excitation import MachineLimits as Room
-from tdhil.run.excitation import RigGuess, SwingPlan
+from tdhil.run.excitation import MotionLimits, RigGuess, SwingPlan
 from tdhil.run.excitation.pulses import CALM_S, Way
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.stages.acquire import Follower, run_swings
 from tdhil.run.stages.hold import MeanSpeedControl, run_hold
 from tests.run.fake_drive import LIMITS, FakeDrive
 
-ROOM = Room(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
+ROOM = MotionLimits(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
 
 
 class Seen(Exception):

@@ -13,14 +13,14 @@ from tdhil.estimation import identify
 from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.recording import LagPrior
 from tdhil.run.design import Knowledge, assumed_noise
-from tdhil.run.excitation import MachineLimits, PlanRefused, RigGuess, make_swings
+from tdhil.run.excitation import MotionLimits, PlanRefused, RigGuess, make_swings
 from tdhil.run.excitation.pulses import CALM_S, TOTAL_S, coasting_s
 from tdhil.run.planning import plan_acquisition
 from tdhil.run.settings import ExcitationRequest
 from tests.run.line_drive import RIG_LIMITS, Line, LineDrive, run_line
 
 TRUE_KG_M2 = 104.0
-LIMITS = MachineLimits(0.5, 10.0, 400.0, 0.86)
+LIMITS = MotionLimits(0.5, 10.0, 400.0, 0.86)
 GUESS = RigGuess(104.0, 8.0, 60.0)
 KINDS = ("pulses", "coast-down")
 
@@ -35,7 +35,7 @@ def test_a_plan_stays_within_window_and_torque(
     kind, mode, inertia, spin_up_s, friction, viscous, foresight_s, window, rel
 ):
     torque = inertia * window / spin_up_s
-    limits = MachineLimits(0.05 * window, 1.05 * window, torque, foresight_s)
+    limits = MotionLimits(0.05 * window, 1.05 * window, torque, foresight_s)
     guess = RigGuess(inertia, viscous * friction * torque / window, (1.0 - viscous) * friction * torque, rel)
     try:
         plan = make_swings(kind, limits, guess, mode)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tdhil.run.excitation import MachineLimits, RigGuess, fit_following, held_back_to, make_plan
+from tdhil.run.excitation import MotionLimits, RigGuess, fit_following, held_back_to, make_plan
 from tdhil.run.excitation.plan import ExcitationWish
 
 STEP_S = 0.001
@@ -73,7 +73,7 @@ def test_nothing_is_read_off_a_speed_that_does_not_follow():
 
 def test_a_plan_leaves_room_for_a_loop_that_overshoots():
     """Driven through the loop, the shaft stays within the window that the plan kept with its margin."""
-    limits = MachineLimits(0.5, 10.0, 1e6)
+    limits = MotionLimits(0.5, 10.0, 1e6)
     following = fit_following(*course(1.5, 2.0, 0.0, 0.02))
     plain = make_plan(limits, RigGuess(1.0), ExcitationWish(mode="speed"))
     aware = make_plan(limits, RigGuess(1.0, following=following), ExcitationWish(mode="speed"))

@@ -30,7 +30,7 @@ from tdhil.run.excitation import (
     LEAST_COUNTED,
     DriveMode,
     ExcitationWish,
-    MachineLimits,
+    MotionLimits,
     Plan,
     PlanRefused,
     RigGuess,
@@ -145,7 +145,7 @@ def proposals(highest_hz: float, slope: float) -> Iterator[Proposal]:
         yield Proposal(reach * highest_hz / harmonics[-1], harmonics, slope)
 
 
-def phased(proposal: Proposal, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> Shape:
+def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> Shape:
     """The proposal with phases that allow the greatest amplitude within speed window and torque limit, peak 1.
 
     A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
@@ -166,7 +166,7 @@ def phased(proposal: Proposal, limits: MachineLimits, guess: RigGuess, mode: Dri
 class _Room:
     """How much of a proposal fits, by its phases."""
 
-    def __init__(self, proposal: Proposal, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> None:
+    def __init__(self, proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
         harmonics, amplitudes = np.array(proposal.harmonics), np.array(proposal.amplitudes)
         omega = 2.0 * np.pi * proposal.lowest_hz * harmonics
         foresight = limits.foresight_s if mode == "torque" else 0.0
@@ -233,7 +233,7 @@ class Choice:
 
 
 def choose(
-    limits: MachineLimits,
+    limits: MotionLimits,
     guess: RigGuess,
     wish: ExcitationWish,
     known: Knowledge,
@@ -281,7 +281,7 @@ def choose(
 
 
 def refuse_unfit(
-    limits: MachineLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
+    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
 ) -> None:
     """PlanRefused where `choose` would find nothing, without weighing what it would find."""
     try:
@@ -295,7 +295,7 @@ def refuse_unfit(
 
 
 def _candidates(
-    limits: MachineLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float, slope: float
+    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float, slope: float
 ) -> Iterator[Plan]:
     speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)
     for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):

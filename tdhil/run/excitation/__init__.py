@@ -19,7 +19,7 @@ from tdhil.run.excitation.pulses import (
 from tdhil.run.excitation.reference import (
     DriveMode,
     ExcitationKind,
-    MachineLimits,
+    MotionLimits,
     PeriodicReference,
     PlanRefused,
     RigGuess,
@@ -41,7 +41,7 @@ __all__ = [
     "ExcitationKind",
     "ExcitationWish",
     "Following",
-    "MachineLimits",
+    "MotionLimits",
     "PeriodicKind",
     "PeriodicReference",
     "Plan",

@@ -12,7 +12,7 @@ from tdhil.recording import Segment
 from tdhil.run.excitation import signals
 from tdhil.run.excitation.reference import (
     DriveMode,
-    MachineLimits,
+    MotionLimits,
     PeriodicReference,
     PlanRefused,
     RigGuess,
@@ -90,7 +90,7 @@ class Plan:
     kind: str
     mode: DriveMode
     segments: tuple[PlannedSegment, ...]
-    limits: MachineLimits
+    limits: MotionLimits
     guess: RigGuess
 
     @property
@@ -171,7 +171,7 @@ class Plan:
         return make_transition(from_rad_s, to, self.limits, self.guess, self.mode)
 
 
-def make_plan(limits: MachineLimits, guess: RigGuess, wish: ExcitationWish | None = None) -> Plan:
+def make_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish | None = None) -> Plan:
     """A plan that stays within the limits even if the rough inertia is wrong by its stated error.
 
     Raises PlanRefused, naming the limit, if what was asked for does not fit.
@@ -199,7 +199,7 @@ class _Fit:
 
     shape: Shape
     period_s: float
-    limits: MachineLimits
+    limits: MotionLimits
     guess: RigGuess
     mode: DriveMode
     up: float            # speed above and below its mean, per unit of amplitude
@@ -209,7 +209,7 @@ class _Fit:
     foreseen: float      # like ``up``, as far ahead as the guard looks
 
     @classmethod
-    def of(cls, shape: Shape, period_s: float, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
+    def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
         following = guess.following if mode == "speed" else None
         moved = shape if following is None else shape.followed(period_s, following)
         speed = shape.deviation()

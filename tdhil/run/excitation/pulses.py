@@ -23,7 +23,7 @@ from typing import Any
 from tdhil.run.excitation.reference import (
     DriveMode,
     ExcitationKind,
-    MachineLimits,
+    MotionLimits,
     PlanRefused,
     RigGuess,
     excitation_kind,
@@ -87,7 +87,7 @@ class SwingPlan:
     speed_max_rad_s: float
     torque_min_nm: float
     torque_max_nm: float
-    limits: MachineLimits
+    limits: MotionLimits
     guess: RigGuess
 
     @property
@@ -117,7 +117,7 @@ class SwingPlan:
 
 def make_swings(
     kind: str,
-    limits: MachineLimits,
+    limits: MotionLimits,
     guess: RigGuess,
     mode: DriveMode,
     amplitude_rad_s: float | None = None,
@@ -216,7 +216,7 @@ COAST_DOWN = SwingKind(
 class _Room:
     """Lower and upper speed, and the steepest way between them, within the limits."""
 
-    def __init__(self, limits: MachineLimits, guess: RigGuess, mode: DriveMode) -> None:
+    def __init__(self, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
         self._limits, self._guess = limits, guess
         # At worst a way goes as much further as the shaft is lighter than thought.
         self._beyond = guess.speed_swing_factor(mode) - 1.0

@@ -55,8 +55,10 @@ def excitation_kind(name: str) -> ExcitationKind:
 
 
 @dataclass(frozen=True)
-class MachineLimits:
-    """The window that the shaft must not leave, rad/s, and the greatest torque either way, N·m.
+class MotionLimits:
+    """What a planned motion may use: the window that the shaft must not leave, rad/s, and the greatest torque, N·m.
+
+    The machine's own, which the guard holds, are `tdhil.run.settings.MachineLimits`.
 
     ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
     what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
@@ -226,7 +228,7 @@ class Transition:
 
 
 def make_transition(
-    from_rad_s: float, to_rad_s: float, limits: MachineLimits, guess: RigGuess, mode: DriveMode = "torque"
+    from_rad_s: float, to_rad_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode = "torque"
 ) -> Transition:
     """The quickest calm transition: at most half of the torque that friction leaves, and never under 2 s.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from tdhil.estimation import Options, identify
 from tdhil.recording import Excitation, Recording, Segment
-from tdhil.run.excitation import ExcitationWish, MachineLimits, Plan, RigGuess, make_plan
+from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
 from tdhil.studies.coverage.workers import results
 
@@ -48,7 +48,7 @@ def rough_guess(plant: CoveragePlant, shares: FloatArray) -> RigGuess:
 
 def plan_for(plant: CoveragePlant, guess: RigGuess, periods: int) -> Plan:
     """The default multisine about two mean speeds: so many periods that count at each, after 10 s of settling."""
-    limits = MachineLimits(*plant.window_rad_s, plant.torque_limit_nm)
+    limits = MotionLimits(*plant.window_rad_s, plant.torque_limit_nm)
     settle = max(1, math.ceil(10.0 * plant.lowest_hz - 1e-9))
     return make_plan(limits, guess, ExcitationWish(frequency_hz=plant.lowest_hz, periods=settle + periods))
 
