@@ -50,6 +50,7 @@ def show_settings(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
+    from drivers import own_limits
     from profiles.quantities import FREQUENCY, SPEED, TIME
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount, share
     from tdhil.config import EXCITATIONS, MODELS
@@ -66,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     drive.add_argument("--accept-shared-watchdog", action="store_true",
                        help="Modbus: take a drive whose watchdog other clients feed, too: it won't stop by itself if "
                        "this host dies while one of them goes on asking")
-    drive.add_argument("--accept-wider-limit", action="append", choices=("torque", "speed", "quick-stop"),
+    drive.add_argument("--accept-wider-limit", action="append", choices=own_limits.NAMES,
                        help="let the run widen this limit of the drive's own; otherwise a tighter one stays")
     drive.add_argument("--accept-speed-unit", action="store_true",
                        help="take the profile's unit of speed without seeing the shaft turn as fast as it says")

@@ -15,6 +15,7 @@ from tdhil.recording import Excitation, FloatArray, LagPrior, Recording, Segment
 from tdhil.studies.paper.loop import LoopRecord, LoopSettings, changed, reference_of, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings, LevelMeans, main_effects, ranking
 from tdhil.studies.paper.processing import backward_difference, settled_periods, torque_line
+from tdhil.studies.study import Progress
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Why the paper's estimate is low: the start from rest, in closed form.
@@ -155,6 +156,23 @@ def run_design(settings: DesignSettings, progress: Callable[[float], None]) -> D
     )
     effects = main_effects(settings.rows, [run.line.inertia_kg_m2 for run in done])
     return DesignResult(done, effects, record.simulated_s, wall_s)
+
+
+class OverDesign:
+    """A study over all runs of a design: what it is called, what can be set, and the runs themselves."""
+
+    def __init__(self, name: str, title: str, model: type[DesignSettings]) -> None:
+        self.name = name
+        self.title = title
+        self._model = model
+
+    @property
+    def settings_model(self) -> type[DesignSettings]:
+        return self._model
+
+    def carried_out(self, settings: DesignSettings, progress: Progress) -> DesignResult:
+        """Every run, with a word on how far they are."""
+        return run_design(settings, lambda share: progress(share, f"{self.name}: {len(settings.rows)} runs"))
 
 
 def _identified(

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import model_validator
 
 from profiles import refuse_if
-from tdhil.studies.paper.design_runs import DesignResult, DesignRun, run_design
+from tdhil.studies.paper.design_runs import DesignResult, DesignRun, OverDesign
 from tdhil.studies.paper.loop import LABELS, LoopRecord, LoopSettings, Positive, SamplePeriod, changed, simulate
 from tdhil.studies.paper.orthogonal_design import DesignSettings
 from tdhil.studies.paper.processing import response, torque_line
@@ -28,20 +28,11 @@ if TYPE_CHECKING:
 # Figures 14 and 15: torque over angular acceleration of every run of a design, with its fitted line.
 
 
-class ScatterStudy:
+class ScatterStudy(OverDesign):
     """`figure14` (the runs of Table 6) and `figure15` (of Table 7)."""
 
-    def __init__(self, name: str, title: str, model: type[DesignSettings]) -> None:
-        self.name = name
-        self.title = title
-        self._model = model
-
-    @property
-    def settings_model(self) -> type[DesignSettings]:
-        return self._model
-
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
-        result = run_design(settings, lambda share: progress(share, f"{self.name}: {len(settings.rows)} runs"))
+        result = self.carried_out(settings, progress)
         columns = ("run", *result.runs[0].factors, "slope_kg_m2", "intercept_nm", "r2")
         rows: list[tuple[Cell, ...]] = [
             (number, *run.factors.values(), run.line.inertia_kg_m2, run.line.intercept_nm, run.line.r2)
@@ -227,21 +218,15 @@ def _draw(figure: Figure, record: LoopRecord) -> None:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-class EffectStudy:
+class EffectStudy(OverDesign):
     """`figure16` (Table 6) and `figure17` (Table 7)."""
 
     def __init__(self, name: str, title: str, model: type[DesignSettings], table: str) -> None:
-        self.name = name
-        self.title = title
-        self._model = model
+        super().__init__(name, title, model)
         self._table = table
 
-    @property
-    def settings_model(self) -> type[DesignSettings]:
-        return self._model
-
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
-        result = run_design(settings, lambda share: progress(share, f"{self.name}: {len(settings.rows)} runs"))
+        result = self.carried_out(settings, progress)
         paper = published_for(self._table, settings)
         factors = effect_document(settings, result)
         progress(1.0, self.name)

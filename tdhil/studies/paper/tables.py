@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from tdhil.studies.paper.design_runs import DesignResult, DesignRun, run_design
+from tdhil.studies.paper.design_runs import DesignResult, DesignRun, OverDesign
 from tdhil.studies.paper.loop import LABELS, NonNegative, Positive, SamplePeriod
 from tdhil.studies.paper.orthogonal_design import DesignSettings, Factor, Rows, ranking
 from tdhil.studies.paper.published import PublishedDesign, published
@@ -69,20 +69,11 @@ class Table7Settings(DesignSettings):
     factors: tuple[Factor, ...] = Field(default_factory=lambda: published().design("table7").as_factors)
 
 
-class DesignStudy:
+class DesignStudy(OverDesign):
     """`table6` and `table7`; with an array or factors of one's own, the same without the published columns."""
 
-    def __init__(self, name: str, title: str, model: type[DesignSettings]) -> None:
-        self.name = name
-        self.title = title
-        self._model = model
-
-    @property
-    def settings_model(self) -> type[DesignSettings]:
-        return self._model
-
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
-        result = run_design(settings, lambda share: progress(share, f"{self.name}: {len(settings.rows)} runs"))
+        result = self.carried_out(settings, progress)
         paper = published_for(self.name, settings)
         progress(1.0, self.name)
         return StudyOutcome(
