@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tdhil.estimation.frequency_domain.model import GaussianPrior as GaussianPrior, Model as Model
     from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit
     from tdhil.estimation.frequency_domain.rigid import (
-        RigidResult as RigidResult, fit_rigid as fit_rigid, known_of as known_of, lag_priors as lag_priors,
+        fit_inertia as fit_inertia, known_of as known_of, lag_priors as lag_priors,
         refuse_count as refuse_count,
     )
     from tdhil.estimation.frequency_domain.shafts import VISCOUS as VISCOUS, shaft_model as shaft_model
@@ -46,7 +46,7 @@ else:
             ),
             "model": ("GaussianPrior", "Model"),
             "optimiser": ("Box", "Fit"),
-            "rigid": ("RigidResult", "fit_rigid", "known_of", "lag_priors", "refuse_count"),
+            "rigid": ("fit_inertia", "known_of", "lag_priors", "refuse_count"),
             "shafts": ("VISCOUS", "shaft_model"),
             "signal_filters": (
                 "AVERAGE", "LAG_BOUND_S", "SHAPE_BOUND", "SKEW", "SKEW_BOUND_S", "SPEED_LAG", "SPEED_SHAPE",

@@ -196,12 +196,9 @@ def fit_rigid(
     torque_scale_rel_sd: float = 0.0,
 ) -> RigidResult:
     """Fit, test, and profile. ``fixed``: parameters of theta known for certain (see Model)."""
-    problem = Likelihood(lines, Model(), constraint, priors)
-    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
-    residual = residual_of(fitted)
-    if rejects(residual):            # then no interval will be shown, and none is sought
+    inertia, residual, fitted = fit_inertia(lines, constraint, priors, fixed, confidence)
+    if rejects(residual):
         return _bare(fitted, residual)
-    inertia = estimate(fitted, INERTIA, confidence)
     viscous = estimate(fitted, VISCOUS, confidence)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
     return RigidResult(
@@ -216,6 +213,23 @@ def fit_rigid(
         first_order=fitted.first_order,
         fitted=fitted,
     )
+
+
+def fit_inertia(
+    lines: tuple[Line, ...],
+    constraint: ViscousConstraint | None,
+    priors: tuple[GaussianPrior, ...],
+    fixed: Fixed,
+    confidence: float,
+) -> tuple[Estimate, ResidualTest | None, Fitted]:
+    """`fit_rigid` as far as J goes, which is a third of it; J without width where the data reject the model."""
+    problem = Likelihood(lines, Model(), constraint, priors)
+    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
+    residual = residual_of(fitted)
+    if rejects(residual):            # then no interval will be shown, and none is sought
+        value = float(fitted.whole.theta[INERTIA])
+        return Estimate(value, value, value), residual, fitted
+    return estimate(fitted, INERTIA, confidence), residual, fitted
 
 
 def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:

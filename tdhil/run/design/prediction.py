@@ -23,8 +23,7 @@ from tdhil.estimation.frequency_domain import (
     Levels,
     Line,
     Model,
-    RigidResult,
-    fit_rigid,
+    fit_inertia,
     known_of,
     period_lines,
     refuse_count,
@@ -178,16 +177,11 @@ def fit(evidence: Evidence, confidence: float) -> Fitted | None:
     if not lines or refuse_count(len(lines), constraint, priors) is not None:
         return None
     try:
-        found = fit_rigid(lines, evidence.levels, constraint, priors, held, confidence)
+        inertia, _, found = fit_inertia(lines, constraint, priors, held, confidence)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
-    return _fitted(found)
-
-
-def _fitted(found: RigidResult) -> Fitted | None:
-    inertia = found.inertia
     half = 0.5 * (inertia.high - inertia.low) / inertia.value if inertia.value > 0.0 else math.inf
-    theta = found.fitted.likelier.theta
+    theta = found.likelier.theta
     if not (half > 0.0 and np.all(np.isfinite(theta))):
         return None
     return Fitted(theta, half)
