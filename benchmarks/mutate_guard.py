@@ -60,7 +60,7 @@ def _driver(name: str, *tests: str, within: str = "") -> Subject:
 
 _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
-    "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_looks.py",
+    "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_polls.py",
 )
 _RUNS = ("test_control_loop.py", "test_runner.py", "test_run_goes_wrong.py")
 SUBJECTS = {

@@ -182,7 +182,7 @@ class _Reader:
             return None
         return found
 
-    def look(self) -> None:
+    def check_entries(self) -> None:
         """Everything that canopen reads in a number or can't do without."""
         if "DeviceInfo" not in self._sections:
             self.refuse(0, "has no section [DeviceInfo]: this is no EDS, or only a part of one")
@@ -279,7 +279,7 @@ def read_eds(path: Path) -> EdsFile:
     reader = _Reader(path)
     reader.split(reader.text(path))
     reader.check()
-    reader.look()
+    reader.check_entries()
     try:
         from canopen.objectdictionary import ODVariable, eds
 

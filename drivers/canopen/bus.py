@@ -141,14 +141,14 @@ class CanLink:
         self._question = 0
         self._answered = self._in_vain = self._dead = False
 
-    def send(self, identifier: int, data: bytes, last_look: Callable[[], None] | None = None) -> None:
+    def send(self, identifier: int, data: bytes, last_check: Callable[[], None] | None = None) -> None:
         """Put one frame on the bus. Raises CommunicationLost if the bus doesn't take it.
 
-        ``last_look`` is called when nothing but sending is left to be done, and may raise to prevent it.
+        ``last_check`` is called when nothing but sending is left to be done, and may raise to prevent it.
         """
         message = self._message(arbitration_id=identifier, data=data, is_extended_id=False, check=False)
-        if last_look is not None:
-            last_look()
+        if last_check is not None:
+            last_check()
         self._put(message)
         if self._tap is not None:
             self._tap(RawFrame(self._clock.now_s(), True, identifier, data))

@@ -33,9 +33,9 @@ from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, ReadBack, SignOfLi
 from drivers.clock import RATES_HZ, Clock, Ticks, how_late
 from drivers.drive import Command, Counters, DriveLimits, FrameTap, Identity, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
-from drivers.left_behind import LeftBehind
 from drivers.own_limits import OwnLimits
 from drivers.preflight import Table
+from drivers.undo_journal import UndoJournal
 from profiles import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.canopen import CanopenProfile
 
@@ -61,7 +61,7 @@ _REPEAT_MODE_CYCLES = 25
 
 class Cia402Drive:
     """One node. ``rated_torque_nm`` overrides or replaces what the drive says; ``tap`` sees every frame;
-    ``left`` keeps what is changed in the drive, for whoever comes after a host that died.
+    ``journal`` keeps what is changed in the drive, for whoever comes after a host that died.
 
     ``stepped`` asks a simulated peer to let each SYNC advance its time; a real one is refused it.
     """
@@ -77,7 +77,7 @@ class Cia402Drive:
         rated_torque_nm: float | None = None,
         host_node: int = HOST_NODE,
         tap: FrameTap | None = None,
-        left: LeftBehind | None = None,
+        journal: UndoJournal | None = None,
     ) -> None:
         self.clock = clock
         self.period_s = round(1e6 / (rate_hz or profile.cyclic.rate_hz)) * 1e-6
@@ -87,7 +87,7 @@ class Cia402Drive:
         self._rated_torque_nm = rated_torque_nm
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
-        self._left = left
+        self._journal = journal
         self._watch = Watch(node, clock)
         self._strangers = Strangers(self._link, self._watch, clock, node=node, number=host_node)
         self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
@@ -193,8 +193,8 @@ class Cia402Drive:
             raise PreflightRefused("preflight before connect", where="driver")
         table, objects, scaling = Table(), self._objects, Table()
         self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
-        if self._left is not None:
-            checks.give_back_left(table, objects, self._left, self._identity)
+        if self._journal is not None:
+            checks.restore_from(table, objects, self._journal, self._identity)
         checks.check_identity(table, self._identity, self._profile)
         checks.check_state(table, objects, self._units, self._profile)
         check_parameters(table, objects, self._profile)

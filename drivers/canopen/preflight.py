@@ -24,9 +24,9 @@ from drivers.canopen.sdo import Objects, name, place
 from drivers.canopen.state_machine import State, decode
 from drivers.drive import Identity, Mode, Preflight, ReportingFilters
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
-from drivers.left_behind import LeftBehind
 from drivers.own_limits import SPEED, TORQUE
 from drivers.preflight import Table, agreed_rated_torque
+from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, visible
 from profiles.canopen import CanopenProfile, ReportingFilter
 
@@ -180,10 +180,10 @@ def check_identity(table: Table, identity: Identity, profile: CanopenProfile) ->
         )
 
 
-def give_back_left(table: Table, objects: Objects, left: LeftBehind, identity: Identity) -> None:
+def restore_from(table: Table, objects: Objects, journal: UndoJournal, identity: Identity) -> None:
     """What an earlier run has left in the drive, since its host died: given back where it still stands so."""
     given, others = [], []
-    for one in left.opened(identity):
+    for one in journal.opened(identity):
         index, sub = place(one.where)
         try:
             if objects.read_bytes(index, sub) == one.after:
@@ -191,14 +191,14 @@ def give_back_left(table: Table, objects: Objects, left: LeftBehind, identity: I
                 given.append(one.text)
             else:
                 others.append(one.where)
-            left.given_back(one.where)
+            journal.given_back(one.where)
         except ObjectRefused as error:
             table.note("left by an earlier run", f"{one.text}; {error.what}", one.where, "Set it at the drive, by hand")
     if given:
         table.note("left by an earlier run", f"{', '.join(given)}: given back now", "log's folder")
     if others:
         table.note("left by an earlier run", f"{', '.join(others)}: changed by somebody since, left alone", "")
-    objects.left = left
+    objects.journal = journal
 
 
 def check_state(table: Table, objects: Objects, units: Units, profile: CanopenProfile) -> None:

@@ -16,7 +16,7 @@ from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from drivers.canopen.bus import CanLink
 from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.left_behind import LeftBehind
+from drivers.undo_journal import UndoJournal
 
 
 class _LinkNetwork(canopen.Network):  # type: ignore[misc]
@@ -95,7 +95,7 @@ class Objects:
         self._node = node
         self._undo: list[Callable[[], None]] = []
         self._changed: set[tuple[int, int]] = set()
-        self.left: LeftBehind | None = None        # where changes are written down before they are made
+        self.journal: UndoJournal | None = None        # where changes are written down before they are made
         self.stands: dict[tuple[int, int], bytes] = {}     # what `change` last read back, or was found right and left
 
     def on_answer(self, take: Callable[[bytes], None]) -> None:
@@ -176,13 +176,13 @@ class Objects:
         if (index, subindex) not in self._changed:
             self._changed.add((index, subindex))
             self.on_restore(lambda: self._give_back(index, subindex, before))
-        if self.left is not None:
-            self.left.changing(where, before, after)
+        if self.journal is not None:
+            self.journal.changing(where, before, after)
 
     def _give_back(self, index: int, subindex: int, before: bytes) -> None:
         self.write_bytes(index, subindex, before, str(int.from_bytes(before, "little")))
-        if self.left is not None:
-            self.left.given_back(name(index, subindex))
+        if self.journal is not None:
+            self.journal.given_back(name(index, subindex))
 
     def on_restore(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called by `restore`."""

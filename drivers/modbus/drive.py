@@ -59,7 +59,7 @@ from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost write must not end a run."""
-LOOK_AT_MODE_CYCLES = 20
+READ_MODE_CYCLES = 20
 """How often the mode display is read where it costs a transaction of its own."""
 RESET_PAUSE_S = 0.1
 """Between the words of a fault reset, for drives that look at their field bus every few ten milliseconds."""
@@ -125,7 +125,7 @@ class ModbusDrive:
         self._feedback = _NOTHING_YET
         self._shown: Mode | None = None
         self._sent_mode = Mode.SPEED
-        self._since_mode_sent = self._since_looked = 0
+        self._since_mode_sent = self._since_mode_read = 0
         self._failing_since_s: float | None = None
         self._told_loss = self._told_other = False
         self._out_of_operation = 0     # cycles so far, since nobody asks for it
@@ -290,7 +290,7 @@ class ModbusDrive:
             self._reverse = setpoints.reverse       # a setpoint of zero keeps the direction it is braked from
         if not self._may_write():
             return self._watch()
-        self._look_for_others()
+        self._poll_other_masters()
         if self._wish is Wish.ENABLED:
             self._heat.poll(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
@@ -325,7 +325,7 @@ class ModbusDrive:
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
 
-    def _look_for_others(self) -> None:
+    def _poll_other_masters(self) -> None:
         """Raises CommunicationLost once; the stop that follows goes on exchanging."""
         if self._other.seen and self._wish is not Wish.ENABLED:
             return                     # known, and the line is needed for the stop
@@ -399,9 +399,9 @@ class ModbusDrive:
             return self._sample(begun_s, self.clock.now_s() - begun_s, 0.0, fresh=False)
         return sample
 
-    def _unless_frozen(self, look_at_ticks: Callable[[], None]) -> None:
+    def _unless_frozen(self, check_ticks: Callable[[], None]) -> None:
         try:
-            look_at_ticks()
+            check_ticks()
         except CommunicationLost:
             self._stay_out()
             raise
@@ -459,14 +459,14 @@ class ModbusDrive:
         """The plan's, with those that only a mode switch needs: the mode after its setpoint, then its display."""
         plan, found = self._plan, self._plan.cycle
         self._since_mode_sent += 1
-        self._since_looked += 1
+        self._since_mode_read += 1
         repeat = self._shown is not mode and self._since_mode_sent >= REPEAT_MODE_CYCLES
         if plan.mode_writes and (mode is not self._sent_mode or repeat):
             self._since_mode_sent = 0
             found += plan.mode_writes
         self._sent_mode = mode
-        if plan.mode_reads and (self._shown is not mode or self._since_looked >= LOOK_AT_MODE_CYCLES):
-            self._since_looked = 0
+        if plan.mode_reads and (self._shown is not mode or self._since_mode_read >= READ_MODE_CYCLES):
+            self._since_mode_read = 0
             found += plan.mode_reads
         return found
 

@@ -29,7 +29,7 @@ from profiles.modbus import Echo, ModbusProfile, Signal
 
 SHARES = (0.25, -0.5, 0.75, -1.0 / 3.0)
 """Of the limit: of both signs, none a multiple of another's wrong scale, and each with two different halves."""
-LOOKS, ECHO_LOOK_S = 12, 0.05
+ECHO_POLLS, ECHO_POLL_S = 12, 0.05
 """At an echo: drives renew what they display every few ten milliseconds, field bus adapters more slowly still."""
 
 
@@ -97,9 +97,9 @@ def _check_one(
         try:
             for value in tests:
                 counts = to_counts(value, lsb, register, where)
-                for poll in range(1 if echo is None else LOOKS):
+                for poll in range(1 if echo is None else ECHO_POLLS):
                     if poll:
-                        access.clock.wait_until(access.clock.now_s() + ECHO_LOOK_S)
+                        access.clock.wait_until(access.clock.now_s() + ECHO_POLL_S)
                     access.write(register, counts)      # each time: a watchdog may be on already
                     found = access.read(seen_in) * seen_lsb
                     if good := math.isclose(found, counts * lsb, rel_tol=1e-9, abs_tol=slack):
@@ -129,7 +129,7 @@ STILL_COUNTS, STILL_SHARE = 5, 0.005
 """What counts as a shaft at rest before motion: so many counts, or this share of the speed limit if that is more."""
 COARSEST_SHARE = 0.05
 """Of a limit, that one count may be worth."""
-LOOKS_AT_MODE, LOOK_S = 20, 0.05
+MODE_POLLS, MODE_POLL_S = 20, 0.05
 
 
 def read_only_checks(
@@ -244,7 +244,7 @@ def check_modes(table: Table, access: Access, profile: ModbusProfile) -> None:
                 back = access.change(register, value)
                 if display is None or back != value:
                     return str(back), back == value
-                shown = _look(access, profile, mode)
+                shown = _poll_mode(access, profile, mode)
                 return str(shown), shown_mode(profile, shown) is mode
 
             table.attempt(
@@ -257,14 +257,14 @@ def check_modes(table: Table, access: Access, profile: ModbusProfile) -> None:
             table.note("mode display", text, register_name(display.register_))
 
 
-def _look(access: Access, profile: ModbusProfile, mode: Mode) -> int:
+def _poll_mode(access: Access, profile: ModbusProfile, mode: Mode) -> int:
     display = profile.modes.display
     assert display is not None
     register, clock = display.register_, access.clock
-    for _ in range(LOOKS_AT_MODE):
+    for _ in range(MODE_POLLS):
         words = access.read_words(register.table, register.address, register.count, register_name(register))
         shown = from_words(words, register.type, profile.line.word_order) & 0xFFFF
         if shown_mode(profile, shown) is mode:
             break
-        clock.wait_until(clock.now_s() + LOOK_S)
+        clock.wait_until(clock.now_s() + MODE_POLL_S)
     return shown

@@ -34,7 +34,7 @@ class ModbusTarget:
         self._profile = profile
         self._access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
         self._scale: float | None = None
-        self._looked_for_scale = False
+        self._scale_sought = False
         self._first = 0
         self._driven = False
         self._stops = 0
@@ -99,8 +99,8 @@ class ModbusTarget:
         cycle, control = self._profile.cycle, self._profile.control
         status = self._access.read(cycle.status.register_) & 0xFFFF
         raw = self._access.read(cycle.speed.register_)
-        if not self._looked_for_scale:
-            self._looked_for_scale, self._first = True, abs(raw)
+        if not self._scale_sought:
+            self._scale_sought, self._first = True, abs(raw)
             self._scale = self._find_scale()
         power = power_state(decode(control, status))
         near = abs(raw) <= max(NEAR_ZERO_COUNTS, NEAR_ZERO_SHARE * self._first)

@@ -204,7 +204,7 @@ def findings(
 def _left(folder: Path) -> Iterator[Finding]:
     """What runs that died have left in their drives."""
     from drivers import TdhilError
-    from drivers.left_behind import PREFIX, SUFFIX, read
+    from drivers.undo_journal import PREFIX, SUFFIX, read
     from tdhil.cli.finding import bad, of_error
 
     for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):

@@ -124,7 +124,7 @@ class Reckoner:
                 self._ready.set()
 
 
-class Beside(Generic[T]):
+class Background(Generic[T]):
     """One piece of work, begun at once, that nobody has to wait for: neither a stop nor the process's end.
 
     Where ``reckoner`` can't do it, a thread does, and ``instead`` says why. As long as a thread is at it, whoever

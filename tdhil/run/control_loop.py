@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 
 from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
 from tdhil.errors import Interrupted
-from tdhil.run.background import Beside, Reckoner
+from tdhil.run.background import Background, Reckoner
 from tdhil.run.guard import Guard
 from tdhil.run.settings import StopRequest
 
@@ -50,7 +50,7 @@ class ControlLoop:
         self.period_s = drive.period_s
         self.stop_side_troubles: list[str] = []
         self.last: Sample | None = None
-        self.beside: Watcher | None = None         # what a stage does beside every cycle, behind the guard
+        self.observer: Watcher | None = None         # what a stage does after every cycle, behind the guard
         self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
         self.reckoner: Reckoner | None = None      # where longer arithmetic is done in real time; None: in a thread
         self.remarks: list[str] = []       # what others did on the drive's bus
@@ -75,8 +75,8 @@ class ControlLoop:
             self._note(self._telling)
         self.guard.check_sample(command, sample)
         self.guard.check_pace(self.drive.counters)
-        if self.beside is not None:
-            self.beside(command, sample)
+        if self.observer is not None:
+            self.observer(command, sample)
         if self._watch is not None and not self.quiet:
             self._watch(command, sample)
         return sample
@@ -145,34 +145,34 @@ class ControlLoop:
 
         In stepped time nothing starves, and a number of cycles that depended on the machine's speed would not repeat:
         there, signs of life that move no time on are all that goes out. In real time a process of its own does it
-        where one stands ready and understands the ``work`` (`beside.Reckoner.ask`): a thread shares the interpreter,
-        and cycles come late beside it. They may all the same on a computer of one processor, and that alone doesn't
-        end the run.
+        where one stands ready and understands the ``work`` (`background.Reckoner.ask`): a thread shares the
+        interpreter, and cycles come late beside it. They may all the same on a computer of one processor, and that
+        alone doesn't end the run.
 
         Whatever ``cycle`` raises goes out at once: nobody waits for work that is not wanted any more, since a shaft
         may be turning without a setpoint meanwhile. A process is killed; a thread goes on by itself, beside the stop,
         and what comes of it is dropped.
         """
-        beside = Beside(work, None if self.drive.clock.stepped else self.reckoner)
+        background = Background(work, None if self.drive.clock.stepped else self.reckoner)
         told = False
         self.guard.reckoning = True
         try:
-            while not beside.ended.is_set():
-                if beside.instead and not told:
-                    self.no_reckoner(beside.instead)
+            while not background.ended.is_set():
+                if background.instead and not told:
+                    self.no_reckoner(background.instead)
                     told = True
                 if self.drive.clock.stepped:
-                    self._wait_alive(beside.ended)
+                    self._wait_alive(background.ended)
                 else:
                     cycle()
         except BaseException:
-            beside.drop()
+            background.drop()
             raise
         finally:
             self.guard.reckoning = False
-        if beside.instead and not told:
-            self.no_reckoner(beside.instead)
-        return beside.result()
+        if background.instead and not told:
+            self.no_reckoner(background.instead)
+        return background.result()
 
     def no_reckoner(self, why: str) -> None:
         """Note that arithmetic has to share this process with the control loop."""

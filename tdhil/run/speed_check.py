@@ -218,7 +218,7 @@ class _Paused(NamedTuple):
     until_compared: bool
 
 
-class SpeedLook:
+class SpeedUnitCheck:
     """Of one run's stage 2: `ramp` to the first mean speed, `level` around its level, `conclude` behind it."""
 
     def __init__(
@@ -291,18 +291,18 @@ class SpeedLook:
                 self._settle_without()
             return
         self._watching = True
-        self._loop.beside = self._beside
+        self._loop.observer = self._observe
 
     def _end(self) -> None:
         self._done = True
         self._watching = False
-        self._loop.beside = None
+        self._loop.observer = None
 
     def _read(self) -> PositionReading | None:
         assert self._drive is not None
         return self._drive.read_position()
 
-    def _beside(self, command: Command, sample: Sample) -> None:
+    def _observe(self, command: Command, sample: Sample) -> None:
         """After every cycle of the bench, whoever asked for it."""
         angles = self._angles
         angles.saw(sample)
@@ -437,7 +437,7 @@ class SpeedLook:
         An angle that was read when a frozen host woke up, or of a drive that has stopped by itself since its last
         sample, says nothing of a unit.
         """
-        self._loop.beside = None
+        self._loop.observer = None
         self._loop.cycle(command)
         raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
 

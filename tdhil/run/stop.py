@@ -16,7 +16,7 @@ quiet for half a swing (`let_go.QUIET_S`); its motor does not follow, since its 
 
 Where the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the drive is
 looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
-has had its time, and a look contradicts it (`stop_looks`).
+has had its time, and a poll contradicts it (`FeedbackPolls`).
 
 A shaft that goes on turning in spite of the quick stop (somebody else commands it, or the drive doesn't brake) is not
 held up by the host's own sign of life: the drive is not fed any more, so that its watchdog acts, and it is watched on.
@@ -38,24 +38,24 @@ from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Single looks at a drive (`drivers.drive.Polled`) for a stop without feedback of the cycle, or none to believe.
+# Single polls of a drive (`drivers.drive.Polled`) for a stop without feedback of the cycle, or none to believe.
 #
-# A look feeds what supervises the host. So it must not go on for ever at a shaft that is not slowing down: such a one
+# A poll feeds what supervises the host. So it must not go on for ever at a shaft that is not slowing down: such a one
 # is left to the drive's own watchdog, which wants silence (`Slowing`).
 
 
 AFTER_S = 0.2
-"""Without cyclic feedback for so long, the drive is looked at."""
+"""Without cyclic feedback for so long, the drive is polled."""
 
 EVERY_S, MOST_S = 0.1, 0.4
-"""Between two looks; twice as long after each that brought nothing, up to the second."""
+"""Between two polls; twice as long after each that brought nothing, up to the second."""
 
 SLOWING_S, SLOWER = 1.0, 0.98
-"""Under looks alone the shaft must have lost so much of its speed each second."""
+"""Under polls alone the shaft must have lost so much of its speed each second."""
 
 
-class Looks:
-    """Knows when a look is due. ``only``: the cyclic feedback is not believed any more."""
+class FeedbackPolls:
+    """Knows when a poll is due. ``only``: the cyclic feedback is not believed any more."""
 
     def __init__(self, drive: Drive, period_s: float) -> None:
         self._drive = drive if isinstance(drive, Polled) else None
@@ -68,7 +68,7 @@ class Looks:
 
     @property
     def standing(self) -> bool:
-        """Do looks stand in for the cycle's feedback at present?"""
+        """Do polls stand in for the cycle's feedback at present?"""
         return self.only or self._missing_s > 0.0
 
     def heard(self) -> None:
@@ -76,7 +76,7 @@ class Looks:
         self._missing_s, self._due_s, self._pause_s = 0.0, AFTER_S, EVERY_S
 
     def missed(self) -> Sample | None:
-        """A cycle has brought none: the drive's answer, where a look was due and was answered. May raise."""
+        """A cycle has brought none: the drive's answer, where a poll was due and was answered. May raise."""
         self._missing_s += self._period_s
         if self._drive is None or self._missing_s < self._due_s - 1e-9:
             return None
@@ -85,7 +85,7 @@ class Looks:
         return self.ask()
 
     def ask(self) -> Sample | None:
-        """Look now; None without an answer. May raise."""
+        """Poll now; None without an answer. May raise."""
         sample = self._drive.poll() if self._drive is not None else None
         if sample is not None:
             self.answered += 1
@@ -240,7 +240,7 @@ class StopSequence:
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = 0.0
         self._trouble: list[str] = []
-        self._looks = Looks(loop.drive, loop.period_s)
+        self._polls = FeedbackPolls(loop.drive, loop.period_s)
         self._slowing = Slowing(self._at_rest_rad_s)
         self._unmoved_s = max(
             UNMOVED_STRING_S if self._string is not None else UNMOVED_S, UNMOVED_RAMP_SHARE * ramp_s
@@ -360,7 +360,7 @@ class StopSequence:
         heard_s = 0.0
         while not patience.over:
             asked = asked or self._ask(self._loop.drive.quick_stop)
-            sample = self._exchange(_REST, or_look=True)
+            sample = self._exchange(_REST, or_poll=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     self._trouble.append("no feedback from the drive any more")
@@ -408,7 +408,7 @@ class StopSequence:
         asked = self._ask(self._loop.drive.disable)
         for _ in range(self._loop.cycles(3.0)):
             asked = asked or self._ask(self._loop.drive.disable)
-            sample = self._exchange(_REST, or_look=True)
+            sample = self._exchange(_REST, or_poll=True)
             if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
             if self._silent >= self._enough_silent:
@@ -420,14 +420,14 @@ class StopSequence:
         """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
         quiet_s, told, heard_s = 0.0, False, self._loop.now_s
         for _ in range(self._loop.cycles(REST_AFTER_S)):
-            sample = self._exchange(_REST, or_look=True)
+            sample = self._exchange(_REST, or_poll=True)
             if sample is None:
                 if self._silent >= self._enough_silent:
                     self._trouble.append("nothing was heard of the drive once it was disabled")
                     return True
                 continue
-            # Looks are further apart than cycles are; a longer gap shows nothing.
-            apart_s = sample.time_s - heard_s if self._looks.standing else 0.0
+            # Polls are further apart than cycles are; a longer gap shows nothing.
+            apart_s = sample.time_s - heard_s if self._polls.standing else 0.0
             quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
             if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
@@ -455,17 +455,17 @@ class StopSequence:
         if len(self._trouble) < 20:
             self._trouble.append(str(error) or type(error).__name__)
 
-    def _exchange(self, command: Command, *, or_look: bool = False) -> Sample | None:
-        """One cycle's feedback; where there is none, a look's, if that may be taken and one is due."""
+    def _exchange(self, command: Command, *, or_poll: bool = False) -> Sample | None:
+        """One cycle's feedback; where there is none, a poll's, if that may be taken and one is due."""
         sample: Sample | None = None
         try:
             sample = self._loop.stop_cycle(command)
         except BaseException as error:  # whatever it is, the stop goes on
             self._note(error)
-        if sample is None or not sample.fresh or (or_look and self._looks.only):
-            sample = self._look() if or_look else None
+        if sample is None or not sample.fresh or (or_poll and self._polls.only):
+            sample = self._poll() if or_poll else None
         else:
-            self._looks.heard()
+            self._polls.heard()
             self._slowing.reset()
         if sample is None:
             self._silent += 1
@@ -475,42 +475,42 @@ class StopSequence:
         self._held.append(sample.torque_nm)
         return sample
 
-    # -- looks beside the cycle --------------------------------------------------------------------------------
+    # -- polls beside the cycle --------------------------------------------------------------------------------
 
-    def _look(self) -> Sample | None:
+    def _poll(self) -> Sample | None:
         try:
-            sample = self._looks.missed()
+            sample = self._polls.missed()
         except BaseException as error:  # whatever it is, the stop goes on
             self._note(error)
             return None
-        if sample is not None and self._looks.answered == 1:
+        if sample is not None and self._polls.answered == 1:
             self._held.clear()             # what was held before the gap tells nothing of now
             self._trouble.append("the cycle brings no feedback: the drive was asked one question at a time instead")
         return sample
 
     def _contradicted(self) -> bool:
-        """Does a look show another drive than the cycle's feedback does? Then only looks are believed from now on."""
+        """Does a poll show another drive than the cycle's feedback does? Then only polls are believed from now on."""
         told = self._loop.last
         try:
-            sample = self._looks.ask()
+            sample = self._polls.ask()
         except BaseException as error:  # whatever it is, the stop goes on
             self._note(error)
             return False
         if sample is None or told is None:
             return False
         rest = self._at_rest_rad_s
-        self._looks.only = abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest
-        if self._looks.only:
+        self._polls.only = abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest
+        if self._polls.only:
             self._held.clear()
             self._trouble.append(
                 f"the cycle's feedback tells of {told.speed_rad_s:.3f} rad/s, and a look at the drive of"
                 f" {sample.speed_rad_s:.3f} rad/s: the cycle's is not believed any more"
             )
-        return self._looks.only
+        return self._polls.only
 
     def _gets_slower(self, sample: Sample) -> bool:
-        """A shaft that looks alone show, and that goes on turning, is left to the drive's own watchdog, if armed."""
-        if not (self._watched and self._looks.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
+        """A shaft that polls alone show, and that goes on turning, is left to the drive's own watchdog, if armed."""
+        if not (self._watched and self._polls.standing) or self._slowing.see(sample.time_s, sample.speed_rad_s):
             return True
         self._trouble.append(
             f"the shaft goes on turning at {sample.speed_rad_s:.3f} rad/s without feedback of the cycle: the drive is"

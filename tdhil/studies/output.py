@@ -328,11 +328,11 @@ def _html(chapters: Sequence[Chapter], folder: Path) -> str:
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["shown"] = shown
     template = environment.from_string(_TEMPLATE)
-    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, beside=_beside(folder),
+    return template.render(chapters=chapters, tally=tally(chapters), marks=MARKS, relative=_relative(folder),
                            style=Markup(STYLE))
 
 
-def _beside(folder: Path):  # type: ignore[no-untyped-def]
+def _relative(folder: Path):  # type: ignore[no-untyped-def]
     return lambda path: path.relative_to(folder).as_posix()
 
 
@@ -372,7 +372,7 @@ figures 19 to 23 through the drive's own bus protocol.</p>
 {% for c in chapters %}
 <h2 id="{{ c.name }}">{{ c.name }}{% if c.outcome %}: {{ c.outcome.title }}{% endif %}</h2>
 {% if not c.outcome %}<p class="red">No result: {{ c.failure }}</p>{% else %}
-{% if c.written.picture %}<p><a href="{{ beside(c.written.vector) }}"><img src="{{ beside(c.written.picture) }}"
+{% if c.written.picture %}<p><a href="{{ relative(c.written.vector) }}"><img src="{{ relative(c.written.picture) }}"
 alt="{{ c.outcome.title }}"></a></p>{% endif %}
 <div class="wide"><table class="claims"><tr><th></th><th>statement</th><th>published</th><th>ours</th></tr>
 {% for s in c.outcome.statements %}<tr><td class="{{ marks[s.holds][2] }}" title="{{ marks[s.holds][1] }}">\
@@ -382,7 +382,7 @@ alt="{{ c.outcome.title }}"></a></p>{% endif %}
 <tr>{% for column in t.columns %}<th>{{ column }}</th>{% endfor %}</tr>
 {% for row in t.rows %}<tr>{% for cell in row %}<td>{{ cell|shown }}</td>{% endfor %}</tr>
 {% endfor %}</table></div>{% endfor %}
-<p>Files: {% for path in c.written.files %}<a href="{{ beside(path) }}">{{ path.name }}</a> {% endfor %}</p>
+<p>Files: {% for path in c.written.files %}<a href="{{ relative(path) }}">{{ path.name }}</a> {% endfor %}</p>
 {% endif %}{% endfor %}
 <p>✓ holds · ✗ does not hold · ~ open: the paper contradicts itself or leaves out what decides</p>
 </body></html>

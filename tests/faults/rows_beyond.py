@@ -63,8 +63,8 @@ SECOND_MASTER: dict[int, Row] = {
              "tests/run/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
             "kept, and the run keeps within them"),
     65: Row("a killed host leaves its limits in the drive", "named by doctor, given back by the next run", "-",
-            ("tests/drivers/test_left_behind.py::test_the_next_run_gives_back_what_a_killed_one_left",
-             "tests/drivers/test_left_behind.py::test_each_is_written_down_before_it_is_changed",
+            ("tests/drivers/test_undo_journal.py::test_the_next_run_gives_back_what_a_killed_one_left",
+             "tests/drivers/test_undo_journal.py::test_each_is_written_down_before_it_is_changed",
              "tests/path/test_doctor.py::test_what_a_killed_run_left_in_a_drive_is_named"),
             "named, and given back before the next run looks at the drive's limits"),
 }
@@ -141,7 +141,7 @@ STAGES: dict[int, Row] = {
              "tests/run/test_stop_string.py::test_what_a_string_forbids",
              "tests/drivers/test_preflight.py::test_whether_a_quick_stop_holds_the_shaft")),
     80: Row("somebody else drives the shaft on against the quick stop", "the drive is fed no more: WD", "as its cause",
-            ("tests/run/test_stop_looks.py::"
+            ("tests/run/test_stop_polls.py::"
              "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
     81: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",

@@ -58,9 +58,9 @@ def test_json_says_the_same():
 
 def test_what_a_killed_run_left_in_a_drive_is_named(tmp_path):
     from drivers.drive import Identity
-    from drivers.left_behind import LeftBehind
+    from drivers.undo_journal import UndoJournal
 
-    book = LeftBehind(tmp_path, "node1")
+    book = UndoJournal(tmp_path, "node1")
     book.opened(Identity(0xFB, 0x1, 0, 0x77, "top drive", False))
     book.changing("6072h", b"\x64\x00", b"\x90\x01")
     done = tdhil("doctor", "--log", tmp_path / "run.mcap")

@@ -70,14 +70,14 @@ def test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on():
     program = """
 import threading
 import numpy as np
-from tdhil.run.background import Beside
+from tdhil.run.background import Background
 begun = threading.Event()
 def work():
     square = np.eye(200)
     begun.set()
     while True:
         square = square @ square
-Beside(work); Beside(work)
+Background(work); Background(work)
 begun.wait()
 print("left alone")
 """

@@ -68,10 +68,10 @@ class Follower:
         limits: MachineLimits,
         mode: Mode,
         control: MeanSpeedControl | None,
-        beside: Callable[[float], float] | None = None,
+        dither_rad_s: Callable[[float], float] | None = None,
     ) -> None:
         self._loop = loop
-        self._beside = beside
+        self._dither_rad_s = dither_rad_s
         self._limits = limits
         self._mode = mode
         self._control = control
@@ -102,7 +102,7 @@ class Follower:
             torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
         torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
-        setpoint = speed_rad_s + (0.0 if self._beside is None else self._beside(self.time_s))
+        setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))
         wanted = max(lowest, min(limits.speed_max_rad_s, setpoint))
         self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
@@ -128,8 +128,8 @@ def run_acquire(
     coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
     """
     begun_s = loop.now_s
-    beside = _beside(plan, speed_resolution_rad_s, begun_s)
-    course = _Course(loop, plan, Follower(loop, limits, Mode(plan.mode), control, beside), announce)
+    dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
+    course = _Course(loop, plan, Follower(loop, limits, Mode(plan.mode), control, dither_rad_s), announce)
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
@@ -143,7 +143,7 @@ def run_acquire(
     return AcquireResult(course.excitation)
 
 
-def _beside(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
+def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
     peak_rad_s = dither_peak(resolution_rad_s, plan.limits.width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
     if peak_rad_s == 0.0:
         return None

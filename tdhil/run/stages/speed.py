@@ -17,7 +17,7 @@ from tdhil.recording import FloatArray, Level, Ramp
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
-from tdhil.run.speed_check import Onlooker, SpeedLook
+from tdhil.run.speed_check import Onlooker, SpeedUnitCheck
 from tdhil.run.stages.steady import SteadyLevel, calm_string, hold_damped, steady_level, trace, wait_until_steady
 
 LEVEL_S = 6.0
@@ -85,10 +85,10 @@ def run_speed(
     rate = (limits.speed_max_rad_s - limits.speed_min_rad_s) / FIRST_RAMP_S
     start = loop.switch_mode(Command(Mode.SPEED, 0.0, 0.0)) if _in_torque(loop) else None
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
-    look = SpeedLook(loop, limits, assumptions, speed_resolution_rad_s, onlooker)
-    look.ramp(speed_now, low_rad_s, rate)
-    low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, look.level).level
-    look.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
+    unit_check = SpeedUnitCheck(loop, limits, assumptions, speed_resolution_rad_s, onlooker)
+    unit_check.ramp(speed_now, low_rad_s, rate)
+    low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, unit_check.level).level
+    unit_check.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
     good_enough = STRING_ERROR if limits.load == "string" else GOOD_ENOUGH
     for _ in range(TRIES):
         ramped = _ramp(loop, low_rad_s, high_rad_s, rate)

@@ -98,7 +98,7 @@ CALM_SHARE = 0.02
 CALM_S = 6.0
 """For so long: half a swing of a string that swings in 12 s."""
 
-LOOK_S = 12.0
+WINDOW_S = 12.0
 NO_CALMER = 0.75
 """Of what it was over the time before: a swing that is still above this share gets no smaller."""
 
@@ -180,7 +180,7 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
     damper = SwingDamper(limits.torque_nm, limits.speed_max_rad_s, target_rad_s, loop.period_s)
     samples: list[Sample] = []
     setpoints: list[float] = []
-    calm, look = loop.cycles(CALM_S), loop.cycles(LOOK_S)
+    calm, window = loop.cycles(CALM_S), loop.cycles(WINDOW_S)
     for _ in range(round(MOST_CALMING_S / BLOCK_S)):
         seen, asked = hold_damped(loop, damper, BLOCK_S)
         samples += seen
@@ -191,23 +191,23 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
         there = abs(_mean_speed(samples[-calm:]) - target_rad_s) <= tolerance_rad_s
         if there and last.torque_nm <= CALM_SHARE * limits.torque_nm:
             return Calmed(samples, setpoints, last, damper)
-        if len(samples) < 2 * look:
+        if len(samples) < 2 * window:
             continue
-        now = swing_of(samples[-look:], loop.period_s)
-        before = swing_of(samples[-2 * look : -look], loop.period_s)
+        now = swing_of(samples[-window:], loop.period_s)
+        before = swing_of(samples[-2 * window : -window], loop.period_s)
         if now.torque_nm >= NO_CALMER * before.torque_nm:
-            left = swing_of(samples[-2 * look :], loop.period_s)
+            left = swing_of(samples[-2 * window :], loop.period_s)
             if left.regular >= STICK_SLIP_REGULAR and left.speed_rad_s >= STICK_SLIP_SPEED_SHARE * target_rad_s:
                 raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
-            if abs(_mean_speed(samples[-look:]) - target_rad_s) <= 2.0 * tolerance_rad_s:
+            if abs(_mean_speed(samples[-window:]) - target_rad_s) <= 2.0 * tolerance_rad_s:
                 loop.log.event(
                     loop.now_s, "string",
                     f"the string gets no calmer at {target_rad_s:.2f} rad/s: its torque goes ±{left.torque_nm:.0f} N·m",
                 )
                 return Calmed(samples, setpoints, left, damper)
-    left = swing_of(samples[-2 * look :], loop.period_s)
-    mean = _mean_speed(samples[-look:])
-    torque, helps = loop.guard.torque_told(float(trace(samples[-look:]).torque_nm.mean()), samples[-1].limit_active)
+    left = swing_of(samples[-2 * window :], loop.period_s)
+    mean = _mean_speed(samples[-window:])
+    torque, helps = loop.guard.torque_told(float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active)
     raise LimitHit(
         f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
         f" rad/s, torque swinging by ±{left.torque_nm:.0f} N·m"

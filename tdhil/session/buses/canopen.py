@@ -72,7 +72,7 @@ class CanopenKind(BusKind):
              tap: FrameTap, trace: Path | None) -> Iterator[Drive]:
         """The bus, shut down afterwards, and the drive on it."""
         from drivers.canopen import Cia402Drive
-        from drivers.left_behind import LeftBehind
+        from drivers.undo_journal import UndoJournal
 
         profile, node = profile_of(connection), node_of(options, connection)
         with open_can(plan, connection, node, trace) as channel:
@@ -84,7 +84,7 @@ class CanopenKind(BusKind):
                 rate_hz=options.rate_hz,
                 rated_torque_nm=rated_torque_nm(plan, profile, data),
                 tap=tap,
-                left=None if plan.embedded else LeftBehind(Path(options.log).parent, f"node{node}"),
+                journal=None if plan.embedded else UndoJournal(Path(options.log).parent, f"node{node}"),
             )
 
     @contextmanager

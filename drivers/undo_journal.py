@@ -23,7 +23,7 @@ PREFIX, SUFFIX = "drive-left-", ".json"
 
 
 @dataclass(frozen=True)
-class Left:
+class Change:
     """One setting: ``where`` as people call it, what stood there, and what a run put in its place."""
 
     where: str
@@ -37,7 +37,7 @@ class Left:
         return f"{self.where} was left at {now}, and was {then} before"
 
 
-class LeftBehind:
+class UndoJournal:
     """The file of one drive in ``folder``; `opened` says whose."""
 
     def __init__(self, folder: Path, address: str) -> None:
@@ -45,9 +45,9 @@ class LeftBehind:
         self._address = address
         self._path: Path | None = None
         self._drive = ""
-        self._entries: dict[str, Left] = {}
+        self._entries: dict[str, Change] = {}
 
-    def opened(self, identity: Identity) -> tuple[Left, ...]:
+    def opened(self, identity: Identity) -> tuple[Change, ...]:
         """What an earlier run left in this drive. Raises PreflightRefused for a file that can't be understood."""
         if identity.simulated:
             return ()
@@ -62,7 +62,7 @@ class LeftBehind:
         """A setting is about to be changed; what first stood there stays what stood there."""
         if self._path is not None:
             known = self._entries.get(where)
-            self._entries[where] = Left(where, known.before if known is not None else before, after)
+            self._entries[where] = Change(where, known.before if known is not None else before, after)
             self._save()
 
     def given_back(self, where: str) -> None:
@@ -97,12 +97,12 @@ class LeftBehind:
             ) from error
 
 
-def read(path: Path) -> tuple[str, tuple[Left, ...]]:
+def read(path: Path) -> tuple[str, tuple[Change, ...]]:
     """The drive as people know it, and what was left in it. Raises PreflightRefused for a file that isn't one."""
     try:
         document: Any = json.loads(path.read_text(encoding="utf-8"))
         entries = tuple(
-            Left(str(one["where"]), bytes.fromhex(one["before"]), bytes.fromhex(one["after"]))
+            Change(str(one["where"]), bytes.fromhex(one["before"]), bytes.fromhex(one["after"]))
             for one in document["settings"]
         )
         return str(document["drive"]), entries

@@ -7,7 +7,7 @@ import pytest
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost
 from tdhil.run.settings import ControlAssumptions
-from tdhil.run.stop import AFTER_S, EVERY_S, REST_AFTER_S, SILENT_S, SLOWING_S, UNMOVED_S, Looks, Slowing
+from tdhil.run.stop import AFTER_S, EVERY_S, REST_AFTER_S, SILENT_S, SLOWING_S, UNMOVED_S, FeedbackPolls, Slowing
 from tests.run.fake_drive import LIMITS, PERIOD_S, FakeDrive
 
 SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
@@ -165,7 +165,7 @@ def test_feedback_that_goes_after_rest_was_seen(world):
 def test_looks_are_due_by_time(period_s):
     drive = LookedAt()
     drive.mode = Mode.SPEED
-    looks = Looks(drive, period_s)
+    looks = FeedbackPolls(drive, period_s)
     for _ in range(round(2.0 / period_s)):
         looks.missed()
     assert drive.looks <= (2.0 - AFTER_S) / max(EVERY_S, period_s) + 2
@@ -290,7 +290,7 @@ def test_slowing():
 
 
 def test_a_drive_that_can_not_be_looked_at_is_not():
-    looks = Looks(FakeDrive(), PERIOD_S)
+    looks = FeedbackPolls(FakeDrive(), PERIOD_S)
     assert looks.ask() is None
     assert all(looks.missed() is None for _ in range(round(3.0 / PERIOD_S)))
     assert (looks.answered, looks.standing) == (0, True)
