@@ -2,6 +2,7 @@
 
 Built on PyYAML's event stream and on nothing above it: its constructors follow YAML 1.1, let later keys
 overwrite earlier ones, and resolve tags and aliases, none of which a data file here needs.
+Our own, since loaders stop at the first mistake and hand on objects without the line of each key.
 """
 
 import math

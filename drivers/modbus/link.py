@@ -1,4 +1,8 @@
-"""What a Modbus line must do for the driver: one request, one reply, and the two moments that bound it."""
+"""What a Modbus line must do for the driver: one request, one reply, and the two moments that bound it.
+
+Frames are pymodbus's, the transaction is our own: its client connects anew by itself, and can't tell a foreign reply, a
+wrong CRC and silence apart (docs/decisions/0008).
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,9 @@
 
 UTF-8, UTF-16 and UTF-32 are known by their byte order mark; without one it is UTF-8 if the beginning decodes as that,
 else Windows-1252, which holds Latin-1's letters. Line ends may be LF, CR LF or CR.
+
+Our own around `csv`, which splits the odd line: readers of tables (numpy's, pandas') stop at the first bad row, or pass
+over it unseen. Here each is counted by its cause, with its line.
 """
 
 import codecs
