@@ -1,0 +1,42 @@
+"""What J is for: drill string, soft-torque controllers, their reflection, damping and critical speeds; pure numbers."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.soft_torque.drill_string import (
+        BitFriction as BitFriction, Bottom as Bottom, DrillString as DrillString, Line as Line, Section as Section,
+        StringFile as StringFile, load_string as load_string, string_of as string_of,
+    )
+    from tdhil.soft_torque.controller import (
+        ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins, Mode as Mode,
+        SpeedController as SpeedController, TopDrive as TopDrive, control_law as control_law, impedance as impedance,
+        inner_lags as inner_lags, margins as margins, reflection as reflection, reflection_at as reflection_at,
+        softest_allowed as softest_allowed, stiff_controller as stiff_controller, tuned_controller as tuned_controller,
+    )
+    from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
+    from tdhil.soft_torque.simulation import (
+        Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search, Trace as Trace,
+        critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
+        onset_speeds as onset_speeds, simulate as simulate,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "drill_string": (
+                "BitFriction", "Bottom", "DrillString", "Line", "Section", "StringFile", "load_string", "string_of",
+            ),
+            "controller": (
+                "ClosedSystem", "DERIVATIVE_FILTER_S", "Margins", "Mode", "SpeedController", "TopDrive", "control_law",
+                "impedance", "inner_lags", "margins", "reflection", "reflection_at", "softest_allowed",
+                "stiff_controller", "tuned_controller",
+            ),
+            "roots": ("RootsLost", "count_in", "roots_in"),
+            "simulation": (
+                "Begin", "CriticalSpeeds", "Grid", "RPM", "Search", "Trace", "critical_speeds", "grid_of",
+                "lowest_turning", "onset_speeds", "simulate",
+            ),
+        },
+    )

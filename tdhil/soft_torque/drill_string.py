@@ -1,0 +1,290 @@
+r"""A drill string as its file says it, and as the top drive feels it: exact transmission lines, section by section.
+
+::
+
+    one metre of pipe    m = ρ I_p  kg·m,   y = 1/(G I_p)  rad/(N·m²),   d  N·m·s/rad per m    I_p = π (OD⁴ − ID⁴)/32
+
+    −∂τ/∂x = m ∂ω/∂t + d ω        −∂ω/∂x = y ∂τ/∂t          x downwards; τ N·m is what is handed down
+
+**Derivation.** In Laplace's s both together give ω'' = γ² ω with γ² = (m s + d) y s: two waves e^∓γx, in which τ = ±Z ω
+with Z = (m s + d)/γ. Without drag Z is real, the characteristic impedance ζ = √(m/y) = I_p √(Gρ), and the waves run
+at c = 1/√(m y) = √(G/ρ). Fitted to both ends of a section of length L they give
+
+    ⎡ω⎤       ⎡ cosh γL      y s S ⎤ ⎡ω⎤
+    ⎢ ⎥     = ⎢                    ⎥ ⎢ ⎥          S = sinh(γL)/γ
+    ⎣τ⎦ top   ⎣ (m s + d) S  cosh γL⎦ ⎣τ⎦ bottom
+
+whose determinant is 1. cosh and S are even in γ, so that each entry is a power series in s: there are no branch cuts
+and no poles anywhere, which finding roots rests on. Sections one below another are products of their matrices. At the
+bottom τ = (s J_L + B_b) ω while it turns, ω = 0 while it is stuck; hence (ω, τ) at the top up to one common factor, and
+
+    Z_s(s) = τ/ω        k = 1/Σ y L        T = Σ L/c        the echo of a change at the top comes back after 2T
+
+**Tool joints** are short against every wave that matters: over the length of a joint of pipe the inertia per metre and
+the compliance per metre are means, weighted by the share of length. (Waves: any text on lines, as S. L. Chen and
+M. Géradin (1995) for strings.)
+
+Everything here is at the shaft that the string hangs on, the main shaft.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, pi, sqrt
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from profiles import DataModel, Finding, load_model
+
+Complex = NDArray[np.complex128]
+
+STEEL_SHEAR_MODULUS_PA = 79.3e9
+STEEL_DENSITY_KG_M3 = 7850.0
+MUD_DRAG_NM_S_RAD_M = 0.005
+"""Viscous drag of mud on 5 inch pipe, of the order that simulations use; nobody has measured yours."""
+
+_Length = Annotated[float, Field(gt=0.0, le=20_000.0)]
+_Diameter = Annotated[float, Field(gt=0.0, le=2.0)]
+_NotNegative = Annotated[float, Field(ge=0.0, le=1e9)]
+_PositiveNumber = Annotated[float, Field(gt=0.0, le=1e12)]
+
+
+class ToolJoints(DataModel):
+    """The thick ends of the joints of pipe, as a mean over the section."""
+
+    length_share: float = Field(gt=0.0, lt=1.0, description="share of the section's length that is tool joint")
+    outer_diameter_m: _Diameter
+    inner_diameter_m: float = Field(ge=0.0, le=2.0)
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A bore wider than the joint."""
+        return _bore(values)
+
+
+class Section(DataModel):
+    """One uniform stretch of pipe or collar."""
+
+    length_m: _Length | None = Field(default=None, description="m; or stiffness_nm_rad")
+    stiffness_nm_rad: _PositiveNumber | None = Field(
+        default=None, description="N·m/rad of the whole section, as identified, where its length isn't known"
+    )
+    outer_diameter_m: _Diameter
+    inner_diameter_m: float = Field(ge=0.0, le=2.0)
+    shear_modulus_pa: Annotated[float, Field(ge=1e9, le=1e12)] = STEEL_SHEAR_MODULUS_PA
+    density_kg_m3: Annotated[float, Field(ge=500.0, le=3e4)] = STEEL_DENSITY_KG_M3
+    drag_nm_s_rad_m: _NotNegative = MUD_DRAG_NM_S_RAD_M
+    tool_joints: ToolJoints | None = None
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """A bore wider than the pipe; a length said twice, or not at all."""
+        length, stiffness = values.get("length_m", ...), values.get("stiffness_nm_rad", ...)
+        found = _bore(values)
+        if length is None and stiffness is None:
+            found.append(("", "needs length_m, or the stiffness_nm_rad that was identified"))
+        if isinstance(length, float) and isinstance(stiffness, float):
+            found.append(("stiffness_nm_rad", "and length_m say the same thing; keep one"))
+        return found
+
+
+class Bottom(DataModel):
+    """What turns at the bottom: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
+
+    The words are plant.yaml's. Without ``coulomb_nm`` no bit is stated, and nothing is said of critical speeds.
+    """
+
+    inertia_kg_m2: _NotNegative = Field(default=0.0, description="kg·m²; collars and bit as one")
+    sections: tuple[Section, ...] = Field(default=(), description="bottom-hole assembly, from the top down")
+    viscous_nm_s_rad: _NotNegative = Field(default=0.0, description="N·m·s/rad, of the bit")
+    friction: Literal["coulomb", "stribeck"] = "coulomb"
+    coulomb_nm: _NotNegative | None = Field(default=None, description="N·m, of a bit that turns fast")
+    static_nm: _NotNegative | None = Field(default=None, description="N·m, at which it breaks away")
+    stribeck_speed_rad_s: Annotated[float, Field(gt=0.0, le=1e4)] | None = Field(
+        default=None, description="rad/s, over which it falls from one to the other (Gaussian)"
+    )
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """Nothing that turns; half a friction law; one that rises."""
+        found: list[Finding] = []
+        if values.get("inertia_kg_m2") == 0.0 and values.get("sections", ...) == ():
+            found.append(("", "needs inertia_kg_m2, or sections of a bottom-hole assembly"))
+        coulomb, static = values.get("coulomb_nm", ...), values.get("static_nm", ...)
+        speed, law = values.get("stribeck_speed_rad_s", ...), values.get("friction", ...)
+        if law == "stribeck":
+            wanted = (("coulomb_nm", coulomb), ("static_nm", static), ("stribeck_speed_rad_s", speed))
+            found += [(name, "friction: stribeck needs it") for name, value in wanted if value is None]
+        elif law == "coulomb":
+            found += [(name, "belongs to friction: stribeck") for name, value in
+                      (("static_nm", static), ("stribeck_speed_rad_s", speed)) if isinstance(value, float)]
+        if isinstance(coulomb, float) and isinstance(static, float) and static < coulomb:
+            found.append(("static_nm", f"must not be below coulomb_nm, which is {coulomb:g}"))
+        return found
+
+
+class StringFile(DataModel):
+    """string.yaml."""
+
+    name: str | None = Field(default=None, min_length=1, max_length=200)
+    sections: Annotated[tuple[Section, ...], Field(min_length=1)]
+    bottom: Bottom
+
+
+def _bore(values: Mapping[str, Any]) -> list[Finding]:
+    outer, inner = values.get("outer_diameter_m"), values.get("inner_diameter_m")
+    if isinstance(outer, float) and isinstance(inner, float) and inner >= outer:
+        return [("inner_diameter_m", f"must be less than outer_diameter_m, which is {outer:g}")]
+    return []
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class Line:
+    """A uniform stretch as the waves see it."""
+
+    length_m: float
+    inertia_kg_m: float
+    """m, per metre: kg·m²/m."""
+    compliance_rad_nm_m: float
+    """y, per metre: rad/(N·m) per m."""
+    drag_nm_s_rad_m: float
+
+    @property
+    def impedance_nm_s_rad(self) -> float:
+        """ζ, without drag."""
+        return sqrt(self.inertia_kg_m / self.compliance_rad_nm_m)
+
+    @property
+    def speed_m_s(self) -> float:
+        """C, of the waves."""
+        return 1.0 / sqrt(self.inertia_kg_m * self.compliance_rad_nm_m)
+
+    @property
+    def delay_s(self) -> float:
+        """From end to end."""
+        return self.length_m / self.speed_m_s
+
+
+@dataclass(frozen=True)
+class BitFriction:
+    """T_f = sgn ω (F_c + (F_s − F_c) e^−(ω/ω_s)²) while it turns, up to F_s while it sticks."""
+
+    coulomb_nm: float
+    static_nm: float
+    stribeck_speed_rad_s: float
+
+    def describe(self) -> str:
+        """The bit in half a line, for every figure that hangs on it."""
+        if self.static_nm == self.coulomb_nm:
+            return f"Coulomb {self.coulomb_nm:g} N·m"
+        return (f"static {self.static_nm:g} N·m, Coulomb {self.coulomb_nm:g} N·m, "
+                f"Stribeck speed {self.stribeck_speed_rad_s:g} rad/s")
+
+
+@dataclass(frozen=True)
+class DrillString:
+    """Lines from the top down, and what turns at the lower end of the last."""
+
+    lines: tuple[Line, ...]
+    bottom_inertia_kg_m2: float
+    bottom_viscous_nm_s_rad: float = 0.0
+    bit: BitFriction | None = None
+    name: str | None = None
+
+    @property
+    def impedance_nm_s_rad(self) -> float:
+        """ζ that the top drive sees until the first echo: the topmost line's."""
+        return self.lines[0].impedance_nm_s_rad
+
+    @property
+    def stiffness_nm_rad(self) -> float:
+        """Of the whole as a spring, k, bottom-hole assembly included."""
+        return 1.0 / sum(line.length_m * line.compliance_rad_nm_m for line in self.lines)
+
+    @property
+    def inertia_kg_m2(self) -> float:
+        """Of everything below the top drive, as if it were stiff."""
+        return self.bottom_inertia_kg_m2 + sum(line.length_m * line.inertia_kg_m for line in self.lines)
+
+    @property
+    def echo_s(self) -> float:
+        """2T: the echo of the bottom comes back after it."""
+        return 2.0 * sum(line.delay_s for line in self.lines)
+
+    def at_top(self, s: Complex, *, stuck: bool = False) -> tuple[Complex, Complex]:
+        """(speed, torque) at the top for one motion of the bottom, up to a common factor; analytic in all of s.
+
+        Turning: the bottom's speed is 1, under its inertia and viscous friction. ``stuck``: its torque is 1.
+        """
+        s = np.asarray(s, dtype=np.complex128)
+        one, none = np.ones_like(s), np.zeros_like(s)
+        if stuck:
+            speed, torque = none, one
+        else:
+            speed, torque = one, s * self.bottom_inertia_kg_m2 + self.bottom_viscous_nm_s_rad
+        for line in reversed(self.lines):
+            series, shunt = line.compliance_rad_nm_m * s, line.inertia_kg_m * s + line.drag_nm_s_rad_m
+            cosh, sinh_over = _cosh_and_sinh_over(series * shunt, line.length_m)
+            speed, torque = cosh * speed + series * sinh_over * torque, shunt * sinh_over * speed + cosh * torque
+        return speed, torque
+
+    def impedance_at(self, s: Complex, *, stuck: bool = False) -> Complex:
+        """Z_s = τ/ω at the top, N·m·s/rad."""
+        speed, torque = self.at_top(s, stuck=stuck)
+        return torque / speed
+
+
+def _cosh_and_sinh_over(square: Complex, length: float) -> tuple[Complex, Complex]:
+    """Cosh γL and sinh(γL)/γ, from γ²."""
+    root = np.sqrt(square)
+    product = root * length
+    small = np.abs(product) < 1e-4
+    safe = np.where(small, 1.0, root)
+    over = np.where(small, length * (1.0 + square * length**2 / 6.0), np.sinh(product) / safe)
+    return np.cosh(product), over
+
+
+def line_of(section: Section) -> Line:
+    """The section as the waves see it; a length that isn't stated is k's."""
+    inertia, compliance = _per_metre(section, section.outer_diameter_m, section.inner_diameter_m)
+    joints = section.tool_joints
+    if joints is not None:
+        heavy, stiff = _per_metre(section, joints.outer_diameter_m, joints.inner_diameter_m)
+        share = joints.length_share
+        inertia = (1.0 - share) * inertia + share * heavy
+        compliance = (1.0 - share) * compliance + share * stiff
+    if section.length_m is not None:
+        length = section.length_m
+    else:
+        assert section.stiffness_nm_rad is not None
+        length = 1.0 / (section.stiffness_nm_rad * compliance)
+    return Line(length, inertia, compliance, section.drag_nm_s_rad_m)
+
+
+def _per_metre(section: Section, outer_m: float, inner_m: float) -> tuple[float, float]:
+    polar = pi * (outer_m**4 - inner_m**4) / 32.0
+    return section.density_kg_m3 * polar, 1.0 / (section.shear_modulus_pa * polar)
+
+
+def string_of(file: StringFile) -> DrillString:
+    """What the file says, from the top down."""
+    bottom = file.bottom
+    bit = None
+    if bottom.coulomb_nm is not None:
+        static = bottom.static_nm if bottom.static_nm is not None else bottom.coulomb_nm
+        speed = bottom.stribeck_speed_rad_s if bottom.stribeck_speed_rad_s is not None else inf
+        bit = BitFriction(bottom.coulomb_nm, static, speed)
+    lines = tuple(line_of(section) for section in (*file.sections, *bottom.sections))
+    return DrillString(lines, bottom.inertia_kg_m2, bottom.viscous_nm_s_rad, bit, file.name)
+
+
+def load_string(path: Path) -> DrillString:
+    """Reads string.yaml; `DataFileError` with every problem and its line."""
+    return string_of(load_model(path, StringFile))

@@ -1,0 +1,181 @@
+"""The string in time: echoes, reflection, modes and damping against theory and the chain of lumps; critical speeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from tdhil.soft_torque import (
+    RPM,
+    Begin,
+    BitFriction,
+    ClosedSystem,
+    DrillString,
+    Search,
+    SpeedController,
+    TopDrive,
+    critical_speeds,
+    grid_of,
+    lowest_turning,
+    reflection_at,
+    simulate,
+)
+from tdhil.soft_torque.simulation import _Top
+from tests.soft_torque.cases import DRIVE, HALF, SOFT_025, SOFT_1, STIFF, STRING, TABLE, Pipe, lumped_chain, string_with
+
+SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
+"""A bit without dry friction: everything is linear."""
+
+
+def turning(string, law, *, drive=DRIVE, speed=10.0, change=0.5, seconds=40.0, keep=0.0, tick=0.006):
+    """A set speed that jumps by `change` from steady rotation."""
+    start = np.array([[speed]])
+    return simulate(string, [(drive, law)], Begin("turning", start), start + change, 1e9, seconds, keep, tick)
+
+
+def test_echoes_come_back_after_twice_the_way():
+    """The top's torque after a jump of the set speed is that of a resistance ζ until the echo, to 0.005 s."""
+    string = string_with(**SMOOTH, viscous_nm_s_rad=0.0, drag=0.0)
+    stiff = SpeedController(3e6, 3e6)
+    quick = TopDrive(100.0, 0.0, 0.0, (1e-4,))
+    trace = turning(string, stiff, drive=quick, seconds=6.0, tick=0.002)
+    torque = trace.top_torque_nm[:, 0, 0]
+    steady = 0.5 * string.impedance_nm_s_rad
+    plateau = (trace.time_s > 0.2) & (trace.time_s < string.echo_s - 0.01)
+    assert torque[plateau] == pytest.approx(np.full(plateau.sum(), steady), abs=0.005 * steady)
+    for echo in (1, 2):      # a heavy bottom reverses the wave, a stiff top does once more
+        jump = np.abs(np.diff(torque))
+        near = np.abs(trace.time_s[1:] - echo * string.echo_s) < 0.1
+        assert trace.time_s[1:][near][np.argmax(jump[near])] == pytest.approx(echo * string.echo_s, abs=0.005)
+
+
+@pytest.mark.parametrize("hertz", [0.1299, 0.567])
+def test_what_the_top_sends_back_is_what_theory_says(hertz):
+    """A wave sent up to it, of one tone: the amplitude that comes down again, to 0.005."""
+    drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
+    grid = grid_of(string_with(drag=0.0))
+    top = _Top([(drive, law) for law in TABLE.values()], grid, 1)
+    time_s = grid.tick_s * (np.arange(round(24.0 / hertz / grid.tick_s)) + 0.5)
+    sent = np.empty((time_s.size, len(TABLE)))
+    still = np.zeros((len(TABLE), 1))
+    for k, wave in enumerate(np.cos(2 * np.pi * hertz * time_s)):
+        sent[k], _ = top.step(np.full(len(TABLE), wave), still)
+    late = time_s > time_s[-1] - 8.0 / hertz
+    basis = np.exp(-2j * np.pi * hertz * time_s[late])
+    amplitudes = abs(2.0 * np.mean(sent[late] * basis[:, None], axis=0))
+    expected = [reflection_at(drive, law, STRING, np.array([hertz]))[0] for law in TABLE.values()]
+    assert amplitudes == pytest.approx(expected, abs=0.005)
+
+
+def poles_of(samples, step_s, order):
+    """Of a sum of decaying exponentials: the matrix pencil."""
+    half = len(samples) // 2
+    data = np.lib.stride_tricks.sliding_window_view(samples, half)
+    _, _, right = np.linalg.svd(data, full_matrices=False)
+    right = right[:order].T
+    values = np.linalg.eigvals(np.linalg.pinv(right[:-1]) @ right[1:])
+    return np.log(values.astype(complex)) / step_s
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_modes_in_time_are_the_poles(name):
+    """Frequency within 1 %, damping within 0.005 (0.012 where it is 0.4 and more)."""
+    string = string_with(**SMOOTH)
+    drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
+    trace = turning(string, TABLE[name], drive=drive, seconds=45.0, keep=0.1)
+    late = trace.time_s > 5.0
+    step_s = float(np.mean(np.diff(trace.time_s)))
+    bit = trace.bit_rad_s[late, 0, 0] - 10.5
+    found = poles_of(bit, step_s, 14)
+    for mode in ClosedSystem(string, drive, TABLE[name]).modes(0.7):
+        if mode.damping > 0.75:
+            continue      # gone before the window begins
+        seen = found[np.argmin(abs(found - mode.pole_rad_s))]
+        assert abs(seen) / (2 * np.pi) == pytest.approx(mode.frequency_hz, rel=0.01)
+        assert -seen.real / abs(seen) == pytest.approx(mode.damping, abs=0.012 if mode.damping > 0.4 else 0.005)
+
+
+@pytest.mark.parametrize("law", [STIFF, SOFT_025, HALF], ids=["stiff", "soft", "half"])
+def test_sections_in_time_against_the_chain(law):
+    """A jump of the set speed, through pipe, heavy pipe and collars, to the bit."""
+    from tdhil.soft_torque import Bottom, Section, StringFile, string_of
+
+    sections = tuple(Section(length_m=length, outer_diameter_m=outer, inner_diameter_m=inner)
+                     for length, outer, inner in ((2000.0, 0.127, 0.1086), (300.0, 0.127, 0.0762)))
+    collars = Section(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
+    string = string_of(StringFile(sections=sections, bottom=Bottom(
+        sections=(collars,), viscous_nm_s_rad=30.0, coulomb_nm=0.0)))
+    drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
+    start = np.zeros((1, 1))
+    trace = simulate(string, [(drive, law)], Begin("rest", start), start + 1.0, 0.2, 30.0, 0.05)
+    pipes = [Pipe(2000.0, 0.127, 0.1086, lumps=80), Pipe(300.0, 0.127, 0.0762, lumps=12),
+             Pipe(180.0, 0.203, 0.0714, lumps=12)]
+    a, b, n = lumped_chain(pipes, 0.0, 30.0, drive, law)
+    step_s = 0.01
+    whole = expm(np.block([[a, b[:, None]], [np.zeros((1, len(b) + 1))]]) * step_s)
+    state, expected = np.zeros(len(b) + 1), []
+    times = np.arange(1, 3001) * step_s
+    for time_s in times:
+        state[-1] = min(1.0, 0.2 * time_s)
+        state = whole @ state
+        expected.append(state[2 * n - 1])
+    seen = np.interp(times, trace.time_s, trace.bit_rad_s[:, 0, 0])
+    assert np.max(np.abs(seen - expected)) < 0.02
+
+
+def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says():
+    """One inertia on a short, stiff stretch under a ramp: breakaway at F_s, then the solution of the equation."""
+    from scipy.integrate import solve_ivp
+
+    bit = BitFriction(2500.0, 5000.0, 2.5)
+    line = string_with(length_m=30.0, drag=0.0).lines[0]
+    string = DrillString((line,), 374.0, 20.0, bit)
+    firm = SpeedController(4e5, 4e6)
+    drive = TopDrive(1500.0, 0.0, 0.0, (1e-3,))
+    start = np.zeros((1, 1))
+    trace = simulate(string, [(drive, firm)], Begin("rest", start), start + 3.0, 0.1, 12.0, 0.01, 0.002)
+    stiffness = string.stiffness_nm_rad
+    # the top follows the ramp: angle 0.05 t²; stuck until k·angle = F_s
+    away_s = np.sqrt(5000.0 / stiffness / 0.05)
+
+    def law(t, y):
+        angle, speed = y
+        friction = 2500.0 + 2500.0 * np.exp(-((speed / 2.5) ** 2))
+        return [speed, (stiffness * (0.05 * t * t - angle) - 20.0 * speed - friction) / 374.0]
+
+    solution = solve_ivp(law, (away_s, 12.0), [0.0, 1e-9], rtol=1e-8, max_step=0.01,
+                         events=lambda t, y: y[1] if t > away_s + 0.1 else 1.0)
+    moved = trace.time_s[np.argmax(trace.bit_rad_s[:, 0, 0] > 0.0)]
+    assert moved == pytest.approx(away_s, abs=0.03)
+    swing = solution.t < (solution.t_events[0][0] if solution.t_events[0].size else 12.0)
+    highest = solution.y[1][swing].max()
+    assert trace.bit_rad_s[trace.time_s < solution.t[swing][-1] + 0.1, 0, 0].max() == pytest.approx(highest, rel=0.03)
+
+
+def test_cure_speeds_of_the_reference_case():
+    """Four controllers of the notes at once; the study has the rest."""
+    search = Search(lowest_rpm=24.0, highest_rpm=200.0, duration_s=80.0)
+    loops = [(DRIVE, law) for law in (STIFF, SOFT_1, SOFT_025, HALF)]
+    cures = lowest_turning(STRING, loops, "stuck", search)
+    assert cures == pytest.approx([183.0, 72.0, 57.0, 40.0], abs=2.0)
+
+
+def test_without_a_bit_there_are_no_critical_speeds():
+    with pytest.raises(ValueError, match="no bit"):
+        critical_speeds(DrillString(STRING.lines, 374.0), [(DRIVE, SOFT_1)])
+
+
+def test_a_stuck_bit_that_is_not_freed_stays_stuck():
+    """Below breakaway nothing turns; above every one that is tried, the answer is None."""
+    string = string_with(static_nm=1e6, coulomb_nm=1e6)
+    search = Search(lowest_rpm=10.0, highest_rpm=20.0, duration_s=20.0, calm_s=5.0, start_ramp_rpm_s=50.0)
+    assert lowest_turning(string, [(DRIVE, SOFT_025)], "rest", search) == [None]
+
+
+def test_steady_rotation_stays_steady():
+    """Begun in balance, with drag, drive friction and bit: nothing swings."""
+    start = np.array([[120.0 * RPM]])
+    trace = simulate(STRING, [(DRIVE, SOFT_025)], Begin("turning", start), start, 1.0, 20.0, 0.5)
+    assert np.ptp(trace.bit_rad_s) < 1e-6 * 120.0 * RPM
+    assert np.isinf(trace.first_stuck_s).all()
