@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +61,20 @@ class Shape:
         return Shape(self.harmonics, self.amplitudes, turned)
 
     def _wave(self, weights: NDArray[np.complex128], phase_rad: float) -> NDArray[np.float64]:
-        turns = 2.0 * np.pi * np.arange(_GRID) / _GRID
-        arguments = np.outer(turns, self.harmonics) + np.asarray(self.phases_rad) + phase_rad
-        wave: NDArray[np.float64] = (np.exp(1j * arguments) @ weights).real
+        wave: NDArray[np.float64] = (_turned(self.harmonics, self.phases_rad, phase_rad) @ weights).real
         return wave
+
+
+@lru_cache(maxsize=8)
+def _turned(
+    harmonics: tuple[int, ...], phases_rad: tuple[float, ...], phase_rad: float
+) -> NDArray[np.complex128]:
+    """(1024, K) the lines of peak 1; kept: speed, rate and torque of one shape are asked for one after another."""
+    turns = 2.0 * np.pi * np.arange(_GRID) / _GRID
+    arguments = np.outer(turns, harmonics) + np.asarray(phases_rad) + phase_rad
+    lines: NDArray[np.complex128] = np.exp(1j * arguments)
+    lines.flags.writeable = False
+    return lines
 
 
 @dataclass(frozen=True)
