@@ -4,8 +4,12 @@ The longest cases run with --long only, heavy ones in CI (--heavy: those alone),
 What the markers mean: pyproject.toml.
 
 And Ctrl-C as usual: a shell that starts the tests in the background has it ignored, which every child would inherit.
+
+Nothing that collection makes is garbage: it is looked through for some neither while it is made (a fifth of the time
+that this takes) nor ever after.
 """
 
+import gc
 import json
 import os
 import signal
@@ -21,6 +25,8 @@ settings.load_profile("fuzz" if os.environ.get("TDHIL_FUZZ") else "same")
 
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+gc.disable()        # until everything is collected
 
 GROUPS = "one_worker"
 """Where a worker of pytest-xdist finds the file's name in which it writes what its `one_worker` items belong to."""
@@ -76,6 +82,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         marks = ((item.nodeid, item.get_closest_marker("one_worker")) for item in items)
         groups = {nodeid: " ".join(mark.args) or nodeid.split("::")[0] for nodeid, mark in marks if mark is not None}
         Path(write_to).write_text(json.dumps(groups))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_finish() -> None:
+    gc.enable()
+    gc.freeze()
 
 
 def pytest_report_header(config: pytest.Config) -> str:
