@@ -128,7 +128,7 @@ SUBJECTS = {
         "tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")
     ),
     "identify": Subject(
-        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
+        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_failed"})
     ),
     "stop_on_signals": Subject(
         "tdhil/session/stop_signals.py", ("cli/test_identify_end.py",), frozenset({"_NAMES", "stop_on_signals"})

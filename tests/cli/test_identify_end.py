@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 from pathlib import Path
 
 import pytest
@@ -143,3 +144,18 @@ def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
         os.kill(os.getpid(), signal.SIGTERM)
         assert (request.signum, request.count) == (number, 2)
     assert signal.getsignal(number) is former
+
+
+def test_in_another_thread_signals_stay_with_the_main_threads_owner():
+    former = signal.getsignal(signal.SIGTERM)
+    seen = []
+
+    def elsewhere():
+        with stop_on_signals() as request:
+            request.ask(signal.SIGTERM)
+            seen.append((request.signum, signal.getsignal(signal.SIGTERM)))
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert seen == [(signal.SIGTERM, former)]
