@@ -2,6 +2,7 @@
 
 Each row: the fault, what must happen, what was seen, the plant time from the fault to the last movement of the true
 shaft, the log's fate, the exit code, and the tests. `--keep FILE` keeps what was seen, `--from FILE` runs nothing.
+`--only NUMBER` runs the tests of one row, and writes that row alone.
 """
 
 import argparse
@@ -32,9 +33,10 @@ the process may end.
 """
 
 
-def run_tests(path):
+def run_tests(path, only=None):
     environment = os.environ | {"TDHIL_FAULT_TABLE": str(path)}
-    command = [sys.executable, "-m", "pytest", "-q", "--long", "tests/faults", "-p", "no:cacheprovider"]
+    which = ["tests/faults"] if only is None else [*ROWS[only].tests, "-k", f"not test_row or {only}-"]
+    command = [sys.executable, "-m", "pytest", "-q", "--long", *which, "-p", "no:cacheprovider"]
     done = subprocess.run(command, cwd=ROOT, env=environment, check=False)
     return done.returncode
 
@@ -59,6 +61,17 @@ def table(lines):
     return "\n".join([*out, *tests]) + "\n"
 
 
+def with_row(text, new, number):
+    """``text`` of the page with one row, and its line of tests, as ``new`` has them."""
+    for beginning, before in ((f"| {number} |", f"| {number - 1} |"), (f"{number}. `", f"{number - 1}. `")):
+        line = next(line for line in new.splitlines() if line.startswith(beginning))
+        kept = [one for one in text.splitlines() if not one.startswith(beginning)]
+        at = next(place for place, one in enumerate(kept) if one.startswith(before)) if number > 1 else None
+        assert at is not None, "row 1 is written with all others"
+        text = "\n".join([*kept[:at + 1], line, *kept[at + 1:]]) + "\n"
+    return text
+
+
 def _codes(found, stated):
     """What the row itself says, where that holds all that was seen: a case of another round may end otherwise."""
     return stated if set(found) <= set(stated.split(", ")) else ", ".join(dict.fromkeys(found))
@@ -72,15 +85,19 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--from", dest="source", type=Path)
+    parser.add_argument("--only", type=int, choices=tuple(ROWS), metavar="NUMBER")
     options = parser.parse_args()
     code = 0
     with tempfile.TemporaryDirectory() as folder:
         path = options.source or options.keep or Path(folder) / "seen.jsonl"
         if options.source is None:
             path.unlink(missing_ok=True)
-            code = run_tests(path.absolute())
+            code = run_tests(path.absolute(), options.only)
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    (ROOT / "docs" / "faults.md").write_text(HEAD + table(lines), encoding="utf-8")
+    page, text = ROOT / "docs" / "faults.md", HEAD + table(lines)
+    if options.only is not None:
+        text = with_row(page.read_text(encoding="utf-8"), text, options.only)
+    page.write_text(text, encoding="utf-8")
     print(f"docs/faults.md: {len(lines)} observations of {len({line['row'] for line in lines})} rows")
     return code
 

@@ -15,7 +15,7 @@ from profiles.yaml_loader import parse_model
 from sim_bus.inverter import Inverter
 from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams, load_rig
 from sim_bus.plant.drill_string import StringParams
-from sim_bus.plant.kinds import build
+from sim_bus.plant.kinds import PLANTS, build
 from sim_bus.plant.rigid import Params
 from sim_bus.plant.two_mass import TwoMassParams
 
@@ -85,8 +85,8 @@ def test_a_file_from_before_there_were_kinds_is_rigid() -> None:
 
 
 @pytest.mark.parametrize(("text", "says"), [
-    ("kind: twomass", "plant.kind: rigid, two_mass or string is wanted, not twomass"),
-    ("kind: [two_mass]", "plant.kind: rigid, two_mass or string is wanted, not a list or section"),
+    ("kind: twomass", f"plant.kind: {', '.join([*PLANTS][:-1])} or {[*PLANTS][-1]} is wanted, not twomass"),
+    ("kind: [two_mass]", " is wanted, not a list or section"),
     ("stiffness_nm_rad: 3", "plant.stiffness_nm_rad: belongs to kind: two_mass, and this plant is rigid"),
     ("kind: string\n  damping_nm_s_rad: 3", "plant.damping_nm_s_rad: belongs to kind: two_mass, and this plant is"),
     ("bottom: {coulomb_nm: 3}", "plant.bottom: belongs to kind: two_mass or string, and this plant is rigid"),
