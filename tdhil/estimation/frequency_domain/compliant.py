@@ -16,6 +16,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     inertias,
     intervals,
 )
+from tdhil.estimation.frequency_domain.filter_order import excess_rise
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
     REJECT_P,
@@ -31,6 +32,7 @@ from tdhil.estimation.frequency_domain.optimiser import Fixed
 from tdhil.estimation.frequency_domain.rigid import RigidResult, fitted_points, known_of, lags_of, of_reports
 from tdhil.estimation.frequency_domain.shafts import (
     DAMPING,
+    DRAG_SHARE,
     INERTIA,
     LOAD,
     LOAD_VISCOUS,
@@ -58,7 +60,7 @@ from tdhil.estimation.result import BudgetLine, Compliant, Estimate, Refusal
 #
 # So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up
 # too early: the string must gain what would be as unlikely by chance as residuals that reject a model (χ²(1); half of
-# that at the bound η = 0).
+# that at the bound η = 0), each model with the structure of lags that it does best with.
 
 
 _DOUBT = 0.3                 # of the residual test's p, above which a rigid shaft isn't doubted
@@ -123,8 +125,21 @@ def choose(
 
 
 def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
-    """Does the string gain more on two masses, by its one parameter, than chance gives?"""
-    return two.fitted.whole.objective - string.fitted.whole.objective > chance_gain()
+    """Does the string gain more on two masses than chance gives a parameter?
+
+    Each with the structure of lags that it needs: two masses may bend filters of two poles and averages into what a
+    string does behind plain lags, and those parameters are counted.
+    """
+    return _likeliest(two) - _likeliest(string) > chance_gain()
+
+
+def _likeliest(fit: CompliantFit) -> float:
+    """−2 ln L of first-order lags, or of the whole family with Schwarz's price for its structure (`filter_order`)."""
+    fitted = fit.fitted
+    price = len([index for index in fitted.problem.model.structure if index not in fitted.fixed])
+    rise = excess_rise(fitted.problem, len(fitted.free))
+    whole = fitted.whole.objective + rise * price * math.log(fitted.problem.numbers)
+    return min(fitted.simple.objective, whole)
 
 
 def may_swing(rigid: RigidResult) -> bool:
@@ -251,7 +266,7 @@ def _budget(
     at = fit.fitted.problem.model.at
     lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
     friction = (VISCOUS, DAMPING, LOAD_VISCOUS)
-    spring = (LOAD, SWING, *((STRING_SHARE,) if fit.is_string else ()))
+    spring = (LOAD, SWING, *((STRING_SHARE, DRAG_SHARE) if fit.is_string else ()))
 
     def half(*known: int) -> float:
         return half_width_first_order(fit.fitted, INERTIA, confidence, known)

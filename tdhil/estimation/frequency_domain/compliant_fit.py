@@ -275,7 +275,7 @@ def _through(row: FloatArray, index: int, slope: FloatArray) -> FloatArray:
 
 SLOWEST_SEEN = 0.5        # of the lowest line: a slower swing is not seen
 _RIGID = len(RigidShaft.names)
-_LIGHT = 0.02      # share of the load that a string weighs which is all but a spring
+_HEAVIER = (0.02, 0.2, 0.4, 0.7)      # shares of the load from which a string's descents begin; the first: two masses
 
 
 @dataclass(frozen=True)
@@ -328,9 +328,20 @@ def fit_compliant(
     problem = Likelihood(lines, model, constraint, priors)
     starts = compliant_starts(problem, fixed)
     if near is not None:
-        starts = [np.insert(near.fitted.simple.theta, STRING_SHARE, _LIGHT), *starts]
+        starts = [*(_heavier(near.fitted.simple.theta, share) for share in _HEAVIER), *starts]
     fitted = fit_model(problem, fixed, starts, apart=too_slow(problem))
     return CompliantFit(fitted, residual_of(fitted))
+
+
+def _heavier(two: FloatArray, share: float) -> FloatArray:
+    """Two masses with a spring that weighs this share of what hangs on it: a third of it seemed to turn with the motor.
+
+    So J_L (1 − η/3) and J_r + η J_L/3 are what two masses took for J_L and J_r.
+    """
+    theta = np.insert(two, STRING_SHARE, [share, 0.5])
+    theta[LOAD] = two[LOAD] / (1.0 - share / 3.0)
+    theta[INERTIA] = max(two[INERTIA] - share / 3.0 * theta[LOAD], 0.1 * two[INERTIA])
+    return theta
 
 
 def too_slow(problem: Likelihood) -> Apart:

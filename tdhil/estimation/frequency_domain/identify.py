@@ -27,6 +27,7 @@ from tdhil.estimation.frequency_domain.rigid import (
 )
 from tdhil.estimation.frequency_domain.shafts import shaft_model
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
+from tdhil.estimation.frequency_domain.transient import settled_lines
 from tdhil.estimation.result import Refusal, Refused
 from tdhil.estimation.samples import Stretch, log_warnings, stretches
 from tdhil.recording import Excitation
@@ -88,7 +89,7 @@ def identify_lines(case: PeriodicCase) -> Finding:
     asked = shaft_model(case.options.model)
     rigid = None
     if asked.compliant is not None:
-        finding = identify_compliant(case)
+        finding = identify_compliant(_settled(case))
     else:
         rigid = _rigid(case, case.lines)
         weak = tuple(line for line in case.usable if all(line is not one for one in case.lines))
@@ -97,12 +98,20 @@ def identify_lines(case: PeriodicCase) -> Finding:
         else:
             doubted = asked.widened and rigid is not None and may_swing(rigid)
         finding = rigid_finding(rigid, case)
-        finding = identify_compliant(case, finding) if doubted else finding
+        finding = identify_compliant(_settled(case), finding) if doubted else finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, finding.advice)
     if finding.rejected and rigid is not None and asked.lags:
         return identify_bent(case, rigid) or finding
     return finding
+
+
+def _settled(case: PeriodicCase) -> PeriodicCase:
+    """The case without what a shaft that swings still does of its own (`transient`)."""
+    slope = case.constraint.slope if case.constraint is not None else 0.0
+    every = settled_lines(case.fits, slope, case.levels.warming.own)
+    usable = usable_lines(every, _LEAST_NU)
+    return replace(case, every=every, usable=usable) if usable else case
 
 
 def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:

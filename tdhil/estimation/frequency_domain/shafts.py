@@ -171,40 +171,38 @@ class RigidShaft:
 # `two_mass.py`, and that is how it is parametrised: with the load J_L = J_s + J_e and the string's share of it, η =
 # J_s/J_L,
 #
-#     m = J_r, B, J_L, ω_a, c, B_L, η        k = ω_a² J_L (1 − 2η/3),    J_s = η J_L,    J_e = (1 − η) J_L,
+#     m = J_r, B, J_L, ω_a, c, B_L, η, δ     k = ω_a² J_L (1 − 2η/3),    J_s = η J_L,    J_e = (1 − η) J_L,
 #
 # η = 0 two masses, η = 1 a free bottom. J_e + J_s/3 is what a string's swing weighs by Rayleigh, so that ω_a stays
-# near the lowest antiresonance (10 % off at worst) whatever η. Friction below, B_L, is taken as shared between string
-# and bottom as their inertias are (D = η B_L): where along the string a weak drag acts can't be told from the top.
+# near the lowest antiresonance (10 % off at worst) whatever η. Of the friction below, B_L, the string's drag is D = δ
+# B_L: at the swing the bottom moves most, so that a loss there shows more than the same loss along the string, of
+# which the levels show the sum alone.
 
 
-STRING_SHARE = 6         # in m
+STRING_SHARE, DRAG_SHARE = 6, 7         # in m
 _RAYLEIGH = 2.0 / 3.0
 
 
 class StringShaft:
-    """J_r, B, J_L, ω_a (rad/s), c, B_L, η."""
+    """J_r, B, J_L, ω_a (rad/s), c, B_L, η, δ."""
 
-    names: tuple[str, ...] = (*TwoMassShaft.names, "string_share")
-    inertia_row = np.append(TwoMassShaft.inertia_row, 0.0)
-    viscous_row = np.append(TwoMassShaft.viscous_row, 0.0)
+    names: tuple[str, ...] = (*TwoMassShaft.names, "string_share", "drag_share")
+    inertia_row = np.append(TwoMassShaft.inertia_row, [0.0, 0.0])
+    viscous_row = np.append(TwoMassShaft.viscous_row, [0.0, 0.0])
 
     def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        load, damping, share = m[LOAD], m[DAMPING], m[STRING_SHARE]
-        a = s / (string_stiffness(m) + damping * s)
-        hung = load * s + m[LOAD_VISCOUS]
-        end, string = (1.0 - share) * hung, share * hung
+        a = s / (string_stiffness(m) + m[DAMPING] * s)
+        end, string = _end_and_string(m, s)
         q, _ = _q(a * string)
         z: ComplexArray = m[0] * s + m[1] - m[LOAD_VISCOUS] + (end + string * q) / (1.0 + end * a * q)
         return z
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
         """Chain rule through Z_e, a, b: of Z_s = N/D, N = Z_e + b q, D = 1 + Z_e a q; ∂a/∂k = −a²/s, ∂a/∂c = −a²."""
-        load, swing, share = m[LOAD], m[SWING], m[STRING_SHARE]
+        load, swing, share, drag_share = m[LOAD], m[SWING], m[STRING_SHARE], m[DRAG_SHARE]
         light = 1.0 - _RAYLEIGH * share
         a = s / (string_stiffness(m) + m[DAMPING] * s)
-        hung = load * s + m[LOAD_VISCOUS]
-        end, string = (1.0 - share) * hung, share * hung
+        end, string = _end_and_string(m, s)
         q, slope = _q(a * string)
         n, d = end + string * q, 1.0 + end * a * q
         by_q = (string - n * end * a / d) / d
@@ -212,20 +210,30 @@ class StringShaft:
         by_string = q / d + by_q * slope * a
         by_a = -n * end * q / d**2 + by_q * slope * string
         by_stiffness, by_damping = -by_a * a**2 / s, -by_a * a**2
-        by_hung = (1.0 - share) * by_end + share * by_string
-        by_share = hung * (by_string - by_end) - by_stiffness * swing**2 * load * _RAYLEIGH
+        by_load = (1.0 - share) * by_end + share * by_string
+        by_viscous = (1.0 - drag_share) * by_end + drag_share * by_string
+        by_share = load * s * (by_string - by_end) - by_stiffness * swing**2 * load * _RAYLEIGH
         return np.stack(
-            [s, np.ones_like(s), s * by_hung + by_stiffness * swing**2 * light,
-             2.0 * by_stiffness * swing * load * light, by_damping, by_hung - 1.0, by_share],
+            [s, np.ones_like(s), s * by_load + by_stiffness * swing**2 * light,
+             2.0 * by_stiffness * swing * load * light, by_damping, by_viscous - 1.0, by_share,
+             m[LOAD_VISCOUS] * (by_string - by_end)],
             axis=1,
         )
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
         low, high = TwoMassShaft().bounds(rough_inertia, s)
-        return np.append(low, 0.0), np.append(high, 1.0)
+        return np.append(low, [0.0, 0.0]), np.append(high, [1.0, 1.0])
 
     def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
-        return np.append(TwoMassShaft().scales(rough_inertia, s), 0.3)
+        return np.append(TwoMassShaft().scales(rough_inertia, s), [0.3, 0.3])
+
+
+def _end_and_string(m: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Z_e and b."""
+    share, drag_share = m[STRING_SHARE], m[DRAG_SHARE]
+    end: ComplexArray = (1.0 - share) * m[LOAD] * s + (1.0 - drag_share) * m[LOAD_VISCOUS]
+    string: ComplexArray = share * m[LOAD] * s + drag_share * m[LOAD_VISCOUS]
+    return end, string
 
 
 def string_stiffness(m: FloatArray) -> float:

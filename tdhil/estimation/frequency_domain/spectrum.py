@@ -172,7 +172,7 @@ def pooled_lines(
     for hertz in frequencies:
         speeds, torques = [], []
         for fit, rate in zip(fits, rates, strict=True):
-            torque = fit.torque - (viscous * fit.drift + rate)[:, None] * fit.ramp
+            torque = torque_lines(fit, viscous, rate)
             for column, own in enumerate(fit.lines_hz):
                 if round(own, 9) == hertz and len(fit.speed) > 0:
                     speeds.append(fit.speed[:, column])
@@ -181,6 +181,12 @@ def pooled_lines(
         if line is not None:
             pooled.append(line)
     return tuple(pooled)
+
+
+def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> ComplexArray:
+    """(P, K), less the ramp of torque that the ramp of speed needs, and that of a friction that changes as it warms."""
+    torque: ComplexArray = fit.torque - (viscous * fit.drift + warming_nm_s)[:, None] * fit.ramp
+    return torque
 
 
 def _pool(hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray]) -> Line | None:

@@ -1,0 +1,95 @@
+"""What dies away in the modes of a shaft that swings: taken off its lines, and left alone where nothing does."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from tdhil.estimation.frequency_domain.spectrum import PeriodLines, period_lines, pooled_lines
+from tdhil.estimation.frequency_domain.transient import settled_lines
+from tdhil.estimation.samples import Samples, Stretch
+from tdhil.recording import Segment
+
+LINES = (0.1, 0.2, 0.3, 0.4, 0.6)
+TORQUES = np.array([1200.0, 800.0, 600.0, 500.0, 400.0]) * np.exp(1j * np.arange(5))
+PERIOD_S, STEP_S, PERIODS = 10.0, 0.02, 10
+MOTOR, LOAD, SPRING, DAMPING, HOLD = 1500.0, 500.0, 480.0, 4.0, 600.0
+"""HOLD: what the top is held to its mean speed with, N·m·s/rad; it damps, and is a part of the torque."""
+
+
+def impedance(hertz):
+    s = 2j * np.pi * np.asarray(hertz)
+    spring = SPRING / s + DAMPING
+    return MOTOR * s + 1.0 / (1.0 / (LOAD * s) + 1.0 / spring)
+
+
+def swinging(seed, speed_noise=1e-4, torque_noise=0.5, settled=False):
+    """Samples of (torque, speed) from a start at rest, by the exact solution: state (ω_r, ω_L, twist)."""
+    a = np.array([[-(DAMPING + HOLD) / MOTOR, DAMPING / MOTOR, -SPRING / MOTOR],
+                  [DAMPING / LOAD, -DAMPING / LOAD, SPRING / LOAD], [1.0, -1.0, 0.0]])
+    b = np.array([1.0 / MOTOR, 0.0, 0.0])
+    time = STEP_S * np.arange(round(PERIODS * PERIOD_S / STEP_S))
+    # Each tone's steady answer, and what is left of the start: x = Σ Re X_k e^(jωt) + e^(At) x_0.
+    answers = np.array([np.linalg.solve(2j * np.pi * hz * np.eye(3) - a, b * one) for hz, one in
+                        zip(LINES, TORQUES, strict=True)])
+    waves = np.exp(2j * np.pi * np.outer(time, LINES))
+    speed = (waves @ answers[:, 0]).real
+    if not settled:
+        free, step = -answers.sum(axis=0).real, expm(a * STEP_S)
+        left = np.empty(len(time))
+        for at in range(len(time)):
+            left[at], free = free[0], step @ free
+        speed = speed + left
+    torque = (waves @ TORQUES).real - HOLD * speed
+    rng = np.random.default_rng(seed)
+    return time, speed + speed_noise * rng.standard_normal(len(time)), torque + torque_noise * rng.standard_normal(
+        len(time))
+
+
+def fits_of(seed, **options):
+    time, speed, torque = swinging(seed, **options)
+    samples = Samples(time, 5.0 + speed, 200.0 + torque)
+    segment = Segment(0.0, PERIODS * PERIOD_S, PERIOD_S, 0, 5.0, LINES, (0.1,) * 5, (0.0,) * 5)
+    cut = (np.split(signal, PERIODS) for signal in (time, 5.0 + speed, 200.0 + torque))
+    periods = tuple(Samples(*one) for one in zip(*cut, strict=True))
+    return (period_lines(Stretch(segment, periods, tuple(range(PERIODS))), samples),)
+
+
+def off(lines):
+    """Relative error of every line's T/W."""
+    return np.array([abs(line.torque[0] / line.speed[0] / impedance(line.hertz) - 1.0) for line in lines])
+
+
+def test_the_lines_of_a_shaft_that_still_swings_are_those_of_the_shaft():
+    fits = fits_of(1)
+    plain, settled = pooled_lines(fits, 0.0), settled_lines(fits, 0.0)
+    assert np.max(off(plain)) > 0.02
+    assert np.max(off(settled)) < 0.003
+    assert all(one.s_ww < 0.01 * other.s_ww for one, other in zip(settled, plain, strict=True))
+    assert all(7.0 < line.periods[0] < 10.0 for line in settled)
+    assert all(6.0 <= line.nu < 9.0 for line in settled)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_their_scatter_says_how_far_off_they_are(seed):
+    settled = settled_lines(fits_of(seed), 0.0)
+    for line in settled:
+        g = impedance(line.hertz)
+        error = line.torque[0] - g * line.speed[0]
+        variance = line.s_tt + abs(g) ** 2 * line.s_ww - 2.0 * (np.conj(g) * line.s_tw).real
+        assert abs(error) ** 2 * line.periods[0] < 25.0 * variance
+
+
+def test_where_nothing_dies_away_the_lines_are_what_they_were():
+    fits = fits_of(2, settled=True)
+    assert all(_alike(one, other) for one, other in zip(settled_lines(fits, 3.0), pooled_lines(fits, 3.0), strict=True))
+
+
+def test_a_few_periods_are_left_alone():
+    whole = fits_of(3)[0]
+    fits = (PeriodLines(LINES, *(getattr(whole, name)[:4] for name in
+                                 ("speed", "torque", "ramp", "speed_mean", "torque_mean", "drift"))),)
+    assert all(_alike(one, other) for one, other in zip(settled_lines(fits, 0.0), pooled_lines(fits, 0.0), strict=True))
+
+
+def _alike(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
