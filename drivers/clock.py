@@ -157,7 +157,7 @@ class Ticks:
     def _refuse_stall(
         self, stood_still_s: float, now_s: float, then: str = "; the setpoint it had in hand was not sent"
     ) -> None:
-        if stood_still_s > max(STALL_S, STALL_CYCLES * self._period_s):
+        if stood_still_s > STALL_S and stood_still_s > STALL_CYCLES * self._period_s:
             self._stalls.append((now_s, stood_still_s))
         if 0.0 < self._longest_stall_s < stood_still_s:
             self._next_s = now_s + self._period_s

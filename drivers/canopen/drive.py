@@ -424,7 +424,8 @@ class Cia402Drive:
             self._watch.on_contradiction()
         self._ticks.check_end()
         self._check()
-        if now_s - self._shown_s > max(MODE_STALE_S, MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s):
+        hidden_s = now_s - self._shown_s
+        if hidden_s > MODE_STALE_S and hidden_s > MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s:
             self._reported.shown_code = 0      # whatever it was, nobody knows any more
         return self._sample(now_s, age_s, fresh)
 

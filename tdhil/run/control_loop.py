@@ -74,7 +74,8 @@ class ControlLoop:
         if self._telling is not None:
             self._note(self._telling)
         self.guard.check_sample(command, sample)
-        self.guard.check_pace(self.drive.counters)
+        if self.guard.pace_is_due():
+            self.guard.check_pace(self.drive.counters)
         if self.observer is not None:
             self.observer(command, sample)
         if self._watch is not None and not self.quiet:

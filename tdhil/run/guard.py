@@ -102,6 +102,7 @@ class Guard:
         self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
         self._pace_cycles = max(10, round(PACE_S / period_s))
         self._pace_from = Counters()
+        self._pace_left = 0                # so many cycles, at least, before there is something to see
         self._started_s: float | None = None
         self.expected: PowerState | None = None
         self.model: RigGuess | None = None
@@ -144,16 +145,22 @@ class Guard:
         """What the time limit leaves, s."""
         return self._limits.time_s - (0.0 if self._started_s is None else time_s - self._started_s)
 
+    def pace_is_due(self) -> bool:
+        """Is `check_pace` to be called in this cycle? Counters aren't put together for nothing."""
+        self._pace_left -= 1
+        return self._pace_left <= 0 or self.reckoning
+
     def check_pace(self, counters: Counters) -> None:
         """Raise CommunicationLost when the loop is late again and again: its setpoints then come too late as well."""
         if self.reckoning:
-            self._pace_from = counters
+            self._pace_from, self._pace_left = counters, self._pace_cycles
             return
         before = self._pace_from
         cycles = counters.cycles - before.cycles
         if cycles < self._pace_cycles:
+            self._pace_left = self._pace_cycles - cycles
             return
-        self._pace_from = counters
+        self._pace_from, self._pace_left = counters, self._pace_cycles
         late = counters.overruns - before.overruns
         if late > LATE_SHARE * cycles:
             words = self.host_late()
@@ -389,7 +396,9 @@ class _Following:
         reach_s = assumptions.reaction_s + 3.0 * assumptions.largest_speed_lag_s + FOLLOW_MEAN_S
         self.within_s = FOLLOW_STRING_S if limits.load == "string" else FOLLOW_S
         self._blocks: deque[_Block] = deque(maxlen=1 + math.ceil(reach_s / max(FOLLOW_BLOCK_S, period_s)))
-        self._recent: deque[tuple[float, float]] = deque(maxlen=max(1, round(FOLLOW_MEAN_S / period_s)))
+        recent = max(1, round(FOLLOW_MEAN_S / period_s))
+        self._speeds: deque[float] = deque(maxlen=recent)
+        self._torques: deque[float] = deque(maxlen=recent)
         self.reset()
 
     def reset(self) -> None:
@@ -401,12 +410,12 @@ class _Following:
     @property
     def speed_rad_s(self) -> float:
         """Mean reported speed."""
-        return math.fsum(speed for speed, _ in self._recent) / len(self._recent)
+        return math.fsum(self._speeds) / len(self._speeds)
 
     @property
     def torque_nm(self) -> float:
         """Mean reported torque."""
-        return math.fsum(torque for _, torque in self._recent) / len(self._recent)
+        return math.fsum(self._torques) / len(self._torques)
 
     def see(self, reference_rad_s: float, sample: Sample) -> bool:
         """False once the shaft has been away from its reference, and come no nearer, for too long."""
@@ -415,16 +424,24 @@ class _Following:
             self._blocks.append(_Block(now_s, reference_rad_s))
         else:
             self._blocks[-1].widen(reference_rad_s)
-        self._recent.append((sample.speed_rad_s, sample.torque_nm))
+        self._speeds.append(sample.speed_rad_s)
+        self._torques.append(sample.torque_nm)
         speed_rad_s = self.speed_rad_s
-        below = min(block.lowest for block in self._blocks) - self._window_rad_s - speed_rad_s
-        above = speed_rad_s - max(block.highest for block in self._blocks) - self._window_rad_s
-        side = 1.0 if below > 0.0 else -1.0 if above > 0.0 else 0.0
+        side = self._side_of(speed_rad_s)
         if side != self._side:
             self._side, self._anchor_rad_s, self._anchor_s, self.since_s = side, speed_rad_s, now_s, now_s
         elif side * (speed_rad_s - self._anchor_rad_s) >= self._nearer_rad_s:
             self._anchor_rad_s, self._anchor_s = speed_rad_s, now_s
         return side == 0.0 or now_s - self._anchor_s < self.within_s
+
+
+    def _side_of(self, speed_rad_s: float) -> float:
+        latest, window_rad_s = self._blocks[-1], self._window_rad_s
+        if latest.lowest - window_rad_s <= speed_rad_s and speed_rad_s - latest.highest <= window_rad_s:
+            return 0.0           # as nearly always; earlier blocks only widen it
+        if speed_rad_s < min(block.lowest for block in self._blocks) - window_rad_s:
+            return 1.0
+        return -1.0 if speed_rad_s - max(block.highest for block in self._blocks) > window_rad_s else 0.0
 
 
 class _Block:
