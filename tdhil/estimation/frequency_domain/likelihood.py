@@ -55,6 +55,7 @@ class Likelihood:
         self.s_tw = np.array([line.s_tw for line in lines])
         self.nu = np.array([line.nu for line in lines])
         self.segments = np.array([float(len(line.speed)) for line in lines])
+        self._scale = 2.0 * (self.nu + self.segments) / self.nu
         self._load = load
         self._of_line = np.equal.outer(np.arange(len(lines)), self.owner).astype(np.float64)
         known = (*priors, *model.plausible({prior.index for prior in priors}))
@@ -104,7 +105,7 @@ class Likelihood:
     def residuals(self, theta: FloatArray) -> FloatArray:
         """A real vector whose sum of squares is −2 ln L."""
         e, q = self.weighted(theta)
-        u = self._phi(q)[0][self.owner] * e
+        u = self._phi(q, False)[0][self.owner] * e
         return np.concatenate([u.real, u.imag, self._prior_residuals(theta)])
 
     def linearised(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -139,16 +140,23 @@ class Likelihood:
             found[:, self._load.index] += self._load.lines
         return found
 
-    def _phi(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q) and dφ/dq, (K,) each; by series where q/ν is small."""
+    def _phi(self, q: FloatArray, sloped: bool = True) -> tuple[FloatArray, FloatArray]:
+        """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q) and dφ/dq, (K,) each; by series where q/ν is small.
+
+        This is called thousands of times for one interval. Not ``sloped``: the second is left out.
+        """
         x = q / self.nu
-        small = x < 1e-4
-        safe = np.where(small, 1.0, x)
-        ratio = np.where(small, 1.0 - x / 2.0 + x * x / 3.0, np.log1p(safe) / safe)
-        slope = np.where(small, -0.5 + 2.0 * x / 3.0, (1.0 / (1.0 + safe) - np.log1p(safe) / safe) / safe)
-        scale = 2.0 * (self.nu + self.segments) / self.nu
-        phi = np.sqrt(scale * ratio)
-        return phi, scale * slope / (2.0 * phi * self.nu)
+        if x.min() >= 1e-4:          # as nearly always
+            ratio = np.log1p(x) / x
+            slope = (1.0 / (1.0 + x) - ratio) / x if sloped else ratio
+        else:
+            small = x < 1e-4
+            safe = np.where(small, 1.0, x)
+            plain = np.log1p(safe) / safe
+            ratio = np.where(small, 1.0 - x / 2.0 + x * x / 3.0, plain)
+            slope = np.where(small, -0.5 + 2.0 * x / 3.0, (1.0 / (1.0 + safe) - plain) / safe)
+        phi = np.sqrt(self._scale * ratio)
+        return phi, self._scale * slope / (2.0 * phi * self.nu) if sloped else phi
 
     def objective(self, theta: FloatArray) -> float:
         """−2 ln L."""
@@ -160,7 +168,9 @@ class Likelihood:
             return known
         z = self.tie_error(theta)
         dof = self.constraint.dof
-        return np.append(known, np.sign(z) * np.sqrt((dof + 1.0) * np.log1p(z * z / dof)))
+        found = np.empty(len(known) + 1)
+        found[:-1], found[-1] = known, np.sign(z) * np.sqrt((dof + 1.0) * np.log1p(z * z / dof))
+        return found
 
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
         if self.constraint is None:

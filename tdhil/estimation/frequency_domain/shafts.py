@@ -143,7 +143,9 @@ class RigidShaft:
         return z
 
     def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
-        return np.stack([s, np.ones_like(s)], axis=1)
+        found = np.ones((len(s), 2), dtype=np.complex128)
+        found[:, INERTIA] = s
+        return found
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
         return np.array([1e-6 * rough_inertia, -np.inf]), np.array([1e6 * rough_inertia, np.inf])

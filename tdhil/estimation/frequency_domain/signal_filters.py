@@ -76,12 +76,15 @@ def log_ratio_jacobian(phi: FloatArray, s: ComplexArray) -> ComplexArray:
         poles = sign / (1.0 + x + phi[shape] * x * x)
         found[:, lag] = (s + 2.0 * phi[shape] * x * s) * poles
         found[:, shape] = x * x * poles
-    omega = np.abs(s)
-    y2 = 0.25 * omega**2 * abs(float(phi[AVERAGE]))
+    quarter = 0.25 * np.abs(s) ** 2
+    y2 = quarter * abs(float(phi[AVERAGE]))
+    series = -1.0 / 6.0 - y2 / 90.0
     small = y2 < 1e-3
-    y = np.sqrt(np.where(small, 1.0, y2))
-    bracket = np.where(small, -1.0 / 6.0 - y2 / 90.0, (y / np.tan(y) - 1.0) / (2.0 * y * y))
-    found[:, AVERAGE] = 0.25 * omega**2 * bracket
+    if small.all():
+        found[:, AVERAGE] = quarter * series
+    else:
+        y = np.sqrt(np.where(small, 1.0, y2))
+        found[:, AVERAGE] = quarter * np.where(small, series, (y / np.tan(y) - 1.0) / (2.0 * y * y))
     found[:, SKEW] = -s
     return found
 
