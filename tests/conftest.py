@@ -6,13 +6,15 @@ What the markers mean: pyproject.toml.
 And Ctrl-C as usual: a shell that starts the tests in the background has it ignored, which every child would inherit.
 
 Nothing that collection makes is garbage: it is looked through for some neither while it is made (a fifth of the time
-that this takes) nor ever after.
+that this takes) nor ever after. And what is compiled is kept, for the programs that are started by the hundred: where
+the environment forbids it (PYTHONDONTWRITEBYTECODE), each of them would compile all of ours anew.
 """
 
 import gc
 import json
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 
@@ -27,6 +29,8 @@ if threading.current_thread() is threading.main_thread() and signal.getsignal(si
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 gc.disable()        # until everything is collected
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 GROUPS = "one_worker"
 """Where a worker of pytest-xdist finds the file's name in which it writes what its `one_worker` items belong to."""

@@ -27,6 +27,7 @@ limits:
   watchdog_s: {WATCHDOG_S}
   probe_torque_nm: 200.0
   probe_travel_rad: 3.0
+run: {{excitation: sine, frequency_hz: 0.2}}
 """
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from tdhil.recording.csv.excitation import load_excitation
 from tdhil.recording.log_reader import read_run
-from tests.path.path_runs import identify, tdhil
+from tests.path.path_runs import QUICK, identify, tdhil
 
 pytestmark = pytest.mark.one_worker
 
@@ -23,7 +23,7 @@ DOC = Path(__file__).parents[2] / "docs" / "csv.md"
 def run(tmp_path_factory):
     """A finished run, its Recording, and its excitation as a file."""
     folder = tmp_path_factory.mktemp("run")
-    done = identify(folder, "--simulate", "--seed", 1, "--periods", 3)
+    done = identify(folder, "--simulate", *QUICK, "--seed", 1, "--periods", 3)
     assert done.code == 0, done.err
     recording = read_run(done.log).recording
     segments = [
@@ -72,7 +72,7 @@ def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
     assert found.keys() == document.keys()
     assert found["log"] == str(path)
     for name in ("value", "low", "high"):
-        assert found["inertia_kg_m2"][name] == pytest.approx(document["inertia_kg_m2"][name], rel=2e-4)
+        assert found["inertia_kg_m2"][name] == pytest.approx(document["inertia_kg_m2"][name], rel=5e-4)
     assert found["verdict"] == document["verdict"]
     assert found["paper"]["inertia_kg_m2"] == pytest.approx(document["paper"]["inertia_kg_m2"], rel=1e-3)
     assert found["samples_used"] == document["samples_used"]
@@ -84,7 +84,7 @@ def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
 def trace(run, tmp_path):
     _, recording, _, _ = run
     path = tmp_path / "run.mcap"          # the name says nothing
-    rows = zip(recording.time_s[::10], recording.speed_rad_s[::10], recording.torque_nm[::10], strict=True)
+    rows = zip(recording.time_s[::2], recording.speed_rad_s[::2], recording.torque_nm[::2], strict=True)
     path.write_text("time_s,speed_rad_s,torque_nm\n" + "".join(f"{t:.5f},{w:.6f},{m:.4f}\n" for t, w, m in rows))
     return path
 
