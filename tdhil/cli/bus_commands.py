@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 from tdhil.config import BUSES, imported
 
 if TYPE_CHECKING:
+    from profiles import Profile
     from tdhil.cli.finding import Finding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
@@ -56,8 +57,7 @@ class BusCommands(ABC):
 
     address: ClassVar[str]              # what tells drives apart: node, unit
     address_flag: ClassVar[str]         # … and its option
-    blank: ClassVar[tuple[str, ...]]    # lines of a rig.yaml that say where a drive is, behind '#'
-    to_fill_in: ClassVar[str]           # … and in words what is to be filled in
+    to_fill_in: ClassVar[str]           # in words, what of rig.yaml says where a drive is
 
     @abstractmethod
     def scan(
@@ -82,6 +82,10 @@ class BusCommands(ABC):
     @abstractmethod
     def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
         """The bus's section of a rig.yaml for that drive; empty where nothing is to be said."""
+
+    @abstractmethod
+    def blank(self, profile: Profile) -> tuple[str, ...]:
+        """Lines of a rig.yaml that say where a drive with that profile is, behind '#'."""
 
     def keys(self, found: FoundDrive) -> Mapping[str, Any]:
         """What else rig.yaml has to say for that drive, beside the section."""

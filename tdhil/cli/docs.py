@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from textwrap import shorten
 
 import tdhil
 from tdhil.errors import UsageError
@@ -18,8 +19,11 @@ def run(namespace: argparse.Namespace) -> int:
     """The folder, and a line for each file in it."""
     folder = docs_folder()
     print(folder)  # noqa: T201
-    for path in (folder / "README.md", *sorted(folder.glob("docs/*.md")), *sorted(folder.glob("examples/*.yaml"))):
-        print(f"  {path.relative_to(folder).as_posix():<28} {_title(path)}")  # noqa: T201
+    found = (folder / "README.md", *sorted(folder.glob("docs/*.md")), *sorted(folder.glob("examples/*.yaml")))
+    names = [path.relative_to(folder).as_posix() for path in found]
+    width = max(map(len, names))
+    for name, path in zip(names, found, strict=True):
+        print(f"  {name:<{width}} {shorten(_title(path), 77 - width, placeholder=' …')}")  # noqa: T201
     return 0
 
 

@@ -59,8 +59,9 @@ def _head(profile: Profile, console: Console) -> None:
     rows = [("bus", profile.bus), ("modes", modes_text(profile)), ("watchdog", watchdog_text(profile))]
     if isinstance(profile, ModbusProfile):
         line = profile.line
-        rows.append(("line", f"{' or '.join(line.transports)}; TCP port {line.port}; {line.baud} baud 8{line.parity}"
-                             f"{line.stop_bits}; unit {line.unit}; 32 bit {line.word_order.replace('_', ' ')}"))
+        ways = {"tcp": f"TCP port {line.port}", "rtu": f"RTU {line.baud} baud 8{line.parity}{line.stop_bits}"}
+        rows.append(("line", f"{' or '.join(ways[way] for way in line.transports)}; unit {line.unit}; 32 bit "
+                             f"{line.word_order.replace('_', ' ')}"))
         rows.append(("cycle", f"{profile.cycle.rate_hz:g} Hz unless told otherwise, if the line carries it"))
     if profile.experimental:
         rows.append(("EXPERIMENTAL", "second-hand, or never tried on this bus"))

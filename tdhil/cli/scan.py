@@ -71,7 +71,7 @@ def blank_rig(profile: Profile, named: str, load: str) -> str:
         f"drive: {profile.bus}",
         f"profile: {scalar(named)}    # {_comment(profile.title)}",
         "# Where the drive is. Left out, the embedded simulator runs, and says so.",
-        *bus_commands(profile.bus).blank,
+        *bus_commands(profile.bus).blank(profile),
     ]
     parts += _doubts(profile)
     parts += ["", "# Nothing real moves without these. Take the '#' away and give every one your machine's value, in",

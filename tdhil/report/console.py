@@ -23,3 +23,7 @@ class PlainConsole(Console):
                 yield Segment(visible(segment.text, keep="\n"), segment.style)
             else:
                 yield segment
+
+    def on_broken_pipe(self) -> None:
+        """Leave it to whoever prints: rich would end the process with 1, which is a mistake of this program."""
+        raise  # noqa: PLE0704 (rich calls this where it has caught the BrokenPipeError)

@@ -298,7 +298,10 @@ class Peg:
 
 
 class ToyCommands(BusCommands):
-    address, address_flag, blank, to_fill_in = "peg", "--peg", ("#peg:",), "a peg"
+    address, address_flag, to_fill_in = "peg", "--peg", "a peg"
+
+    def blank(self, profile: Any) -> tuple[str, ...]:
+        return ("#peg:",)
 
     def scan(self, plan: Any, connection: Any, options: Any, asked: Any) -> tuple[tuple[FoundDrive, ...], list[str]]:
         return (FoundDrive("toy", connection.line.value("peg"), "a toy", "wood", plan.embedded),), ["it is asleep"]

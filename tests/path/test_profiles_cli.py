@@ -1,10 +1,14 @@
 """`tdhil profiles`: the table, a page for a person at the drive, and a file that is wrong."""
 
+import io
+import sys
+
 import pytest
 
 from drivers.errors import PreflightRefused
 from profiles.library import load_profile, profile_names, profile_path
 from profiles.modbus import ModbusProfile
+from tdhil.cli.main import main
 from tdhil.session.consent import require_accepted
 from tests.path.path_runs import tdhil
 
@@ -195,3 +199,28 @@ def test_where_a_profile_cannot_go(tmp_path, output, words):
     done = tdhil("profiles", "import", profile_path("generic/cia402").parent / "cia402.eds", "-o", tmp_path / output)
     assert done.code == 2
     assert words in done.err
+
+
+class Gone(io.StringIO):
+    """A pipe whose reader has enough: `tdhil profiles show … | head`."""
+
+    def write(self, text):
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+@pytest.mark.parametrize("command", [("profiles",), ("profiles", "show", "generic/modbus")])
+def test_a_reader_that_has_enough_is_no_mistake_of_ours(command, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", Gone())
+    assert main([*command]) == 141
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("name", "said", "unsaid"), [
+    ("siemens/g120", "RTU 19200 baud 8E1", "TCP port"), ("abb/acs880-enhanced", "TCP port 502", "baud"),
+])
+def test_a_line_that_the_drive_does_not_have_is_not_offered(name, said, unsaid, tmp_path):
+    (line,) = [line for line in tdhil("profiles", "show", name).out.splitlines() if line.startswith("  line")]
+    assert said in line and unsaid not in line
+    tdhil("rig", "new", tmp_path / "rig.yaml", "--profile", name, "--load", "none")
+    (blank,) = [line for line in (tmp_path / "rig.yaml").read_text().splitlines() if line.startswith("#modbus:")]
+    assert ("host:" in blank, "serial:" in blank) == ("TCP" in said, "RTU" in said)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.bus_commands import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
+    from profiles import Profile
     from tdhil.cli.finding import Finding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
@@ -20,10 +21,6 @@ class CanopenCommands(BusCommands):
     """Every node of a bus is asked; a drive is looked at by SDO."""
 
     address, address_flag = "node", "--node"
-    blank = (
-        "#bus: {interface: socketcan, channel: can0, bitrate: 500k}    # python-can's own names",
-        "#node:    # CANopen node number, 1 to 127",
-    )
     to_fill_in = "bus and node"
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
@@ -101,6 +98,11 @@ class CanopenCommands(BusCommands):
         line: dict[str, Any] = {name: simple[name] for name in own if name in simple}
         more = {name: value for name, value in simple.items() if name not in own}
         return {**line, "options": more} if more else line
+
+    def blank(self, profile: Profile) -> tuple[str, ...]:
+        """Bus and node."""
+        return ("#bus: {interface: socketcan, channel: can0, bitrate: 500k}    # python-can's own names",
+                "#node:    # CANopen node number, 1 to 127")
 
     def keys(self, found: FoundDrive) -> Mapping[str, Any]:
         """The node."""

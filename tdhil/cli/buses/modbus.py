@@ -7,9 +7,11 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from profiles.modbus import ModbusProfile
 from tdhil.cli.bus_commands import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
+    from profiles import Profile
     from tdhil.cli.finding import Finding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
@@ -19,7 +21,6 @@ class ModbusCommands(BusCommands):
     """Units are asked one by one, on a serial line at its usual settings; a drive is looked at register by register."""
 
     address, address_flag = "unit", "--unit"
-    blank = ("#modbus: {host: 192.0.2.10, unit: 1}    # or {serial: /dev/ttyUSB0, baud: 19200, parity: E}",)
     to_fill_in = "modbus"
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:
@@ -80,6 +81,17 @@ class ModbusCommands(BusCommands):
     def section(self, found: FoundDrive, connection: Connection) -> Mapping[str, Any]:
         """How the line was set when the drive answered, and its unit."""
         return {**found.line, "unit": found.address}
+
+
+    def blank(self, profile: Profile) -> tuple[str, ...]:
+        """A line of the kind that the drive has, as it leaves the factory."""
+        assert isinstance(profile, ModbusProfile)
+        line = profile.line
+        ways = {
+            "tcp": f"{{host: 192.0.2.10, unit: {line.unit}}}",
+            "rtu": f"{{serial: /dev/ttyUSB0, baud: {line.baud}, parity: {line.parity}, unit: {line.unit}}}",
+        }
+        return (f"#modbus: {'    # or '.join(ways[way] for way in line.transports)}",)
 
 
 MODBUS = ModbusCommands()
