@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tdhil.estimation import Options, identify
 from tdhil.estimation.data_checks import flat_share
 from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
 from tdhil.estimation.frequency_domain.friction_levels import warming_of
-from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.frequency_domain.spectrum import period_lines, repeating_rounding
 from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
 from tdhil.estimation.time_domain.identify import cut_off
 from tests.estimation.analytic import closed_form
@@ -174,3 +175,45 @@ def test_a_noisy_record_that_was_cut_off_is_seen(quantum, noise):
         x = np.minimum(x, np.round(np.quantile(x, 0.85) / quantum) * quantum)
         assert cut_off(x, quantum) == pytest.approx(0.15, abs=0.05)
         assert cut_off(-x, quantum) == pytest.approx(0.15, abs=0.05)
+
+
+# -- rounding that repeats -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0])
+@pytest.mark.parametrize("noise", [0.0, 0.15, 0.5])
+def test_what_rounding_leaves_in_the_mean_of_a_line(rate_hz, noise, shifted):
+    """Against 100 waves about random means, ten periods each; ``noise`` in steps; ``shifted``: other instants in each.
+
+    Right to a factor of three in square where it counts, beside what rounding adds to a single period's scatter.
+    """
+    rng = np.random.default_rng(7)
+    count = round(10.0 * rate_hz)
+    begins = [10.0 * number for number in range(10)]
+    shifts = rng.uniform(0.0, 1.0 / rate_hz, 10) if shifted else np.zeros(10)
+    times = tuple(begin + shift + np.arange(count) / rate_hz for begin, shift in zip(begins, shifts, strict=True))
+    lines_hz, wave = (0.1, 0.3), np.array([6.0 + 2.0j, 3.0 - 1.0j])
+    turned = [np.exp(2j * np.pi * np.multiply.outer(time, lines_hz)) for time in times]
+    seen, alone, told = [], [], []
+    for _ in range(100):
+        mean = rng.uniform(0.0, 1.0)
+        noisy = [mean + (each @ wave).real + noise * rng.standard_normal(count) for each in turned]
+        periods = tuple(np.round(one) for one in noisy)
+        error = [2.0 / count * (each.conj().T @ (one - before))
+                 for each, one, before in zip(turned, periods, noisy, strict=True)]
+        seen.append(np.abs(np.mean(error, axis=0)) ** 2)
+        alone.append(np.abs(error) ** 2)
+        told.append(repeating_rounding(periods, times, begins, 0.0, lines_hz, wave, 0.0, 1.0))
+    once = np.mean(alone)
+    assert np.mean(told) < 3.0 * np.mean(seen) + 0.05 * once
+    assert np.mean(told) > np.mean(seen) / 3.0 - 0.1 * once
+
+
+def test_a_coarse_register_that_rounds_alike_in_every_period_is_no_contradiction():
+    """1 rpm at 10 Hz: the scatter between periods knows nothing of it, and spoke against the model at p = 1e-50."""
+    exact = closed_form(offsets=(4.0, 7.0), rate_hz=10.0)
+    coarse = replace(rounded(exact, 0.1047, 1e-3), speed_resolution_rad_s=0.1047)
+    said = identify(coarse, Options(model="rigid"))
+    assert said.residual.p_value > 0.01
+    assert said.inertia.low <= 104.0 <= said.inertia.high

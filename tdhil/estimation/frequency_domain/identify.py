@@ -45,7 +45,8 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
     recording, samples = case.recording, case.samples
     check_motion(recording, excitation, samples)
     cut = stretches(samples, excitation.segments)
-    fits = tuple(period_lines(stretch, samples) for stretch in cut)
+    quanta = (recording.speed_resolution_rad_s, recording.torque_resolution_nm)
+    fits = tuple(period_lines(stretch, samples, quanta) for stretch in cut)
     rough = _rough(fits)
     levels = measure_levels(cut, fits, samples, recording.levels, rough)
     constraint = _tie(case, levels, rough)

@@ -61,6 +61,61 @@ class Edge:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# Rounding that repeats with the motion isn't in the scatter between periods, and no number of periods averages it.
+#
+# A signal rounded to q is off by q²/12 in square. With ρ_p(t) what a period's samples are off its segment's mean wave,
+# the part of it that comes again is how two periods in a row go together at the same phase,
+#
+#     r² = mean ρ_p(t) ρ_(p+1)(t),      0 ≤ r² ≤ q²/12:
+#
+# noise, and instants that lie otherwise in each period, have no part in it. Where noise of deviation σ goes before the
+# rounding, it can't be more than the sawtooth of rounding smoothed by it, Σ_k e^(−4π²k²σ²/q²) q²/(2π²k²): a thousandth
+# for σ = 0.4 q, which settles it where ρ is mostly noise.
+#
+# Of N samples with errors of their own, a line's is 4 r²/N (complex: E|·|²). Where the signal takes many samples for
+# one step these have one error together: it changes sign twice on a step, so N is at most twice the steps of a period.
+
+
+_HARMONICS = np.arange(1.0, 9.0)
+_SURE = 1.25            # of q²/12: so much of the residuals' square may be rounding
+_LOOKED_AT = 40_000     # samples, in whole periods
+_UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked at further
+
+
+def repeating_rounding(
+    periods: tuple[FloatArray, ...], times: tuple[FloatArray, ...], begins: list[float], start_s: float,
+    lines_hz: tuple[float, ...], wave: NDArray[np.complex128], scatter: float, quantum: float,
+) -> float:
+    """E|·|² of what rounding to ``quantum`` leaves in the mean of a line, over periods' samples and their times.
+
+    ``begins``: when each period began, s; ``wave`` (K,): the mean lines; ``scatter``: the least variance of a period's.
+    """
+    if not quantum > 0.0 or not periods:
+        return 0.0
+    count = min(len(periods[0]), 2.0 * float(np.sum(np.abs(np.diff(periods[0])))) / quantum)
+    whole = 4.0 * quantum**2 / 12.0 / max(count, 1.0)
+    if whole * len(periods) < _UNDETECTED * scatter:
+        return 0.0
+    omega = 2.0 * np.pi * np.asarray(lines_hz)
+    few = slice(max(2, _LOOKED_AT // len(periods[0])))
+    phases = [time - begin for time, begin in zip(times[few], begins[few], strict=True)]
+    rests = [
+        signal - (np.exp(1j * np.multiply.outer(time - start_s, omega)) @ wave).real
+        for signal, time in zip(periods[few], times[few], strict=True)
+    ]
+    rests = [rest - rest.mean() for rest in rests]
+    half = 0.5 * float(np.median(np.diff(phases[0])))
+    again = 0.0
+    for first, second, phase, other in zip(rests[:-1], rests[1:], phases[:-1], phases[1:], strict=True):
+        nearest = np.minimum(np.searchsorted(other, phase - half), len(other) - 1)
+        again += float(np.mean(first * second[nearest])) / (len(rests) - 1)
+    noise = max(float(np.mean([np.var(rest) for rest in rests])) - _SURE * quantum**2 / 12.0, 0.0)
+    smoothed = np.exp(-4.0 * np.pi**2 * _HARMONICS**2 * noise / quantum**2) / _HARMONICS**2
+    most = float(np.sum(smoothed) / np.sum(1.0 / _HARMONICS**2))
+    return whole * min(max(again / (quantum**2 / 12.0), 0.0), most)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 ComplexArray = NDArray[np.complex128]
 
@@ -74,7 +129,7 @@ class PeriodLines:
     """One stretch of P periods: ``speed``, ``torque``, ``ramp`` (P, K) complex lines, the rest (P,).
 
     ``drift`` is the net change of speed per second; it is taken off ``speed``, not yet off ``torque``. ``ramp`` are the
-    lines of tᶜ itself, s.
+    lines of tᶜ itself, s. ``rounding``: E|·|² of what rounding leaves in the means of speed's and torque's lines.
     """
 
     lines_hz: tuple[float, ...]
@@ -84,6 +139,7 @@ class PeriodLines:
     speed_mean: FloatArray
     torque_mean: FloatArray
     drift: FloatArray
+    rounding: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -110,8 +166,11 @@ class Line:
         return bool(np.all(speed_clear & torque_clear))
 
 
-def period_lines(stretch: Stretch, samples: Samples) -> PeriodLines:
-    """The least-squares lines of every period of a stretch; ``samples``: all there are, to look across theirs."""
+def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float] = (0.0, 0.0)) -> PeriodLines:
+    """The least-squares lines of every period of a stretch; ``samples``: all there are, to look across theirs.
+
+    ``quanta``: what speed and torque are rounded to, rad/s and N·m.
+    """
     segment = stretch.segment
     lines = segment.lines_hz
     count = len(lines)
@@ -123,15 +182,31 @@ def period_lines(stretch: Stretch, samples: Samples) -> PeriodLines:
     edge = Edge(samples.between(segment.start_s - 1e-9, segment.end_s - 1e-9), segment.start_s, lines, wave)
     begins = [segment.start_s + number * segment.period_s for number in stretch.index]
     drift = np.array([edge.drift(begin, segment.period_s) for begin in begins])
+    speed = table[:, 0] - drift[:, None] * table[:, 2]
+    times = tuple(period.time_s for period in stretch.periods)
+    rounding = [
+        repeating_rounding(signals, times, begins, segment.start_s, lines, seen.mean(axis=0), _least(seen), quantum)
+        if len(signals) > 1 else 0.0
+        for signals, seen, quantum in (
+            (tuple(period.speed_rad_s for period in stretch.periods), speed, quanta[0]),
+            (tuple(period.torque_nm for period in stretch.periods), table[:, 1], quanta[1]),
+        )
+    ]
     return PeriodLines(
         lines_hz=lines,
-        speed=table[:, 0] - drift[:, None] * table[:, 2],
+        speed=speed,
         torque=table[:, 1],
         ramp=table[:, 2],
         speed_mean=means[:, 0] - drift * means[:, 2],
         torque_mean=means[:, 1],
         drift=drift,
+        rounding=(rounding[0], rounding[1]),
     )
+
+
+def _least(lines: ComplexArray) -> float:
+    """The smallest scatter of a line's periods (P, K)."""
+    return float(np.min(np.sum(np.abs(lines - lines.mean(axis=0)) ** 2, axis=0))) / max(len(lines) - 1, 1)
 
 
 def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[FloatArray, ComplexArray]:
@@ -170,14 +245,15 @@ def pooled_lines(
     frequencies = sorted({round(hertz, 9) for fit in fits for hertz in fit.lines_hz})
     pooled = []
     for hertz in frequencies:
-        speeds, torques = [], []
+        speeds, torques, rounding = [], [], []
         for fit, rate in zip(fits, rates, strict=True):
             torque = torque_lines(fit, viscous, rate)
             for column, own in enumerate(fit.lines_hz):
                 if round(own, 9) == hertz and len(fit.speed) > 0:
                     speeds.append(fit.speed[:, column])
                     torques.append(torque[:, column])
-        line = _pool(hertz, speeds, torques)
+                    rounding.append(len(fit.speed) * np.asarray(fit.rounding))
+        line = _pool(hertz, speeds, torques, rounding)
         if line is not None:
             pooled.append(line)
     return tuple(pooled)
@@ -189,7 +265,10 @@ def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> Compl
     return torque
 
 
-def _pool(hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray]) -> Line | None:
+def _pool(
+    hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray], rounding: list[FloatArray]
+) -> Line | None:
+    """``rounding``: of each segment, as large as if it came anew in every period."""
     nu = float(sum(len(speed) - 1 for speed in speeds))
     if nu < 1.0:
         return None
@@ -200,6 +279,9 @@ def _pool(hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray])
         s_ww += float(np.sum(np.abs(dw) ** 2)) / nu
         s_tt += float(np.sum(np.abs(dt) ** 2)) / nu
         s_tw += complex(np.sum(dt * dw.conj())) / nu
+    by_rounding = np.mean(rounding, axis=0)
+    s_ww += float(by_rounding[0])
+    s_tt += float(by_rounding[1])
     mean_speed = np.array([speed.mean() for speed in speeds])
     mean_torque = np.array([torque.mean() for torque in torques])
     s_ww += _FLOOR * float(np.max(np.abs(mean_speed) ** 2))
