@@ -11,6 +11,7 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
+from tdhil.estimation import identify
 from tdhil.recording.log_reader import read_run
 from tdhil.session.conclusion import conclude
 from tests.path.path_runs import QUICK, clean_environment
@@ -33,7 +34,21 @@ def ended(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def log(ended):
+def once():
+    """`identify`, whose work is done once: all replays here are of one log, and differ in where they print."""
+    kept = {}
+
+    def identified(recording, options):
+        if options not in kept:
+            kept[options] = identify(recording, options)
+        return kept[options]
+
+    return identified
+
+
+@pytest.fixture
+def log(ended, once, monkeypatch):
+    monkeypatch.setattr("tdhil.estimation.identification.identify", once)
     return ended[2]
 
 
