@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import tdhil
 from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
 from tdhil.cli.main import main
-from tdhil.errors import ExitCode, Interrupted, UsageError
+from tdhil.errors import Interrupted, UsageError
 from tdhil.session.confirm import AskingAttendant, TerminalAttendant
 from tdhil.session.stop_signals import stop_on_signals
 
@@ -261,7 +262,6 @@ def test_a_library_that_is_missing_is_named(record, monkeypatch):
         record.to_pandas()
 
 
-def test_the_example_runs(tmp_path):
-    done = subprocess.run([sys.executable, EXAMPLE], capture_output=True, text=True, cwd=tmp_path)
-    assert done.returncode == ExitCode.OK, done.stderr
-    assert "kg·m²" in done.stdout
+def test_the_example_runs(capsys):
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    assert "kg·m²" in capsys.readouterr().out

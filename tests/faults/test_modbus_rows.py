@@ -111,7 +111,12 @@ SURVIVES = [
 ]
 
 
-@pytest.mark.parametrize(("row", "name", "becomes", "requests"), SURVIVES, ids=[case[1] for case in SURVIVES])
+# tests/drivers/test_modbus_drive.py has all five of them, cycle by cycle.
+@pytest.mark.parametrize(("row", "name", "becomes", "requests"), [
+    pytest.param(*case, id=case[1],
+                 marks=() if case[1] in ("busy, twice", "one late reply") else pytest.mark.heavy)
+    for case in SURVIVES
+])
 def test_it_is_survived(row, name, becomes, requests, line, monkeypatch, tmp_path, seen):
     acted = at(monkeypatch, "acquire", 5.0, lambda _: line.begin(becomes, requests))
     ended = run(tmp_path, *MODBUS)

@@ -15,7 +15,7 @@ RATE_HZ = 100
 # amplitude that the torque limit allows, and the noise of the reported speed (6 % of the variance of α) then takes as
 # much off the slope: in torque mode, without that loop, the motion is twice as large.
 TONES = [
-    (0.1, "speed", 107.0),
+    pytest.param(0.1, "speed", 107.0, marks=pytest.mark.heavy),       # speed mode and a tone: `both_buses`, `slow_line`
     pytest.param(0.3, "speed", 118.0, marks=pytest.mark.long),
     pytest.param(0.5, "speed", 137.0, marks=pytest.mark.long),
     (1.0, "torque", 186.0),

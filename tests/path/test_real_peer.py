@@ -164,6 +164,7 @@ def test_a_wrong_word_moves_nothing(prompt, drive, answer):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy      # no word at all: `without_a_terminal`, and tests/api/test_front_door.py
 def test_end_of_input_moves_nothing(prompt, drive):
     prompt.type("\x04")
     assert prompt.finish() == 4

@@ -55,7 +55,7 @@ def aborted_stage(log):
 
 ALWAYS, HEAVY = (), pytest.mark.heavy
 SELDOM = {
-    ("SIGINT", "setup"): ALWAYS, ("SIGINT", "acquire"): ALWAYS, ("SIGINT twice", "acquire"): ALWAYS,
+    ("SIGINT", "setup"): ALWAYS, ("SIGINT", "acquire"): HEAVY, ("SIGINT twice", "acquire"): ALWAYS,
     ("SIGINT", "speed"): HEAVY, ("SIGINT", "torque"): HEAVY, ("SIGTERM", "speed"): HEAVY,
 }
 """What a signal and a stage are marked with; those that aren't here are long."""
@@ -128,7 +128,9 @@ def test_ctrl_c_in_real_time(tmp_path):
     assert read_run(done.log).complete
 
 
-@pytest.mark.parametrize("stage", ["speed", pytest.param("hold", marks=pytest.mark.long), "acquire"])
+@pytest.mark.parametrize("stage", [       # in stage 2, tests/faults/test_rows_process.py kills one as well
+    pytest.param("speed", marks=pytest.mark.heavy), pytest.param("hold", marks=pytest.mark.long), "acquire",
+])
 def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
     with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
         tmp_path, *drive.options, "--stepped", *LONG
