@@ -14,6 +14,7 @@ off T̄_s first. The tie of B to the levels is a real t-distribution, (n + 1) ln
 Gaussian.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,7 +170,7 @@ class Likelihood:
         z = self.tie_error(theta)
         dof = self.constraint.dof
         found = np.empty(len(known) + 1)
-        found[:-1], found[-1] = known, np.sign(z) * np.sqrt((dof + 1.0) * np.log1p(z * z / dof))
+        found[:-1], found[-1] = known, math.copysign(math.sqrt((dof + 1.0) * float(np.log1p(z * z / dof))), z)
         return found
 
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:

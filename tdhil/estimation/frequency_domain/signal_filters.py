@@ -44,12 +44,10 @@ _AVERAGE_CYCLES = 0.8          # an average of w has a zero at 1/w: lines must s
 
 def log_ratio(phi: FloatArray, s: ComplexArray) -> ComplexArray:
     """Ln F_T/F_w, (K,); ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s)."""
-    x = phi[SPEED_LAG] * s
-    y = phi[TORQUE_LAG] * s
-    ratio: ComplexArray = (
-        np.log((1.0 + x + phi[SPEED_SHAPE] * x * x) / (1.0 + y + phi[TORQUE_SHAPE] * y * y)) - phi[SKEW] * s
-    )
-    u = float(phi[AVERAGE])
+    speed_lag, speed_shape, torque_lag, torque_shape, u, skew = phi.tolist()
+    x = speed_lag * s
+    y = torque_lag * s
+    ratio: ComplexArray = np.log((1.0 + x + speed_shape * x * x) / (1.0 + y + torque_shape * y * y)) - skew * s
     if u != 0.0:
         ratio = ratio + np.sign(u) * np.log(np.sinc(np.abs(s) * np.sqrt(abs(u)) / (2.0 * np.pi)))
     return ratio
@@ -71,13 +69,14 @@ def log_ratio_jacobian(phi: FloatArray, s: ComplexArray) -> ComplexArray:
     With y = ω √|u|/2: ∂a/∂u = (y cot y − 1)/(2|u|), which is −ω²/24 at u = 0.
     """
     found = np.empty((len(s), COUNT), dtype=np.complex128)
+    values = phi.tolist()
     for lag, shape, sign in ((SPEED_LAG, SPEED_SHAPE, 1.0), (TORQUE_LAG, TORQUE_SHAPE, -1.0)):
-        x = phi[lag] * s
-        poles = sign / (1.0 + x + phi[shape] * x * x)
-        found[:, lag] = (s + 2.0 * phi[shape] * x * s) * poles
+        x = values[lag] * s
+        poles = sign / (1.0 + x + values[shape] * x * x)
+        found[:, lag] = (s + 2.0 * values[shape] * x * s) * poles
         found[:, shape] = x * x * poles
     quarter = 0.25 * np.abs(s) ** 2
-    y2 = quarter * abs(float(phi[AVERAGE]))
+    y2 = quarter * abs(values[AVERAGE])
     series = -1.0 / 6.0 - y2 / 90.0
     small = y2 < 1e-3
     if small.all():
