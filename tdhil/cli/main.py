@@ -15,6 +15,8 @@ from tdhil.version import __version__
 _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
     "replay": "identify again from a log, or from a trace that a drive's own tool exported",
+    "fleet": "identify many logs again, into one table: by processes here, or on a Dask cluster",
+    "watch": "identify new logs in a folder as they come",
     "export": "a log's CAN frames or samples in another program's format",
     "profiles": "what is known of which drive, what it needs set, and how sure that is",
     "scan": "find out who is on the bus; writes nothing to any drive",
@@ -89,6 +91,10 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.cli.identify import add_arguments
     elif name == "replay":
         from tdhil.cli.replay import add_arguments
+    elif name == "fleet":
+        from tdhil.cli.fleet import add_arguments
+    elif name == "watch":
+        from tdhil.cli.fleet import add_watch_arguments as add_arguments
     elif name == "stop":
         from tdhil.cli.stop import add_arguments
     elif name == "study":

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
     from tdhil.recording.log_writer import RunWriter as RunWriter
     from tdhil.recording.mcap_container import MAGIC as MAGIC
+    from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, LagPrior as LagPrior,
         Level as Level, Ramp as Ramp, Recording as Recording, Segment as Segment, Stage as Stage,
@@ -31,6 +32,7 @@ else:
             "log_reader": ("read_cycles", "read_frames", "read_run"),
             "log_writer": ("RunWriter",),
             "mcap_container": ("MAGIC",),
+            "packed": ("pack_recording", "unpack_recording"),
             "recording": (
                 "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Ramp", "Recording", "Segment",
                 "Stage", "SteppedSetpoint", "aborted_stage", "before_abort",

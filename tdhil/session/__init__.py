@@ -20,7 +20,8 @@ if TYPE_CHECKING:
         DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
     )
     from tdhil.session.log_place import (
-        check_different_files as check_different_files, check_log_path as check_log_path, make_room as make_room,
+        check_different_files as check_different_files, check_log_path as check_log_path, is_live as is_live,
+        make_room as make_room,
     )
     from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
     from tdhil.session.plan_ahead import (
@@ -50,7 +51,7 @@ else:
             ),
             "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
             "holder": ("DriveHeld", "Holder", "address_of", "hold", "holder_of"),
-            "log_place": ("check_different_files", "check_log_path", "make_room"),
+            "log_place": ("check_different_files", "check_log_path", "is_live", "make_room"),
             "opening": ("open_drive", "plan_peer", "with_faults"),
             "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry", "refuse_hopeless"),
             "recorded": ("RunRecord", "is_log", "read"),

@@ -32,7 +32,7 @@ class RunRecord:
     """One run or one trace. ``configuration``: the run's, as its log has it; ``log``: the file.
 
     ``assumed``: what was assumed in reading a foreign trace, None for a run of ours; ``problems``: what of the file was
-    stepped over, a line each.
+    stepped over, a line each; ``stored_result``: the result document that the run itself left in its log.
     """
 
     recording: Recording
@@ -41,6 +41,7 @@ class RunRecord:
     assumed: tuple[str, ...] | None = None
     problems: tuple[str, ...] = ()
     ended: Ended | None = None
+    stored_result: Mapping[str, Any] | None = None
 
     @property
     def whole(self) -> bool:
@@ -168,7 +169,7 @@ def _read_log(path: Path) -> RunRecord:
     if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
         began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
         configuration["started"] = began.isoformat(timespec="seconds")
-    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended)
+    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended, found.result)
 
 
 def _read_trace(

@@ -1,0 +1,218 @@
+"""A thousand logs of twenty rigs, ten of them poisoned: the same table by every road, whoever is killed; what it costs.
+
+    python benchmarks/fleet_thousand.py [--logs 1000] [--roads pool one dask] [--kills 50] [--folder DIR]
+    python benchmarks/fleet_thousand.py --cost [--copies 20]
+
+The logs are real run.mcap files of the studies' batch simulator. With --cost: CPU seconds a log of a real run's size
+(simulated once, 8.7 MB), cold and from the cache, beside a plain replay; memory; how soon the pool starts.
+"""
+
+import argparse
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tdhil.fleet import FleetRequest, FleetRow, Settings, TaskLimits, run_fleet  # noqa: E402
+from tdhil.fleet.pool import Pool  # noqa: E402
+from tests.fleet import poison  # noqa: E402
+from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
+from tests.recording.test_damage import bomb  # noqa: E402
+
+LIMITS = TaskLimits(25.0, 1_500_000_000)
+POISONED = {
+    "kills": (2, poison.KILLS), "hangs": (2, poison.HANGS), "bomb": (1, bomb("zstd", 500_000_000, 500_000_000)),
+    "corrupt": (2, b"\x89MCAP0\r\n" + random.Random(1).randbytes(100_000)), "empty": (1, b""),
+    "foreign": (1, b"GIF89a"),
+}
+
+
+def generate(folder: Path, logs: int, rigs: int) -> None:
+    began, cpu = time.monotonic(), time.process_time()
+    folder.mkdir(parents=True)
+    for number, plant in enumerate(rig_plants(rigs)):
+        place = folder / plant.name
+        place.mkdir()
+        for _ in write_rig(place, plant, logs // rigs, 1 + number):
+            pass
+    rng = random.Random(7)
+    every = sorted(folder.rglob("*.mcap"))
+    victims = rng.sample(every, 10)
+    for count, content in POISONED.values():
+        for _ in range(count):
+            victims.pop().write_bytes(content)
+    gone = victims.pop()                       # unreadable, for root too: a link to what isn't there
+    gone.unlink()
+    gone.symlink_to("nowhere")
+    wall_s, cpu_s = time.monotonic() - began, time.process_time() - cpu
+    print(f"{len(every)} logs of {rigs} rigs made in {wall_s:.0f} s, {cpu_s:.0f} s CPU", flush=True)
+
+
+class Killer:
+    """Kills processes of the pool, or of a cluster, at random while rows come in."""
+
+    def __init__(self, kills: int, victims: Any) -> None:
+        self.kills, self._left, self._victims, self._rng = 0, kills, victims, random.Random(11)
+        self._chance = 0.0
+
+    def start(self, total: int, done: int) -> None:
+        self._chance = 1.3 * self._left / max(1, total)
+
+    def done(self, row: FleetRow) -> None:
+        if self._left and self._rng.random() < self._chance:
+            pids = self._victims()
+            if pids:
+                try:
+                    os.kill(self._rng.choice(pids), signal.SIGKILL)
+                except ProcessLookupError:
+                    return
+                self._left -= 1
+                self.kills += 1
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            found += [int(one) for one in path.read_text().split()]
+        except OSError:
+            continue
+    return found
+
+
+def pool_processes(of: int) -> list[int]:
+    found = []
+    for pid in children(of):
+        try:
+            if b"tdhil.fleet.pool" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.append(pid)
+        except OSError:
+            continue
+    return found
+
+
+def by_road(road: str, request: FleetRequest, kills: int) -> tuple[FleetRow, ...]:
+    began = time.monotonic()
+    if road == "dask":
+        import dask
+        from distributed import Client, LocalCluster
+
+        dask.config.set({"distributed.scheduler.allowed-failures": 10})
+        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+            asking = Client(cluster, set_as_default=False)
+
+            def victims() -> list[int]:
+                try:
+                    workers = list(asking.run(os.getpid).values())
+                except Exception:
+                    return []
+                return workers + [pid for worker in workers for pid in pool_processes(worker)]
+
+            killer = Killer(kills, victims)
+            summary = run_fleet(
+                replace(request, scheduler=cluster.scheduler_address), killer, function=poison.identify)
+            asking.close()
+    else:
+        killer = Killer(kills if road == "pool" else 0, lambda: pool_processes(os.getpid()))
+        summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=poison.identify)
+    rows = summary.rows
+    names = Counter(row.log for row in rows)
+    print(f"{road:5}: {len(rows)} rows, {sum(not row.failed for row in rows)} results, "
+          f"{dict(Counter(str(row.error_kind) for row in rows if row.failed))}; {killer.kills} killed; "
+          f"lost {summary.left}, twice {sum(count > 1 for count in names.values())}; "
+          f"{summary.cpu_s / max(1, len(rows)):.3f} s CPU a log, {time.monotonic() - began:.0f} s in all", flush=True)
+    return rows
+
+
+def thousand(asked: argparse.Namespace, folder: Path) -> None:
+    logs = folder / "logs"
+    if not logs.exists():
+        generate(logs, asked.logs, asked.rigs)
+    tables = {}
+    for road in asked.roads:
+        request = FleetRequest((str(logs),), folder / f"{road}.parquet", limits=LIMITS, cache=False, again=True)
+        tables[road] = [repr(row) for row in by_road(road, request, asked.kills)]
+    first = next(iter(tables.values()))
+    for road, rows in tables.items():
+        differ = sum(a != b for a, b in zip(rows, first, strict=True))
+        print(f"{road}: {differ} rows differ from {next(iter(tables))}'s")
+
+
+def cost(asked: argparse.Namespace, folder: Path) -> None:
+    import tdhil
+    from tdhil.recording.log_format import CLASSES, CONFIGURATION
+    from tdhil.recording.salvage import examine, write_copy
+
+    log = folder / "run.mcap"
+    with tdhil.simulate(seed=7) as drive:
+        tdhil.run(drive, log=log)
+    found = examine(log)
+    logs = folder / "copies"
+    logs.mkdir()
+    for number in range(asked.copies):
+        def noted(channel: int, payload: bytes, number: int = number) -> bytes:
+            if channel != CONFIGURATION:
+                return payload
+            content = json.loads(CLASSES["Text"].FromString(payload).json)
+            content["run"]["note"] = f"copy {number}"
+            return CLASSES["Text"](json=json.dumps(content)).SerializeToString()
+
+        write_copy(log, logs / f"{number}.mcap", found, noted)
+        if number == 0:
+            print(f"{log.stat().st_size / 1e6:.1f} MB a run, {len(found.run.recording.time_s)} samples")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([sys.executable, "-m", "tdhil", "replay", str(log), "--json"], check=True,
+                   stdout=subprocess.DEVNULL, cwd=ROOT)
+    print(f"tdhil replay, a process of its own: {children_cpu_s(before):.2f} s CPU")
+    request = FleetRequest((str(logs),), folder / "cost.csv", jobs=2)
+    for what, settings in (("cold", Settings()), ("from the cache", Settings(confidence=0.9))):
+        before, own, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.process_time(), time.monotonic()
+        summary = run_fleet(replace(request, settings=settings))
+        whole = children_cpu_s(before) + time.process_time() - own
+        rest = sorted(cpu_s for _, cpu_s in summary.slowest)
+        print(f"{what}: {whole / asked.copies:.3f} s CPU a log, all processes and their starts included "
+              f"({summary.cpu_s / asked.copies:.3f} in the tasks; slowest {rest[-1]:.2f}), "
+              f"{time.monotonic() - began:.1f} s in all; "
+              f"{resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024:.0f} MB the largest process")
+    began = time.monotonic()
+    with Pool(poison.work, 2, LIMITS) as pool:
+        list(pool.run([1, 2]))
+    print(f"start of the pool: {time.monotonic() - began:.2f} s until two processes have answered")
+
+
+def children_cpu_s(before: Any) -> float:
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return float(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--logs", type=int, default=1000)
+    parser.add_argument("--rigs", type=int, default=20)
+    parser.add_argument("--roads", nargs="+", choices=("pool", "one", "dask"), default=["pool", "one", "dask"])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--folder", type=Path, help="where logs and tables stay")
+    parser.add_argument("--cost", action="store_true")
+    parser.add_argument("--copies", type=int, default=20)
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="tdhil-thousand-") as folder:
+        place = asked.folder or Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        (cost if asked.cost else thousand)(asked, place)
+
+
+if __name__ == "__main__":
+    main()

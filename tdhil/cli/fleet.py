@@ -1,0 +1,255 @@
+"""`tdhil fleet` and `tdhil watch`: many logs identified into one table, once or as they come."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from profiles.quantities import TIME
+from tdhil.cli.arguments import amount, share
+from tdhil.config import MODELS
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from tdhil.fleet import FleetRequest, FleetRow, FleetSummary, Progress
+
+_SHOWN = 10         # failures, changes: more stand in the table
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of fleet."""
+    parser.add_argument("logs", nargs="+", metavar="FOLDER|LOG",
+                        help="folders with run.mcap files and traces (.csv with a .yaml of the same name), or files")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE",
+                        help="the table: fleet.parquet (extra `fleet`), fleet.csv or fleet.sqlite")
+    _add_settings(parser)
+    where = parser.add_mutually_exclusive_group()
+    _add_jobs(where)
+    where.add_argument("--scheduler", metavar="tcp://HOST:8786", help="a Dask cluster instead (extra `cluster`)")
+    parser.add_argument("--again", action="store_true", help="do all of them, whatever is there already")
+    parser.add_argument("--retry-failed", action="store_true", help="do those again that failed")
+    parser.set_defaults(run=run)
+
+
+def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of watch."""
+    parser.add_argument("folder", type=Path, metavar="DIR", help="where logs come in; below it, too")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the table (default: DIR/fleet.csv)")
+    _add_settings(parser)
+    _add_jobs(parser)
+    parser.add_argument("--every", type=amount(TIME), default=2.0, metavar="S", help="how often it looks (default 2 s)")
+    parser.add_argument("--once", action="store_true", help="look once, and end")
+    parser.set_defaults(run=run_watch)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: each run's, or auto)")
+    parser.add_argument("--confidence", type=share, metavar="P", help="of the intervals (default: each run's, or 0.95)")
+    parser.add_argument("--tolerance", type=share, metavar="SHARE",
+                        help="half-width of the interval that is enough (default: each run's, or 0.05)")
+    parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
+                        help="for one log; twice over it, it is set aside (default 120 s)")
+    parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
+                        help="for one log (default 1500 MB)")
+    parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
+    parser.add_argument("--json", action="store_true", help="the summary as one JSON document on stdout")
+
+
+def _add_jobs(group: Any) -> None:
+    group.add_argument("--jobs", type=int, metavar="N", help="processes at once (default: the processor's cores)")
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Identify, write the table, print the summary."""
+    from tdhil.fleet import run_fleet
+
+    request = _request(namespace, tuple(namespace.logs), namespace.out)
+    with _Bar() as bar:
+        summary = run_fleet(request, bar)
+    _print(summary, namespace.json)
+    return int(ExitCode.INTERRUPTED) if summary.interrupted else summary.exit_code
+
+
+def run_watch(namespace: argparse.Namespace) -> int:
+    """Look, identify what is new, look again, until Ctrl-C."""
+    from tdhil.fleet import find_logs, run_fleet
+
+    folder: Path = namespace.folder
+    if not folder.is_dir():
+        raise UsageError("there is no such folder", where=str(folder))
+    request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
+    seen: set[str] = set()
+    rested: dict[str, tuple[int, int]] = {}
+    while True:
+        now = {log: _stamp(log) for log in find_logs(request.roots).logs}
+        # A file that grows without a lock (a copy that is under way) is left until it rests.
+        calm = all(rested.get(log) == stamp for log, stamp in now.items()) or namespace.once
+        rested = now
+        if now and calm and set(now) != seen:
+            summary = run_fleet(request)
+            for row in summary.rows:
+                if row.log not in seen:
+                    _tell(row, namespace.json)
+            seen = {row.log for row in summary.rows}
+            if summary.interrupted:
+                raise KeyboardInterrupt
+        if namespace.once:
+            return int(ExitCode.OK)
+        time.sleep(namespace.every)
+
+
+def _stamp(log: str) -> tuple[int, int]:
+    try:
+        found = Path(log).stat()
+    except OSError:
+        return 0, 0
+    return found.st_size, found.st_mtime_ns
+
+
+def _tell(row: FleetRow, as_json: bool) -> None:
+    from tdhil.report import PlainConsole
+
+    if as_json:
+        from dataclasses import asdict
+
+        sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
+    else:
+        PlainConsole().print(f"{row.log}: {_result_text(row)}", soft_wrap=True)
+    sys.stdout.flush()
+
+
+def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -> FleetRequest:
+    from tdhil.fleet import FleetRequest, Settings, TaskLimits
+
+    if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
+        raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
+    if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
+        raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
+    if namespace.tolerance is not None and not namespace.tolerance > 0.0:
+        raise UsageError(f"{namespace.tolerance:g}: must be a positive share", where="--tolerance")
+    if not namespace.time_limit > 0.0:
+        raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit")
+    if not namespace.memory_limit >= 100:
+        raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
+    return FleetRequest(
+        roots, out, Settings(namespace.model, namespace.confidence, namespace.tolerance),
+        jobs=namespace.jobs or _cores(),
+        scheduler=getattr(namespace, "scheduler", None),
+        limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),
+        cache=not namespace.no_cache, again=getattr(namespace, "again", False),
+        retry_failed=getattr(namespace, "retry_failed", False),
+    )
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How it goes, on stderr; what came of it, on stdout
+
+
+class _Bar:
+    """A bar with the time left on a terminal; elsewhere nothing."""
+
+    def __init__(self) -> None:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+        from rich.progress import Progress as RichProgress
+
+        from tdhil.report import PlainConsole
+
+        self._progress = RichProgress(
+            TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+            TextColumn("left"), TimeRemainingColumn(), console=PlainConsole(sys.stderr), transient=True,
+            disable=not sys.stderr.isatty(),
+        )
+        self._task = self._progress.add_task("logs", total=None)
+
+    def start(self, total: int, done: int) -> None:
+        self._progress.reset(self._task, total=total, completed=done)
+
+    def done(self, row: FleetRow) -> None:
+        self._progress.advance(self._task)
+
+    def __enter__(self) -> _Bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+
+def _print(summary: FleetSummary, as_json: bool) -> None:
+    if as_json:
+        json.dump(summary.document(), sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+        sys.stdout.write("\n")
+        return
+    from tdhil.report import PlainConsole
+
+    console = PlainConsole()
+    found = summary.document()
+    left = f", {summary.left} left to do" if summary.left else ""
+    before = f" ({summary.done_before} of them done before)" if summary.done_before else ""
+    console.print(f"{found['logs']} logs{before}{left} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
+    console.print(_counts(found))
+    _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
+    _list(console, "other than the result in the log", [
+        f"{one['log']}: {_was(one['stored_verdict'], one['stored_inertia_kg_m2'])} → "
+        f"{_was(one['verdict'], one['inertia_kg_m2'])}" for one in found["changed"]])
+    _list(console, "slowest", [f"{one['log']}: {one['cpu_s']:.2f} s of CPU" for one in found["slowest"]])
+    if summary.live:
+        console.print(f"left alone: {summary.live} being written")
+    if summary.bare_traces:
+        console.print(f"left out: {summary.bare_traces} CSV files without a .yaml beside them")
+
+
+def _counts(found: dict[str, Any]) -> Table:
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(justify="right")
+    table.add_column()
+    for name, count in (*found["verdicts"].items(), *found["failed"].items()):
+        table.add_row(str(count), name if name in found["verdicts"] else f"failed: {name}")
+    return table
+
+
+def _list(console: Any, title: str, lines: list[str]) -> None:
+    if not lines:
+        return
+    console.print(f"{title}:")
+    for line in lines[:_SHOWN]:
+        console.print(f"  {line}", soft_wrap=True)
+    if len(lines) > _SHOWN:
+        console.print(f"  and {len(lines) - _SHOWN} more, in the table")
+
+
+def _was(verdict: str, inertia_kg_m2: float | None) -> str:
+    return verdict if inertia_kg_m2 is None else f"{verdict} {inertia_kg_m2:.5g} kg·m²"
+
+
+def _result_text(row: FleetRow) -> str:
+    if row.failed:
+        return f"failed: {row.error_text}"
+    if row.inertia_kg_m2 is None:
+        return f"{row.verdict}: {row.reason}"
+    low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
+    return f"{row.verdict}, J {row.inertia_kg_m2:.5g} ({low:.5g} to {high:.5g}) kg·m²"
+
+
+if TYPE_CHECKING:
+    def _is_a_progress(bar: _Bar) -> Progress:
+        return bar

@@ -1,0 +1,26 @@
+"""Many logs: identified by a pool or a cluster into one table; compared, and watched over time."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.fleet.fleet import (
+        FleetRequest as FleetRequest, FleetSummary as FleetSummary, Progress as Progress, find_logs as find_logs,
+        run_fleet as run_fleet,
+    )
+    from tdhil.fleet.pool import TaskLimits as TaskLimits
+    from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings
+    from tdhil.fleet.table import read_table as read_table
+    from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "fleet": ("FleetRequest", "FleetSummary", "Progress", "find_logs", "run_fleet"),
+            "pool": ("TaskLimits",),
+            "rows": ("FleetRow", "Settings"),
+            "table": ("read_table",),
+            "task": ("Done", "LogTask", "identify_log"),
+        },
+    )

@@ -1,0 +1,142 @@
+"""The same tasks on a Dask cluster that is there already: `--scheduler tcp://host:8786` (extra `cluster`).
+
+A worker of Dask doesn't do a task itself: it keeps a `Pool` of one process beside it, with the same limits, tries and
+losses as on one machine. So no log can kill Dask's worker, and what kills that from outside costs a task only its turn.
+"""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from importlib import metadata
+from typing import Any, Final, TypeVar
+
+from tdhil.errors import TdhilError, UsageError
+from tdhil.fleet.pool import Loss, Pool, TaskLimits
+from tdhil.version import __version__
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_ASKED: Final = ("numpy", "scipy")      # their digits are in the rows
+_AHEAD: Final = 4                       # tasks for each thread of the cluster
+_RESUBMIT: Final = 5
+_PATIENCE_S: Final = 60.0               # without a single worker
+_LOOK_S: Final = 10.0
+_here = threading.local()
+
+
+def versions() -> dict[str, str]:
+    """What a worker must have in common with its host, by name."""
+    found = {"python": ".".join(platform.python_version_tuple()[:2]), "tdhil": __version__}
+    for name in _ASKED:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "none"
+    return found
+
+
+def guarded(function: Callable[[Task], Result], task: Task, limits: TaskLimits) -> Result | Loss:
+    """One task, in the process that this thread of a Dask worker keeps."""
+    pool = getattr(_here, "pool", None)
+    if pool is None or _here.made_for != (function, limits):
+        if pool is not None:
+            pool.close()
+        pool = _here.pool = Pool(function, 1, limits)
+        _here.made_for = (function, limits)
+    found: list[Result | Loss] = [result for _, result in pool.run([task])]
+    return found[0]
+
+
+def run_on_cluster(
+    function: Callable[[Task], Result], tasks: Iterable[Task], address: str, limits: TaskLimits
+) -> Iterator[tuple[Task, Result | Loss]]:
+    """Every task with its result, as `Pool.run` gives it. Raises UsageError before the start where the scheduler can't
+    be reached or its workers don't fit, and TdhilError where all of them have gone.
+    """
+    distributed = _distributed()
+    try:
+        client = distributed.Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise UsageError(f"no Dask scheduler answers: {error}", where=f"--scheduler {address}",
+                         next_step="Start one with: dask scheduler") from error
+    with client:
+        threads = _check(client, address)
+        yield from _results(distributed, client, function, tasks, limits, threads * _AHEAD)
+
+
+def _results(
+    distributed: Any, client: Any, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits,
+    most: int,
+) -> Iterator[tuple[Task, Result | Loss]]:
+    waiting = iter(tasks)
+    under_way: dict[Any, tuple[Task, int]] = {}
+
+    def submit(task: Task, tries: int) -> None:
+        under_way[client.submit(guarded, function, task, limits, pure=False)] = (task, tries)
+
+    while True:
+        for _, task in zip(range(most - len(under_way)), waiting, strict=False):
+            submit(task, 1)
+        if not under_way:
+            return
+        for future in _done(distributed, client, list(under_way)):
+            task, tries = under_way.pop(future)
+            if future.status == "finished":
+                yield task, future.result()
+                continue
+            failure = future.exception()
+            if not isinstance(failure, distributed.scheduler.KilledWorker):
+                raise TdhilError(f"a worker of the cluster failed: {failure!r}", where="fleet")
+            if tries < _RESUBMIT:
+                submit(task, tries + 1)
+            else:
+                yield task, Loss("ProcessDied", f"the cluster's workers died with it, in each of {tries} tries")
+
+
+def _done(distributed: Any, client: Any, futures: list[Any]) -> list[Any]:
+    """Those that are done, at least one. Raises TdhilError where there has been no worker for long."""
+    empty_s = 0.0
+    while True:
+        with suppress(TimeoutError), client.as_current():
+            return list(distributed.wait(futures, timeout=_LOOK_S, return_when="FIRST_COMPLETED").done)
+        empty_s = 0.0 if client.scheduler_info()["workers"] else empty_s + _LOOK_S
+        if empty_s >= _PATIENCE_S:
+            raise TdhilError(
+                f"the cluster has had no worker for {empty_s:.0f} s; what is done is kept", where="fleet",
+                next_step="Start workers, and the same command again",
+            )
+
+
+def _check(client: Any, address: str) -> int:
+    """How many tasks the cluster does at once. UsageError where a worker doesn't fit."""
+    wanted = versions()
+    try:
+        theirs = client.run(versions, on_error="return")
+    except Exception as error:
+        raise UsageError(f"its workers can't be asked for their versions: {error}", where=f"--scheduler {address}",
+                         next_step=f"Install tdhil {__version__} where they run") from error
+    if not theirs:
+        raise UsageError("the scheduler has no workers", where=f"--scheduler {address}",
+                         next_step=f"Start some with: dask worker {address}")
+    for worker, found in sorted(theirs.items()):
+        if not isinstance(found, dict):
+            raise UsageError(f"{worker} can't run it: {found!r}", where=f"--scheduler {address}",
+                             next_step=f"Install tdhil {__version__} there")
+        odd = [f"{name} {found.get(name)} (here {one})" for name, one in wanted.items() if found.get(name) != one]
+        if odd:
+            raise UsageError(f"{worker} has {', '.join(odd)}", where=f"--scheduler {address}",
+                             next_step="Rows would differ by who reckoned them: install the same versions")
+    return int(sum(client.nthreads().values()))
+
+
+def _distributed() -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as error:
+        raise UsageError("distributed is not installed", where="--scheduler",
+                         next_step="Install it with: pip install '.[cluster]'") from error

@@ -1,0 +1,306 @@
+"""Many logs, one table: what is found under some folders, done by a pool or a cluster, and what came of it."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from tdhil.errors import UsageError
+from tdhil.fleet.pool import Loss, Pool, TaskLimits
+from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_key
+from tdhil.fleet.table import Journal, check_table_path, write_table
+from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, sidecar_of
+
+_SLOWEST: Final = 5
+_GOOD: Final = ("valid", "valid_wide")
+
+
+@dataclass(frozen=True)
+class FleetRequest:
+    """``roots``: folders, files, or URLs of them; ``out``: the table. ``jobs``: processes at once on this machine.
+
+    ``scheduler``: a Dask cluster's address instead. ``cache``: keep recordings that were read beside the table;
+    ``again``: do all of them anew; ``retry_failed``: those that failed.
+    """
+
+    roots: tuple[str, ...]
+    out: Path
+    settings: Settings = field(default_factory=Settings)
+    jobs: int = 1
+    scheduler: str | None = None
+    limits: TaskLimits = field(default_factory=TaskLimits)
+    cache: bool = True
+    again: bool = False
+    retry_failed: bool = False
+
+    @property
+    def folder(self) -> Path:
+        """What is kept beside the table: the journal, and the recordings."""
+        return self.out.with_name(f"{self.out.name}.work")
+
+
+@dataclass(frozen=True)
+class FleetSummary:
+    """What came of it, the rows by log. ``done_before``: rows that were there already; ``live``: logs that are being
+    written; ``bare_traces``: CSV files without a sidecar; ``slowest``: log and CPU time in s; ``left``: not done yet.
+    """
+
+    rows: tuple[FleetRow, ...]
+    out: Path
+    done_before: int = 0
+    live: int = 0
+    bare_traces: int = 0
+    slowest: tuple[tuple[str, float], ...] = ()
+    cpu_s: float = 0.0
+    wall_s: float = 0.0
+    left: int = 0
+    interrupted: bool = False
+
+    def document(self) -> dict[str, Any]:
+        """As ``--json`` prints it."""
+        changed = [row for row in self.rows if row.changed]
+        return {
+            "out": str(self.out),
+            "logs": len(self.rows),
+            "verdicts": dict(sorted(Counter(row.verdict for row in self.rows if not row.failed).items())),
+            "failed": dict(sorted(Counter(row.error_kind for row in self.rows if row.failed).items(), key=str)),
+            "failures": [{"log": row.log, "kind": row.error_kind, "text": row.error_text}
+                         for row in self.rows if row.failed],
+            "changed": [
+                {"log": row.log, "verdict": row.verdict, "stored_verdict": row.stored_verdict,
+                 "inertia_kg_m2": row.inertia_kg_m2, "stored_inertia_kg_m2": row.stored_inertia_kg_m2}
+                for row in changed
+            ],
+            "slowest": [{"log": log, "cpu_s": cpu_s} for log, cpu_s in self.slowest],
+            "done_before": self.done_before, "live": self.live, "bare_traces": self.bare_traces, "left": self.left,
+            "cpu_s": self.cpu_s, "wall_s": self.wall_s,
+        }
+
+    @property
+    def exit_code(self) -> int:
+        """0: every log has a result; 3: some have none, or aren't done; 10: none has."""
+        bad = sum(row.failed for row in self.rows)
+        if bad == len(self.rows):
+            return 10
+        return 3 if bad or self.left else 0
+
+
+class Progress(Protocol):
+    """Told how it goes."""
+
+    def start(self, total: int, done: int) -> None:
+        """So many logs, of which so many are done."""
+
+    def done(self, row: FleetRow) -> None:
+        """One more."""
+
+
+class _Silent:
+    def start(self, total: int, done: int) -> None: ...
+
+    def done(self, row: FleetRow) -> None: ...
+
+
+def run_fleet(
+    request: FleetRequest,
+    progress: Progress | None = None,
+    function: Callable[[LogTask], Done] = identify_log,
+) -> FleetSummary:
+    """Identify all that isn't done yet, and write the table. Ctrl-C ends it early: what is done is in the table then.
+
+    Raises UsageError (nothing there, a file that isn't ours, a cluster that doesn't fit) and LogBroken (disk full).
+    """
+    check_table_path(request.out, request.folder)
+    began = time.monotonic()
+    found = find_logs(request.roots)
+    if not found.logs and not found.live:
+        raise UsageError("no log is there", where=", ".join(request.roots),
+                         next_step="Logs end in .mcap; a trace in .csv needs a .yaml of the same name beside it")
+    progress = progress or _Silent()
+    with Journal(request.folder) as journal, ExitStack() as stack:
+        rows, todo = _known(request, journal, found.logs)
+        before = len(rows)
+        progress.start(len(found.logs), before)
+        taken: list[tuple[float, str]] = []
+        interrupted = False
+        try:
+            results = _results(request, function, [task for task, _ in todo], stack) if todo else iter(())
+            stamps = {task.log: stamp for task, stamp in todo}
+            for task, result in results:
+                done = _lost(task, result) if isinstance(result, Loss) else result
+                row = done.row
+                key = None if row.sha256 is None else row_key(row.sha256, request.settings)
+                journal.add(row, key, stamps[task.log])
+                rows[task.log] = row
+                taken.append((done.cpu_s, task.log))
+                progress.done(row)
+        except KeyboardInterrupt:
+            interrupted = True
+            stack.close()
+        ordered = tuple(rows[log] for log in sorted(rows))
+        write_table(ordered, request.out)
+    taken.sort(reverse=True)
+    return FleetSummary(
+        rows=ordered, out=request.out, done_before=before, live=len(found.live), bare_traces=len(found.bare_traces),
+        slowest=tuple((log, cpu_s) for cpu_s, log in taken[:_SLOWEST]), cpu_s=sum(cpu_s for cpu_s, _ in taken),
+        wall_s=time.monotonic() - began, left=len(found.logs) - len(rows),
+        interrupted=interrupted,
+    )
+
+
+def _results(
+    request: FleetRequest, function: Callable[[LogTask], Done], tasks: Sequence[LogTask], stack: ExitStack
+) -> Iterator[tuple[LogTask, Done | Loss]]:
+    if request.scheduler is not None:
+        from tdhil.fleet.cluster import run_on_cluster
+
+        cluster = run_on_cluster(function, tasks, request.scheduler, request.limits)
+        stack.callback(cluster.close)  # type: ignore[attr-defined]
+        return cluster
+    pool: Pool[LogTask, Done] = stack.enter_context(Pool(function, min(request.jobs, len(tasks)), request.limits))
+    return pool.run(tasks)
+
+
+def _lost(task: LogTask, loss: Loss) -> Done:
+    """The row of a log that hangs or ends its process: with its content's hash, so that it isn't tried for ever."""
+    facts: dict[str, Any] = {}
+    if "://" not in task.log:
+        with suppress(OSError):
+            facts = {"sha256": content_hash(Path(task.log)), "size_bytes": Path(task.log).stat().st_size}
+    return Done(failure_row(task.log, loss.kind, loss.text, task.settings, **facts))
+
+
+Stamp = tuple[int, int] | None
+
+
+def _known(
+    request: FleetRequest, journal: Journal, logs: Sequence[str]
+) -> tuple[dict[str, FleetRow], list[tuple[LogTask, Stamp]]]:
+    """Rows that are there already, by log, and what is left to do.
+
+    A file that was not touched since is known by size and time; another one by its content, where there are results
+    that it could be one of.
+    """
+    cache = None
+    if request.cache:
+        folder = request.folder / "cache"
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            cache = str(folder.absolute())
+    rows: dict[str, FleetRow] = {}
+    todo: list[tuple[LogTask, Stamp]] = []
+    for log in logs:
+        stamp = _stamp(log)
+        row = None if request.again else _row(request, journal, log, stamp)
+        if row is not None and not (row.failed and request.retry_failed):
+            rows[log] = row
+        else:
+            todo.append((LogTask(log, request.settings, cache), stamp))
+    return rows, todo
+
+
+def _row(request: FleetRequest, journal: Journal, log: str, stamp: Stamp) -> FleetRow | None:
+    if stamp is None or not journal.rows:
+        return None
+    sha256 = journal.hashes.get((log, *stamp))
+    if sha256 is None:
+        try:
+            sha256 = content_hash(Path(log))
+        except OSError:
+            return None
+    row = journal.rows.get(row_key(sha256, request.settings))
+    return None if row is None else replace(row, log=log)
+
+
+def _stamp(log: str) -> Stamp:
+    """Size in bytes and time of the last change in ns, of a trace also of what stands beside it."""
+    if "://" in log:
+        return None
+    path = Path(log)
+    try:
+        found = path.stat()
+        size, changed_ns = found.st_size, found.st_mtime_ns
+        if path.suffix.lower() == ".csv":
+            for beside in sorted(path.parent.glob("*.yaml")):
+                size += beside.stat().st_size
+                changed_ns = max(changed_ns, beside.stat().st_mtime_ns)
+    except OSError:
+        return None
+    return size, changed_ns
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Looking for logs
+
+
+@dataclass(frozen=True)
+class Found:
+    """Logs in their order; those that are being written; traces of which nothing is known."""
+
+    logs: tuple[str, ...]
+    live: tuple[str, ...]
+    bare_traces: tuple[str, ...]
+
+
+def find_logs(roots: Sequence[str]) -> Found:
+    """Every .mcap, and every .csv with a sidecar, below the folders; a file that is named itself whatever it ends in.
+
+    Raises UsageError for a root that isn't there. What can't be listed is left out with a row of its own later: a file
+    that can't be read stays in the list.
+    """
+    logs: set[str] = set()
+    live: set[str] = set()
+    bare: set[str] = set()
+    for root in roots:
+        if "://" in root:
+            logs.update(_remote(root))
+            continue
+        path = Path(root)
+        if path.is_file():
+            _sort_in(path, logs, live, bare, named=True)
+        elif path.is_dir():
+            for folder, folders, names in os.walk(path):
+                folders[:] = sorted(name for name in folders if not name.endswith(".work"))
+                for name in names:
+                    if name.lower().endswith((".mcap", ".csv")):
+                        _sort_in(Path(folder) / name, logs, live, bare, named=False)
+        else:
+            raise UsageError("there is no such file or folder", where=root)
+    return Found(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
+
+
+def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, named: bool) -> None:
+    from tdhil.session import is_live
+
+    with suppress(OSError):
+        if not stat.S_ISREG(path.stat().st_mode):
+            return                                     # a pipe would be waited on for ever
+    if path.suffix.lower() == ".csv" and not sidecar_of(path).is_file() and not named:
+        bare.add(str(path))
+    elif is_live(path):
+        live.add(str(path))
+    else:
+        logs.add(str(path))
+
+
+def _remote(root: str) -> list[str]:
+    """The logs below a URL that fsspec can list."""
+    import importlib
+
+    try:
+        fsspec: Any = importlib.import_module("fsspec")
+        system, inside = fsspec.core.url_to_fs(root)
+        names = [inside] if system.isfile(inside) else system.find(inside)
+    except ImportError as error:
+        raise UsageError(f"a library for this address is missing: {error}", where=root,
+                         next_step="Install the extra `cluster`, and for s3:// s3fs") from error
+    except (OSError, ValueError) as error:
+        raise UsageError(f"can't be listed: {error}", where=root) from error
+    return [system.unstrip_protocol(name) for name in names if name.lower().endswith(".mcap")]

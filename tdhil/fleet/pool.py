@@ -1,0 +1,301 @@
+"""A pool of processes that outlives what its tasks do to it.
+
+Each process is a Python in a process group of its own, so that a Ctrl-C in the terminal reaches only the host; tasks
+come one at a time over its stdin, answers go over its stdout, nothing else is shared: it can be killed at any moment.
+The end of its stdin ends it, also in the middle of a task, however the host came to its own.
+
+A task has a limit of time, which the host keeps by killing, and one of memory, which the process keeps itself. What
+ends its process or hangs is tried once more, after all others, and then set aside as a `Loss`. Where something from
+outside killed the process (SIGKILL, SIGTERM), that isn't held against the task until it happens `_KILLS` times.
+
+Not `concurrent.futures` (one dead process breaks the pool, and every task in it) and not joblib (the same): tried with
+a log that kills its process among twenty, they finished 7 and none.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from selectors import EVENT_READ, DefaultSelector
+from struct import Struct
+from types import TracebackType
+from typing import Any, Final, Generic, Self, TypeVar
+
+from tdhil.errors import TdhilError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.fleet.pool import serve; serve({memory!r})"
+_LENGTH: Final = Struct("<Q")
+_TRIES: Final = 2
+_KILLS: Final = 5
+_START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
+_STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
+_ALONE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""One core a process; and sums are added in the same order whatever the machine, so that rows are the same."""
+
+
+@dataclass(frozen=True)
+class TaskLimits:
+    """``time_s``: wall time; ``memory_bytes``: on top of what a fresh process has, where the system can limit it."""
+
+    time_s: float = 120.0
+    memory_bytes: int = 1_500_000_000
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A task that got no answer; ``kind``: TimeLimit, ProcessDied; ``text`` in words."""
+
+    kind: str
+    text: str
+
+
+@dataclass
+class _Job(Generic[Task]):
+    task: Task
+    faults: int = 0
+    kills: int = 0
+
+
+class Pool(Generic[Task, Result]):
+    """``jobs`` processes that call ``function``, which is told by its name: one of a module. Started when needed."""
+
+    def __init__(self, function: Callable[[Task], Result], jobs: int, limits: TaskLimits) -> None:
+        self._function = function
+        self._jobs = max(1, jobs)
+        self._limits = limits
+        self._workers: list[_Worker] = []
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | Loss]]:
+        """Every task with its result, or with what became of it instead, as they are done.
+
+        Raises TdhilError where no process can be started, and what ``function`` raises. Whoever stops in the middle
+        calls `close`.
+        """
+        fresh = iter(tasks)
+        again: deque[_Job[Task]] = deque()
+        stillborn = 0
+        with DefaultSelector() as answers:
+            for worker in self._workers:
+                worker.job = None
+                answers.register(worker.stdout, EVENT_READ, worker)
+            while True:
+                more = self._feed(fresh, again, answers)
+                busy = [worker for worker in self._workers if worker.job is not None]
+                if not busy and not more:
+                    return
+                now_s = time.monotonic()
+                next_s = min((worker.deadline_s for worker in busy), default=now_s + 1.0)
+                ready = {key.data for key, _ in answers.select(max(0.0, next_s - now_s))}
+                now_s = time.monotonic()
+                for worker in ready.difference(busy):
+                    answers.unregister(worker.stdout)      # an idle one that has ended
+                    self._workers.remove(worker)
+                    worker.kill()
+                for worker in busy:
+                    job = worker.job
+                    assert job is not None
+                    late = worker not in ready and now_s >= worker.deadline_s
+                    answer: Any = worker.take() if worker in ready else _DEAD if late else _PART
+                    if answer is _PART:
+                        continue
+                    if answer is not _DEAD:
+                        worker.job = None
+                        result: Result = answer
+                        yield job.task, result
+                        continue
+                    answers.unregister(worker.stdout)
+                    self._workers.remove(worker)
+                    loss, outside = worker.bury(late, self._limits)
+                    stillborn = 0 if worker.awake else stillborn + 1
+                    if stillborn > _STARTS * self._jobs:
+                        raise TdhilError(f"the processes end before they begin: {loss.text}", where="fleet",
+                                         next_step="Look for memory and for `ulimit -v`")
+                    job.kills += outside
+                    job.faults += not outside
+                    if job.faults < _TRIES and job.kills < _KILLS:
+                        again.append(job)
+                    else:
+                        yield job.task, loss
+
+    def _feed(self, fresh: Iterator[Task], again: deque[_Job[Task]], answers: DefaultSelector) -> bool:
+        """A task for each idle process, more processes while there are tasks; False: there is none left."""
+        while True:
+            worker = next((one for one in self._workers if one.job is None), None)
+            if worker is None and len(self._workers) >= self._jobs:
+                return True
+            try:
+                job: _Job[Task] = _Job(next(fresh))
+            except StopIteration:
+                if not again:
+                    return False
+                job = again.popleft()
+            if worker is None:
+                worker = _Worker(self._limits)
+                self._workers.append(worker)
+                answers.register(worker.stdout, EVENT_READ, worker)
+            worker.give(self._function, job, self._limits.time_s)
+
+    def pids(self) -> list[int]:
+        """The processes that are there now."""
+        return [worker.pid for worker in self._workers]
+
+    def close(self) -> None:
+        """End all processes at once, without what they have in hand."""
+        while self._workers:
+            self._workers.pop().kill()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+_PART: Final = object()         # not all of an answer is there yet
+_DEAD: Final = object()
+
+
+class _Worker:
+    """One process, idle or with one task in hand."""
+
+    def __init__(self, limits: TaskLimits) -> None:
+        self.job: _Job[Any] | None = None
+        self.deadline_s = 0.0
+        self.awake = False
+        self._time_s = 0.0
+        self._buffer = bytearray()
+        group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM.format(path=sys.path, memory=limits.memory_bytes)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | _ALONE, **group,
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._stdin, self.stdout = self._process.stdin, self._process.stdout
+        self.pid = self._process.pid
+
+    def give(self, function: Callable[[Any], Any], job: _Job[Any], time_s: float) -> None:
+        self.job, self._time_s = job, time_s
+        self.deadline_s = time.monotonic() + (time_s if self.awake else max(time_s, _START_S))
+        with suppress(BrokenPipeError):        # dead: the end of its stdout says so, too
+            data = pickle.dumps((function, job.task))
+            self._stdin.write(_LENGTH.pack(len(data)) + data)
+            self._stdin.flush()
+
+    def take(self) -> Any:
+        """The answer, or that it is not all there, or that none comes. Raises what the function raised."""
+        assert isinstance(self.stdout, io.BufferedReader)
+        more = self.stdout.read1(2**16)
+        if not more:
+            return _DEAD
+        self._buffer += more
+        if len(self._buffer) < _LENGTH.size:
+            return _PART
+        (length,) = _LENGTH.unpack_from(self._buffer)
+        if len(self._buffer) < _LENGTH.size + length:
+            return _PART
+        data = bytes(self._buffer[_LENGTH.size:_LENGTH.size + length])
+        del self._buffer[:_LENGTH.size + length]
+        if not self.awake:                    # its first word is that it is there
+            self.awake, self.deadline_s = True, time.monotonic() + self._time_s
+            return _PART
+        failed, answer = pickle.loads(data)
+        if failed:
+            raise answer
+        return answer
+
+    def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
+        """What to say of its end, and was it killed from outside?"""
+        if late:
+            self.kill()
+            return Loss("TimeLimit", f"no result within {limits.time_s:g} s, in each of {_TRIES} tries"), False
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(5.0)            # it has closed its stdout: it is ending
+        self.kill()
+        code = self._process.returncode
+        outside = code in (-int(getattr(signal, "SIGKILL", 9)), -int(signal.SIGTERM))
+        told = f"exit code {code}" if code >= 0 else _signal_name(-code)
+        tries = _KILLS if outside else _TRIES
+        return Loss("ProcessDied", f"its process ended ({told}), in each of {tries} tries"), outside
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._stdin, self.stdout):
+            with suppress(OSError):            # half a task may still wait to be written
+                pipe.close()
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# In a worker
+
+
+def serve(memory_bytes: int) -> None:
+    """One task after the other, until the host closes the pipe or is gone."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)                               # whatever else is printed is no answer
+    limited = False
+    tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(sys.stdin.buffer, tasks), daemon=True).start()
+    with suppress(BrokenPipeError):
+        answers.write(_LENGTH.pack(0))         # it is there
+        answers.flush()
+        while True:
+            function, task = pickle.loads(tasks.get())
+            if not limited:                    # once what the function needs is loaded
+                _limit_memory(memory_bytes)
+                limited = True
+            try:
+                answer = pickle.dumps((False, function(task)))
+            except Exception as error:
+                answer = pickle.dumps((True, error))
+            answers.write(_LENGTH.pack(len(answer)) + answer)
+            answers.flush()
+
+
+def _listen(stdin: io.BufferedReader, tasks: queue.SimpleQueue[bytes]) -> None:
+    """Tasks as they come; the end of the host is the end of this process, also in the middle of a task."""
+    while True:
+        head = stdin.read(_LENGTH.size)
+        if len(head) < _LENGTH.size:
+            os._exit(0)
+        tasks.put(stdin.read(_LENGTH.unpack(head)[0]))
+
+
+def _limit_memory(memory_bytes: int) -> None:
+    """So much more address space than now: what asks for more gets a MemoryError. Nothing where the system has no such
+    limit.
+    """
+    try:
+        import resource
+
+        with open("/proc/self/statm", encoding="ascii") as file:  # noqa: PTH123
+            now = int(file.read().split()[0]) * resource.getpagesize()
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        wanted = now + memory_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard < 0 else min(wanted, hard), hard))
+    except (ImportError, OSError, ValueError):
+        return

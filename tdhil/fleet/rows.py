@@ -1,0 +1,228 @@
+"""One row a log: flat, typed, with units in the names; what a table of any kind is made of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Final
+
+from tdhil.version import __version__
+
+ROW_FORMAT: Final = 1
+"""Grows when rows of before can't stand beside new ones."""
+
+UNREAD: Final = "unread"
+"""Verdict of a log that gave no result at all; `error_kind` says why."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is asked of every log alike; None: as each run had it (`tdhil.identify`)."""
+
+    model: str | None = None
+    confidence: float | None = None
+    tolerance: float | None = None
+
+    def asked(self) -> dict[str, Any]:
+        """What was said, by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """What one log gave. SI at the motor shaft; ``low`` to ``high`` is the interval at ``confidence``.
+
+    Of the inertia ``low`` to ``high`` is the repeatability on this drive, ``low_total`` to ``high_total`` has the
+    torque scale in it, which is right to ``torque_scale_rel_sd`` (1 sd, a share). ``stored_…`` is the result that the
+    run left in its log, ``changed`` whether this one differs from it. None: not known, or there is none. No field
+    depends on which machine or process did it, nor on when.
+    """
+
+    log: str
+    verdict: str
+    reason: str | None = None
+    error_kind: str | None = None
+    error_text: str | None = None
+    rig: str | None = None
+    date: str | None = None
+    inertia_kg_m2: float | None = None
+    inertia_low_kg_m2: float | None = None
+    inertia_high_kg_m2: float | None = None
+    inertia_low_total_kg_m2: float | None = None
+    inertia_high_total_kg_m2: float | None = None
+    confidence: float | None = None
+    torque_scale_rel_sd: float | None = None
+    gear_ratio: float | None = None
+    viscous_nm_s_rad: float | None = None
+    viscous_low_nm_s_rad: float | None = None
+    viscous_high_nm_s_rad: float | None = None
+    coulomb_nm: float | None = None
+    coulomb_low_nm: float | None = None
+    coulomb_high_nm: float | None = None
+    speed_lag_s: float | None = None
+    speed_lag_low_s: float | None = None
+    speed_lag_high_s: float | None = None
+    torque_lag_s: float | None = None
+    torque_lag_low_s: float | None = None
+    torque_lag_high_s: float | None = None
+    skew_s: float | None = None
+    skew_low_s: float | None = None
+    skew_high_s: float | None = None
+    load_inertia_kg_m2: float | None = None
+    load_inertia_low_kg_m2: float | None = None
+    load_inertia_high_kg_m2: float | None = None
+    stiffness_nm_rad: float | None = None
+    stiffness_low_nm_rad: float | None = None
+    stiffness_high_nm_rad: float | None = None
+    resonance_hz: float | None = None
+    resonance_low_hz: float | None = None
+    resonance_high_hz: float | None = None
+    paper_inertia_kg_m2: float | None = None
+    second_opinion_kg_m2: float | None = None
+    second_opinion_agrees: bool | None = None
+    residual_p_value: float | None = None
+    model: str | None = None
+    warnings: str | None = None
+    excitation: str | None = None
+    mode: str | None = None
+    duration_s: float | None = None
+    samples: int | None = None
+    periods_used: int | None = None
+    complete: bool | None = None
+    simulated: bool | None = None
+    drive_name: str | None = None
+    drive_vendor: int | None = None
+    drive_product: int | None = None
+    drive_revision: int | None = None
+    drive_serial: int | None = None
+    profile: str | None = None
+    connection: str | None = None
+    operator: str | None = None
+    note: str | None = None
+    stored_verdict: str | None = None
+    stored_inertia_kg_m2: float | None = None
+    changed: bool | None = None
+    recorded_by: str | None = None
+    tdhil: str = __version__
+    settings: str = "{}"
+    sha256: str | None = None
+    size_bytes: int | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Is it the row of a log that gave nothing?"""
+        return self.error_kind is not None
+
+
+COLUMNS: Final[Mapping[str, type]] = {
+    one.name: next(kind for kind in (bool, int, float, str) if str(one.type).startswith(kind.__name__))
+    for one in fields(FleetRow)
+}
+"""Each column's type; all but the log, the verdict and the settings may be empty."""
+
+
+def row_key(sha256: str, settings: Settings) -> str:
+    """What a result hangs on: the file's content, this program's version, what was asked for."""
+    text = json.dumps([ROW_FORMAT, __version__, sha256, settings.asked()], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def row_from_json(content: Mapping[str, Any]) -> FleetRow:
+    """A row as `dataclasses.asdict` laid it out. Raises ValueError for anything else."""
+    if not set(content) <= set(COLUMNS) or not {"log", "verdict"} <= set(content):
+        raise ValueError("not a row of a fleet's table")
+    for name, value in content.items():
+        kind = COLUMNS[name]
+        if value is not None and type(value) is not kind and not (kind is float and type(value) is int):
+            raise ValueError(f"{name}: {value!r:.40} is no {kind.__name__}")
+    typed: dict[str, Any] = {
+        name: float(value) if COLUMNS[name] is float and value is not None else value
+        for name, value in content.items()
+    }
+    return FleetRow(**typed)
+
+
+def row_of(
+    log: str,
+    document: Mapping[str, Any],
+    *,
+    settings: Settings,
+    stored: Mapping[str, Any] | None = None,
+    **facts: Any,
+) -> FleetRow:
+    """The row of a result document (``tdhil replay --json``); ``stored``: the document that the run left in its log.
+
+    ``facts``: other fields by name, such as ``sha256`` and ``torque_scale_rel_sd``.
+    """
+    inertia = document.get("inertia_kg_m2") or {}
+    compliant = document.get("compliant") or {}
+    rig, drive = document.get("rig") or {}, document.get("drive") or {}
+    opinion = (document.get("second_opinions") or [{}])[0]
+    found: dict[str, Any] = {
+        "reason": document["reason"],
+        "rig": rig.get("name") or rig.get("file"),
+        "date": document.get("date"),
+        "inertia_kg_m2": inertia.get("value"),
+        **{f"inertia_{end}_kg_m2": inertia.get(end) for end in ("low", "high", "low_total", "high_total")},
+        "confidence": inertia.get("confidence"),
+        "gear_ratio": document.get("gear_ratio"),
+        "paper_inertia_kg_m2": (document.get("paper") or {}).get("inertia_kg_m2"),
+        "second_opinion_kg_m2": (opinion.get("inertia_kg_m2") or {}).get("value"),
+        "second_opinion_agrees": opinion.get("agrees"),
+        "residual_p_value": (document.get("residual") or {}).get("p_value"),
+        "model": document.get("model"),
+        "warnings": "\n".join(document.get("warnings") or ()) or None,
+        "periods_used": document.get("periods_used"),
+        "complete": document.get("complete"),
+        "simulated": document.get("simulated"),
+        "drive_name": drive.get("name"),
+        **{f"drive_{name}": drive.get(name) for name in ("vendor", "product", "revision", "serial")},
+        "profile": (document.get("profile") or {}).get("name"),
+        **{name: document.get(name) for name in ("connection", "operator", "note", "recorded_by")},
+    }
+    for name, unit, source in (
+        ("viscous", "nm_s_rad", document), ("coulomb", "nm", document), ("speed_lag", "s", document),
+        ("torque_lag", "s", document), ("skew", "s", document), ("load_inertia", "kg_m2", compliant),
+        ("stiffness", "nm_rad", compliant), ("resonance", "hz", compliant),
+    ):
+        estimate = source.get(f"{name}_{unit}") or {}
+        found[f"{name}_{unit}"] = estimate.get("value")
+        found |= {f"{name}_{end}_{unit}": estimate.get(end) for end in ("low", "high")}
+    was = _stored(stored)
+    now = (document["verdict"], inertia.get("value"))
+    known: dict[str, Any] = found | facts | {
+        "stored_verdict": was[0] if was else None,
+        "stored_inertia_kg_m2": was[1] if was else None,
+        "changed": _differs(was, now) if was else None,
+    }
+    return row_from_json(
+        {"log": log, "verdict": document["verdict"], "settings": json.dumps(settings.asked(), sort_keys=True)} | known
+    )
+
+
+def failure_row(log: str, kind: str, text: str, settings: Settings, **facts: Any) -> FleetRow:
+    """The row of a log that gave nothing; ``kind`` is the error's class, ``text`` what it said."""
+    return FleetRow(
+        log=log, verdict=UNREAD, error_kind=kind, error_text=" ".join(text.split())[:1000],
+        settings=json.dumps(settings.asked(), sort_keys=True), **facts,
+    )
+
+
+def _stored(document: Mapping[str, Any] | None) -> tuple[str, float | None] | None:
+    """Verdict and inertia of the run's own result; a log may say anything."""
+    if not isinstance(document, Mapping) or not isinstance(document.get("verdict"), str):
+        return None
+    inertia = document.get("inertia_kg_m2")
+    value = inertia.get("value") if isinstance(inertia, Mapping) else None
+    number = float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+    return document["verdict"][:40], number
+
+
+def _differs(was: tuple[str, float | None], now: tuple[str, float | None]) -> bool:
+    """Another verdict, or another number by more than what processors' sums differ."""
+    if was[0] != now[0] or (was[1] is None) != (now[1] is None):
+        return True
+    return was[1] is not None and now[1] is not None and not math.isclose(was[1], now[1], rel_tol=1e-8)

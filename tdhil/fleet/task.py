@@ -1,0 +1,250 @@
+"""One log in, one row out: the same function for the pool, for a cluster, and for whoever calls it himself."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from pydantic import Field
+
+from profiles import DataModel
+from tdhil.errors import NothingRecoverable, TdhilError, UsageError
+from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_of
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from tdhil.session import RunRecord
+
+_CACHE_FORMAT: Final = 1
+_BLOCK: Final = 2**20
+
+
+@dataclass(frozen=True)
+class LogTask:
+    """``log``: a path, or a URL that fsspec can open; ``cache``: a folder for recordings that were read, or None."""
+
+    log: str
+    settings: Settings = field(default_factory=Settings)
+    cache: str | None = None
+
+
+@dataclass(frozen=True)
+class Done:
+    """A task's row, and what differs from one time to the next: CPU time in s, and was the recording in the cache?"""
+
+    row: FleetRow
+    cpu_s: float = 0.0
+    cached: bool = False
+
+
+def identify_log(task: LogTask) -> Done:
+    """Identify one log. Raises nothing that hangs on the file: what can't be read is a row with its error."""
+    import time
+
+    began = time.process_time()
+    facts: dict[str, Any] = {}
+    cached = False
+    try:
+        with local_copy(task.log) as path:
+            facts = {"sha256": content_hash(path), "size_bytes": path.stat().st_size}
+            row, cached = _row(task, path, facts)
+    except Exception as error:
+        row = failure_row(task.log, type(error).__name__, _text(error), task.settings, **facts)
+    return Done(row, time.process_time() - began, cached)
+
+
+def _text(error: Exception) -> str:
+    """What a row says of it; of an error of our tree without the place, which is the row's own."""
+    if isinstance(error, TdhilError):
+        return error.what if not error.next_step else f"{error.what}. {error.next_step}"
+    if isinstance(error, OSError):
+        return f"can't be read: {error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return "needs more memory than it may take"
+    # A mistake of ours that this file brings to light; the other logs are not to suffer for it.
+    return f"internal error, please report it with this log: {error}"
+
+
+def _row(task: LogTask, path: Path, facts: Mapping[str, Any]) -> tuple[FleetRow, bool]:
+    from tdhil.session import conclude
+
+    kept = None if task.cache is None else Path(task.cache) / f"{facts['sha256']}.v{_CACHE_FORMAT}.npz"
+    record = None if kept is None else _from_cache(kept)
+    cached = record is not None
+    if record is None:
+        record = read_any(path)
+        if kept is not None:
+            _into_cache(kept, record)
+    record = replace(record, log=task.log)
+    record.require_motion()
+    configuration = record.asked(task.settings.asked())
+    found = conclude(record.recording, configuration, task.log, record.assumed)
+    recording = record.recording
+    time_s = recording.time_s
+    excitation = recording.excitation
+    warnings = (*record.problems, *found.document["warnings"])
+    row = row_of(
+        task.log, {**found.document, "warnings": warnings}, settings=task.settings, stored=record.stored_result,
+        torque_scale_rel_sd=recording.torque_scale_rel_sd,
+        excitation=None if excitation is None else excitation.kind,
+        mode=None if excitation is None else excitation.mode,
+        duration_s=float(time_s[-1] - time_s[0]) if len(time_s) else 0.0,
+        samples=len(time_s),
+        **facts,
+    )
+    return row, cached
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Reading: a log of ours, or a trace with what is known of it beside it
+
+
+class Sidecar(DataModel):
+    """trace.yaml beside trace.csv: the options of ``tdhil replay`` for a trace, and whose it is."""
+
+    rig: str | None = Field(default=None, max_length=200, description="whose trace it is")
+    date: str | None = Field(default=None, max_length=40, description="when it was recorded, ISO 8601")
+    columns: tuple[str, ...] | None = Field(default=None, description="such as time=t_s, speed=n_rpm:rpm")
+    excitation: str | None = Field(default=None, description="an excitation.yaml in the same folder")
+    rated_torque_nm: float | None = Field(default=None, gt=0, description="N·m; what torque in % is a share of")
+    torque_limit_nm: float | None = Field(default=None, gt=0, description="N·m; the drive's torque limit")
+    gear_ratio: float | None = Field(default=None, gt=0, description="ω_motor/ω_main")
+    torque_scale_rel_sd: float | None = Field(default=None, ge=0, lt=1, description="how right the torque is, 1 sd")
+    speed_lag_s: float | None = Field(default=None, ge=0, description="s; filter on the reported speed")
+    speed_lag_sd_s: float | None = Field(default=None, ge=0, description="s; its standard deviation")
+    torque_lag_s: float | None = Field(default=None, ge=0, description="s; filter on the reported torque")
+    torque_lag_sd_s: float | None = Field(default=None, ge=0, description="s; its standard deviation")
+
+
+def sidecar_of(trace: Path) -> Path:
+    """Where what is known of a trace in CSV stands: the same name, ending .yaml."""
+    return trace.with_suffix(".yaml")
+
+
+def read_any(path: Path) -> RunRecord:
+    """A log of ours, or a trace with its sidecar. Raises TdhilError."""
+    from tdhil.session import is_log, read
+
+    if is_log(path):
+        return read(path)
+    if path.suffix.lower() != ".csv":
+        empty = path.stat().st_size == 0
+        raise NothingRecoverable("the file is empty" if empty else "this is not an MCAP file", where=str(path))
+    from tdhil.session import stated_lags
+
+    known = _known(path)
+    if known.excitation is not None and Path(known.excitation).name != known.excitation:
+        raise UsageError("name a file in the same folder", where=f"{sidecar_of(path)}: excitation")
+    lags = stated_lags(
+        known.speed_lag_s, known.speed_lag_sd_s, known.torque_lag_s, known.torque_lag_sd_s, sidecar_of(path).name
+    )
+    record = read(
+        path,
+        columns=None if known.columns is None else list(known.columns),
+        excitation=None if known.excitation is None else path.with_name(known.excitation),
+        rated_torque_nm=known.rated_torque_nm, torque_limit_nm=known.torque_limit_nm, gear_ratio=known.gear_ratio,
+        torque_scale_rel_sd=known.torque_scale_rel_sd, lags=lags,
+    )
+    said: dict[str, Any] = {} if known.rig is None else {"bench": {"name": known.rig}}
+    if known.date is not None:
+        said["started"] = known.date
+    return replace(record, configuration={**record.configuration, **said})
+
+
+def _known(trace: Path) -> Sidecar:
+    """What its sidecar says. Raises DataFileError with every problem and its line."""
+    from profiles import load_model
+
+    side = sidecar_of(trace)
+    return load_model(side, Sidecar) if side.is_file() else Sidecar()
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 of the file; of a trace in CSV, of what stands beside it too. Raises OSError."""
+    sum_ = hashlib.sha256()
+    _add(sum_, path)
+    side = sidecar_of(path)
+    if path.suffix.lower() == ".csv" and side.is_file():
+        sum_.update(b"\0sidecar\0")
+        _add(sum_, side)
+        with suppress(TdhilError):             # who reads it says what is wrong with it
+            named = _known(path).excitation
+            if named is not None and path.with_name(Path(named).name).is_file():
+                sum_.update(b"\0excitation\0")
+                _add(sum_, path.with_name(Path(named).name))
+    return sum_.hexdigest()
+
+
+def _add(sum_: Any, path: Path) -> None:
+    with path.open("rb", buffering=0) as file:
+        while block := file.read(_BLOCK):
+            sum_.update(block)
+
+
+@contextmanager
+def local_copy(log: str) -> Iterator[Path]:
+    """The file as a path of this machine: a URL's content in a temporary file for as long as it is needed."""
+    if "://" not in log:
+        yield Path(log)
+        return
+    try:
+        from importlib import import_module
+
+        fsspec: Any = import_module("fsspec")
+        with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder:
+            target = Path(folder) / log.rsplit("/", 1)[-1]
+            with fsspec.open(log, "rb") as source, target.open("wb") as file:
+                while block := source.read(_BLOCK):
+                    file.write(block)
+            yield target
+    except ImportError as error:
+        raise UsageError(f"a library for this address is missing: {error}", where=log,
+                         next_step="Install the extra `cluster`, and for s3:// s3fs") from error
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The cache: recordings that were read, by their file's content. What is damaged in it is read anew, and written anew.
+
+
+def _from_cache(kept: Path) -> RunRecord | None:
+    from tdhil.recording import Ended, unpack_recording
+    from tdhil.session import RunRecord
+
+    found = unpack_recording(kept)
+    if found is None or found[1].get("by") != __version__:
+        return None
+    recording, beside = found
+    try:
+        ended = beside["ended"]
+        return RunRecord(
+            recording, beside["configuration"], beside["log"],
+            None if beside["assumed"] is None else tuple(beside["assumed"]), tuple(beside["problems"]),
+            None if ended is None else Ended(**ended), beside["stored_result"],
+        )
+    except (KeyError, TypeError):
+        return None
+
+
+def _into_cache(kept: Path, record: RunRecord) -> None:
+    """A cache that can't be written is none: the row doesn't hang on it."""
+    from tdhil.recording import pack_recording
+
+    beside = {
+        "by": __version__, "log": record.log, "configuration": record.configuration, "problems": record.problems,
+        "assumed": record.assumed, "ended": None if record.ended is None else asdict(record.ended),
+        "stored_result": record.stored_result,
+    }
+    part = kept.with_name(f"{kept.name}.{os.getpid()}.part")
+    with suppress(OSError, TypeError, ValueError):
+        try:
+            part.write_bytes(pack_recording(record.recording, beside))
+            part.replace(kept)
+        finally:
+            part.unlink(missing_ok=True)
+

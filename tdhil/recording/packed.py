@@ -1,0 +1,49 @@
+"""A recording as an npz: what a cache keeps, read in milliseconds. It is no log: it has no frames, commands or events.
+
+The arrays stand in it as they are, everything else as one JSON text; what is read back is equal to the last bit.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+from zipfile import BadZipFile
+
+import numpy as np
+
+from tdhil.recording.builder import hints_of, structure
+from tdhil.recording.recording import Recording
+
+_ARRAYS: Final = ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")
+_KINDS: Final = {"time_s": "f8", "speed_rad_s": "f8", "torque_nm": "f8", "fresh": "?", "limited": "?"}
+_REST: Final = tuple(field.name for field in fields(Recording) if field.name not in _ARRAYS)
+_TEXT: Final = "json"
+
+
+def pack_recording(recording: Recording, beside: Mapping[str, Any]) -> bytes:
+    """The file's bytes. ``beside``: what else is to be kept, as plain data for JSON. Raises TypeError or ValueError."""
+    whole = asdict(recording)
+    text = json.dumps({"recording": {name: whole[name] for name in _REST}, "beside": dict(beside)})
+    file = BytesIO()
+    arrays: dict[str, Any] = {name: getattr(recording, name) for name in _ARRAYS}
+    arrays[_TEXT] = np.frombuffer(text.encode(), np.uint8)
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def unpack_recording(path: Path) -> tuple[Recording, dict[str, Any]] | None:
+    """The recording and what was kept beside it; None for a file that is missing, damaged, or something else."""
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in _ARRAYS}
+            content = json.loads(found[_TEXT].tobytes())
+        size = len(arrays["time_s"])
+        if any(one.dtype != np.dtype(_KINDS[name]) or one.shape != (size,) for name, one in arrays.items()):
+            return None
+        hints, rest = hints_of(Recording), content["recording"]
+        members = {name: structure(hints[name], rest[name]) for name in _REST}
+        return Recording(**arrays, **members), dict(content["beside"])
+    except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile):
+        return None

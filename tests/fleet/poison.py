@@ -1,0 +1,70 @@
+"""What a log may do to the process that reads it. Told by the file's first bytes; the function is one of a module, so
+that the pool's processes and a cluster's find it by name.
+"""
+
+import ctypes
+import os
+import signal
+import time
+from pathlib import Path
+
+from tdhil.fleet.rows import FleetRow, failure_row
+from tdhil.fleet.task import Done, LogTask, content_hash, identify_log
+
+KILLS, HANGS, EATS, OUTSIDE = b"poison: kills", b"poison: hangs", b"poison: eats", b"poison: outside"
+
+
+def head_of(path):
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(32)
+    except OSError:
+        return b""
+
+
+def act(head):
+    if head.startswith(KILLS):
+        ctypes.string_at(0)                            # SIGSEGV, as a library at fault would
+    if head.startswith(HANGS):
+        time.sleep(3600)
+    if head.startswith(EATS):
+        bytearray(4_000_000_000)
+    if head.startswith(OUTSIDE):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def identify(task: LogTask) -> Done:
+    """As `identify_log`, but for poisoned logs."""
+    try:
+        act(head_of(task.log))
+    except MemoryError as error:
+        facts = {"sha256": content_hash(Path(task.log))}
+        return Done(failure_row(task.log, "MemoryError", str(error), task.settings, **facts))
+    return identify_log(task)
+
+
+def quick(task: LogTask) -> Done:
+    """A row without identifying; a note of each call in the file that TDHIL_CALLS names."""
+    head = head_of(task.log)
+    if head.startswith(b"poison"):
+        return identify(task)
+    with Path(os.environ["TDHIL_CALLS"]).open("a") as file:
+        file.write(task.log + "\n")
+    time.sleep(0.01)
+    path = Path(task.log)
+    return Done(FleetRow(log=task.log, verdict="valid", sha256=content_hash(path), size_bytes=path.stat().st_size))
+
+
+def work(task):
+    """For the pool alone: what a number or a word asks for."""
+    if isinstance(task, bytes):
+        act(task)
+    if task == "raise":
+        raise ValueError("as asked")
+    if task == "print":
+        print("not an answer")
+    if task == "much":
+        return b"x" * 3_000_000
+    if isinstance(task, float):
+        time.sleep(task)
+    return task

@@ -1,0 +1,261 @@
+"""Many logs into one table: whole, cut, corrupt, foreign and poisoned; interrupted and started again; by each road."""
+
+import json
+import os
+import random
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tdhil.cli.main import main
+from tdhil.errors import UsageError
+from tdhil.fleet import FleetRequest, LogTask, Settings, TaskLimits, find_logs, identify_log, read_table, run_fleet
+from tdhil.fleet import cluster as cluster_module
+from tests.fleet import poison
+from tests.fleet.simulated_logs import rig_plants, write_rig
+
+pytestmark = pytest.mark.one_worker("fleet")
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory):
+    """Three runs of one rig, and what a folder may hold besides."""
+    folder = tmp_path_factory.mktemp("fleet") / "logs"
+    folder.mkdir()
+    logs = list(write_rig(folder, rig_plants(1)[0], 3, 5, periods=2))
+    (folder / "below").mkdir()
+    whole = logs[0].read_bytes()
+    (folder / "below" / "cut.mcap").write_bytes(whole[:len(whole) * 3 // 4])
+    (folder / "empty.mcap").touch()
+    (folder / "corrupt.mcap").write_bytes(whole[:8] + random.Random(1).randbytes(5000))
+    (folder / "other.mcap").write_bytes(b"not a log")
+    (folder / "shaft.csv").write_text("time_s,speed_rad_s,torque_nm\n0,1,2\n")
+    return folder
+
+
+@pytest.fixture
+def calls(tmp_path, monkeypatch):
+    path = tmp_path / "calls.txt"
+    path.touch()
+    monkeypatch.setenv("TDHIL_CALLS", str(path))
+    return path
+
+
+def many(folder, count, bad=()):
+    """So many little files that `poison.quick` takes for logs."""
+    folder.mkdir(exist_ok=True)
+    for number in range(count):
+        (folder / f"{number:03d}.mcap").write_bytes(f"log {number}".encode())
+    for number, head in enumerate(bad):
+        (folder / f"bad{number}.mcap").write_bytes(head)
+    return (str(folder),)
+
+
+def trace(folder, record):
+    """The samples of a recording as a CSV with its sidecar."""
+    columns = zip(record.time_s, record.speed_rad_s * 60 / 2 / np.pi, record.torque_nm, strict=True)
+    (folder / "trace.csv").write_text("t,n,m\n" + "".join(f"{t:.5f},{n:.6f},{m:.6f}\n" for t, n, m in columns))
+    (folder / "trace.yaml").write_text(
+        "rig: R9\ndate: 2026-05-01T12:00:00\ncolumns: ['time=t:s', 'speed=n:rpm', 'torque=m:Nm']\n"
+        "torque_scale_rel_sd: 0.02\n")
+
+
+def test_one_log_is_what_replay_gives(few):
+    import tdhil
+
+    done = identify_log(LogTask(str(few / "R1-001.mcap")))
+    result = tdhil.identify(tdhil.read(few / "R1-001.mcap"))
+    row = done.row
+    assert (row.verdict, row.inertia_kg_m2) == (result.verdict.value, result.inertia.value)
+    assert (row.inertia_low_kg_m2, row.inertia_high_total_kg_m2) == (result.inertia.low, result.inertia.high_total)
+    assert (row.rig, row.drive_serial, row.profile, row.torque_scale_rel_sd) == ("R1", 1, "generic/cia402", 0.03)
+    assert row.date == "2026-01-12T08:00:00+00:00"
+    assert row.speed_lag_low_s < 0.4 < row.speed_lag_high_s
+
+
+def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
+    task = LogTask(str(few / "R1-000.mcap"), Settings(confidence=0.9), str(tmp_path))
+    first, second = identify_log(task), identify_log(task)
+    plain = identify_log(replace(task, cache=None))
+    assert (first.cached, second.cached) == (False, True)
+    assert repr(first.row) == repr(second.row) == repr(plain.row)
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[:-500])             # damaged: read anew, and written anew
+    assert repr(identify_log(task).row) == repr(first.row)
+    assert identify_log(task).cached
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(few / "R1-000.mcap", copy)
+    again = identify_log(replace(task, log=str(copy)))
+    assert again.cached
+    assert again.row == replace(first.row, log=str(copy))
+
+
+def test_one_process_or_two_give_the_same_table(few, tmp_path):
+    one, two = (run_fleet(FleetRequest((str(few),), tmp_path / f"{jobs}.csv", jobs=jobs, cache=False)).rows
+                for jobs in (1, 2))
+    assert [repr(row) for row in one] == [repr(row) for row in two]
+
+
+def test_every_kind_of_file_has_its_row(few, tmp_path):
+    import tdhil
+
+    folder = tmp_path / "logs"
+    shutil.copytree(few, folder)
+    trace(folder, tdhil.read(few / "R1-000.mcap").recording)
+    (folder / "wrong.csv").write_text("t,n\n1,2\n")
+    (folder / "wrong.yaml").write_text("rig: R9\ncolour: red\n")
+    summary = run_fleet(FleetRequest((str(folder),), tmp_path / "fleet.csv", jobs=1))
+    rows = {Path(row.log).name: row for row in summary.rows}
+    assert rows == {Path(row.log).name: row for row in read_table(tmp_path / "fleet.csv")}
+    assert {name for name, row in rows.items() if not row.failed} == {
+        "R1-000.mcap", "R1-001.mcap", "R1-002.mcap", "cut.mcap", "trace.csv"}
+    assert (rows["trace.csv"].rig, rows["trace.csv"].torque_scale_rel_sd) == ("R9", 0.02)
+    assert not rows["cut.mcap"].complete
+    assert {name: row.error_text for name, row in rows.items() if row.failed} == {
+        "empty.mcap": "the file is empty", "other.mcap": "this is not an MCAP file",
+        "corrupt.mcap": "an MCAP file, but not a run of this tool. Give a run.mcap of this tool",
+        "wrong.csv": rows["wrong.csv"].error_text}
+    assert "colour" in rows["wrong.csv"].error_text
+    assert (summary.bare_traces, summary.exit_code) == (1, 3)
+
+
+def test_poisoned_logs_are_set_aside(tmp_path, calls):
+    bad = (poison.KILLS, poison.HANGS, poison.EATS, poison.OUTSIDE)
+    roots = many(tmp_path / "logs", 12, bad)
+    limits = TaskLimits(2.0, 300_000_000)
+    request = FleetRequest(roots, tmp_path / "fleet.sqlite", jobs=2, limits=limits)
+    rows = {Path(row.log).name: row for row in run_fleet(request, function=poison.quick).rows}
+    assert len(rows) == 16
+    assert {name: row.error_kind for name, row in rows.items() if row.failed} == {
+        "bad0.mcap": "ProcessDied", "bad1.mcap": "TimeLimit", "bad2.mcap": "MemoryError", "bad3.mcap": "ProcessDied"}
+
+
+def test_killed_at_random_and_nothing_is_lost_or_twice(tmp_path, calls):
+    rng, pools = random.Random(2), []
+
+    class Killer:
+        def start(self, total, done): ...
+
+        def done(self, row):
+            if len(pools) < 10 and rng.random() < 0.4:
+                children = [int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()]
+                victims = [pid for pid in children if b"fleet.pool" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+                if victims:
+                    os.kill(rng.choice(victims), signal.SIGKILL)
+                    pools.append(1)
+
+    roots = many(tmp_path / "logs", 60)
+    summary = run_fleet(FleetRequest(roots, tmp_path / "fleet.csv", jobs=2), Killer(), function=poison.quick)
+    assert len(pools) == 10
+    assert [Path(row.log).name for row in read_table(tmp_path / "fleet.csv")] == [f"{k:03d}.mcap" for k in range(60)]
+    assert {row.verdict for row in summary.rows} == {"valid"}
+
+
+def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
+    class Impatient:
+        seen = 0
+
+        def start(self, total, done): ...
+
+        def done(self, row):
+            self.seen += 1
+            if self.seen == 15:
+                raise KeyboardInterrupt
+
+    request = FleetRequest(many(tmp_path / "logs", 40), tmp_path / "fleet.csv", jobs=2)
+    first = run_fleet(request, Impatient(), function=poison.quick)
+    assert (first.interrupted, len(first.rows), first.left) == (True, 15, 25)
+    assert len(read_table(request.out)) == 15
+    calls.write_text("")
+    (tmp_path / "logs" / "003.mcap").rename(tmp_path / "logs" / "moved.mcap")      # known by its content
+    second = run_fleet(request, function=poison.quick)
+    assert (len(second.rows), second.left) == (40, 0)
+    done = calls.read_text().split()
+    assert len(done) == len(set(done)) == 40 - second.done_before
+    assert second.done_before == 15
+    again = run_fleet(request, function=poison.quick)
+    assert (again.done_before, again.rows) == (40, second.rows)
+    (tmp_path / "logs" / "004.mcap").write_bytes(b"changed")
+    assert run_fleet(request, function=poison.quick).done_before == 39
+    assert run_fleet(replace(request, settings=Settings(confidence=0.9)), function=poison.quick).done_before == 0
+    assert run_fleet(replace(request, again=True), function=poison.quick).done_before == 0
+
+
+def test_live_logs_and_pipes_are_left_alone(tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    many(tmp_path / "logs", 2)
+    os.mkfifo(tmp_path / "logs" / "pipe.mcap")
+    with (tmp_path / "logs" / "001.mcap").open("ab") as file:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        found = find_logs((str(tmp_path / "logs"),))
+    assert [Path(log).name for log in found.logs] == ["000.mcap"]
+    assert [Path(log).name for log in found.live] == ["001.mcap"]
+    with pytest.raises(UsageError, match="no such file or folder"):
+        find_logs((str(tmp_path / "none"),))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match="no log is there"):
+        run_fleet(FleetRequest((str(tmp_path / "empty"),), tmp_path / "fleet.csv"))
+
+
+def test_a_log_that_may_not_be_read_has_a_row(tmp_path, few, monkeypatch):
+    """And is tried again the next time, since nothing is known of its content."""
+    log = tmp_path / "locked.mcap"
+    shutil.copy(few / "R1-000.mcap", log)
+    from tdhil.fleet import task
+
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(task, "content_hash", refuse)
+    row = identify_log(LogTask(str(log))).row
+    assert (row.error_kind, row.error_text, row.sha256) == ("PermissionError", "can't be read: Permission denied", None)
+
+
+def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
+    """Dask's scheduler and a worker of it in this process; the log is read in one beside it, as ever."""
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
+    roots = many(tmp_path / "logs", 6, (poison.KILLS,))
+    here = run_fleet(FleetRequest(roots, tmp_path / "here.csv", jobs=1), function=poison.quick)
+    how = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**how) as cluster:
+        request = FleetRequest(roots, tmp_path / "there.csv", scheduler=cluster.scheduler_address)
+        there = run_fleet(request, function=poison.quick)
+        assert [repr(row) for row in there.rows] == [repr(row) for row in here.rows]
+        monkeypatch.setattr(cluster_module, "versions", their_versions)
+        with pytest.raises(UsageError, match=r"has numpy 1.0 \(here 2"):
+            run_fleet(replace(request, again=True), function=poison.quick)
+    with pytest.raises(UsageError, match="no Dask scheduler answers"):
+        run_fleet(replace(request, again=True), function=poison.quick)
+
+
+def their_versions(asked=[]):  # noqa: B006  (who asks first is the host: both are in one process here)
+    asked.append(1)
+    return OURS if len(asked) == 1 else OURS | {"numpy": "1.0"}
+
+
+OURS = cluster_module.versions()
+
+
+def test_the_command(few, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "fleet.csv"
+    arguments = ["fleet", str(few), "--out", str(out), "--jobs", "1"]
+    assert main([*arguments, "--json"]) == 3
+    document = json.loads(capsys.readouterr().out)
+    assert (document["logs"], document["verdicts"], document["failed"]) == (
+        7, document["verdicts"], {"NothingRecoverable": 3})
+    assert sum(document["verdicts"].values()) == 4
+    assert main(arguments) == 3
+    text = capsys.readouterr().out
+    assert "7 logs (7 of them done before)" in text
+    assert "empty.mcap: the file is empty" in text
+    assert "left out: 1 CSV files" in text
+    for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):
+        assert main(["fleet", str(few), "--out", str(out), *wrong]) == 2
+    assert main(["fleet", str(few), "--out", str(tmp_path / "fleet.txt")]) == 2
+    assert main(["fleet", str(tmp_path / "none"), "--out", str(out)]) == 2
+    assert main(["watch", str(few), "--out", str(out), "--once", "--jobs", "1"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 7

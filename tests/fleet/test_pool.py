@@ -1,0 +1,100 @@
+"""The pool: every task gets its answer or its loss, once, whatever happens to its processes."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tdhil.errors import TdhilError
+from tdhil.fleet.pool import Loss, Pool, TaskLimits
+from tests.fleet import poison
+
+LIMITS = TaskLimits(60.0, 500_000_000)
+
+
+def test_every_task_is_answered_once():
+    tasks = [*range(40), "print", "much", "word"]
+    with Pool(poison.work, 2, LIMITS) as pool:
+        found = dict(pool.run(tasks))
+        assert found == {task: b"x" * 3_000_000 if task == "much" else task for task in tasks}
+        assert dict(pool.run([1])) == {1: 1}           # the processes stay
+        pids = pool.pids()
+    assert len(pids) == 2
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+def test_what_ends_its_process_or_hangs_is_set_aside_and_the_rest_goes_on():
+    bad = [poison.KILLS, poison.HANGS, poison.OUTSIDE]
+    with Pool(poison.work, 2, TaskLimits(3.0, 500_000_000)) as pool:
+        found = dict(pool.run([1, *bad, *range(2, 12)]))
+    assert {task for task, result in found.items() if not isinstance(result, Loss)} == set(range(1, 12))
+    assert {task: found[task].kind for task in bad} == {
+        poison.KILLS: "ProcessDied", poison.HANGS: "TimeLimit", poison.OUTSIDE: "ProcessDied"}
+    assert "SIGSEGV" in found[poison.KILLS].text
+    assert "2 tries" in found[poison.KILLS].text
+    assert "5 tries" in found[poison.OUTSIDE].text
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is limited where /proc tells what is in use")
+def test_memory_is_limited():
+    with Pool(poison.work, 1, TaskLimits(60.0, 200_000_000)) as pool, pytest.raises(MemoryError):
+        list(pool.run([poison.EATS]))
+
+
+def test_a_mistake_of_the_function_is_raised_here():
+    with Pool(poison.work, 1, LIMITS) as pool, pytest.raises(ValueError, match="as asked"):
+        list(pool.run(["raise"]))
+
+
+def test_processes_killed_at_random():
+    """Twelve kills over sixty tasks, some while idle: nothing is lost, nothing comes twice."""
+    rng = random.Random(3)
+    with Pool(poison.work, 2, LIMITS) as pool:
+        found, kills = [], 0
+        for task, result in pool.run(0.01 + k / 1e4 for k in range(60)):
+            assert result == task
+            found.append(task)
+            if kills < 12 and rng.random() < 0.5 and (pids := pool.pids()):
+                os.kill(rng.choice(pids), signal.SIGKILL)
+                kills += 1
+    assert kills == 12
+    assert sorted(found) == [0.01 + k / 1e4 for k in range(60)]
+
+
+def test_processes_that_never_begin_end_the_pool(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with Pool(poison.work, 2, LIMITS) as pool, pytest.raises(TdhilError, match="end before they begin"):
+        list(pool.run(range(50)))
+
+
+def test_the_processes_end_with_their_host():
+    """Also one that is in the middle of a task, when the host is killed."""
+    script = (
+        "import os, sys\n"
+        "from tests.fleet import poison\n"
+        "from tdhil.fleet.pool import Pool, TaskLimits\n"
+        "pool = Pool(poison.work, 1, TaskLimits())\n"
+        "tasks = iter([1, poison.HANGS])\n"
+        "for one in pool.run(tasks):\n"
+        "    print(*pool.pids(), flush=True)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True,
+                          cwd=Path(__file__).parents[2]) as host:
+        pid = int(host.stdout.readline())
+        host.kill()
+    for _ in range(200):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return
+        if "zombie" in Path(f"/proc/{pid}/status").read_text():
+            return
+        time.sleep(0.05)
+    pytest.fail("it lives on")

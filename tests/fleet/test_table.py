@@ -1,0 +1,127 @@
+"""Rows, the journal, and the table in each of its kinds."""
+
+import json
+import random
+import struct
+from dataclasses import asdict, fields, replace
+
+import pytest
+
+from tdhil.errors import UsageError
+from tdhil.fleet.rows import COLUMNS, FleetRow, Settings, failure_row, row_from_json, row_key, row_of
+from tdhil.fleet.table import Journal, check_table_path, read_table, write_table
+
+VALUES = {
+    str: ["R7", "N·m, \"quoted\"\nsecond line; 'x'", "0012", "nan", "=1+1"],
+    int: [0, 2**32 - 1, 2**53 + 1], bool: [True, False],
+    float: [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -1.5, 104.28293000519912],
+}
+
+
+def rows():
+    rng = random.Random(4)
+    found = [FleetRow("a.mcap", "valid"), failure_row("b.mcap", "DriveFault", "two\nlines", Settings())]
+    for number in range(30):
+        content = {name: rng.choice([*VALUES[kind], None]) for name, kind in COLUMNS.items()}
+        content |= {"log": f"{number}.mcap", "verdict": "valid", "tdhil": "0.1.0", "settings": "{}"}
+        content["inertia_kg_m2"] = struct.unpack("<d", rng.randbytes(6) + b"\x59\x40")[0]
+        found.append(FleetRow(**content))
+    return found
+
+
+@pytest.mark.parametrize("ending", [".csv", ".sqlite", ".parquet"])
+def test_a_table_is_read_back_to_the_last_bit(tmp_path, ending):
+    if ending == ".parquet":
+        pytest.importorskip("duckdb", reason="duckdb is not installed (pip install '.[fleet]')")
+    path = tmp_path / f"it's a fleet{ending}"
+    write_table([], path)
+    assert read_table(path) == []
+    write_table(rows(), path)
+    assert [repr(row) for row in read_table(path)] == [repr(row) for row in rows()]
+    assert sorted(one.name for one in tmp_path.iterdir()) == [path.name]
+
+
+def test_a_name_that_is_no_utf_8_has_a_row(tmp_path):
+    write_table([FleetRow("R7-\udcff.mcap", "valid")], tmp_path / "fleet.csv")
+    assert read_table(tmp_path / "fleet.csv")[0].log == "R7-?.mcap"
+
+
+def test_every_quantity_has_its_unit():
+    units = ("_kg_m2", "_nm_s_rad", "_nm_rad", "_nm", "_s", "_hz", "_rel_sd", "_ratio", "_value", "confidence")
+    assert [name for name, kind in COLUMNS.items() if kind is float and not name.endswith(units)] == []
+    assert {one.name for one in fields(FleetRow)} == set(COLUMNS)
+
+
+def test_parquet_without_duckdb_says_how_to_get_it(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    with pytest.raises(UsageError, match="pip install 'duckdb"):
+        check_table_path(tmp_path / "fleet.parquet", tmp_path / "work")
+    check_table_path(tmp_path / "fleet.csv", tmp_path / "work")
+
+
+def test_a_foreign_file_is_left_as_it_is(tmp_path):
+    (tmp_path / "fleet.csv").write_text("mine")
+    with pytest.raises(UsageError, match="no fleet wrote"):
+        check_table_path(tmp_path / "fleet.csv", tmp_path / "fleet.csv.work")
+    with pytest.raises(UsageError, match="ends neither"):
+        check_table_path(tmp_path / "fleet.xlsx", tmp_path)
+    with pytest.raises(UsageError, match="no such table"):
+        read_table(tmp_path / "none.csv")
+    for ending in (".csv", ".sqlite"):
+        (tmp_path / f"fleet{ending}").write_text("mine\n1\n")
+        with pytest.raises(UsageError, match="is no table of a fleet"):
+            read_table(tmp_path / f"fleet{ending}")
+
+
+def test_the_journal_loses_a_cut_line_only(tmp_path):
+    first, second = rows()[:2]
+    with Journal(tmp_path) as journal:
+        journal.add(replace(first, sha256="aa"), "k1", (5, 6))
+        journal.add(second, "k2", None)
+    path = tmp_path / "journal.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(b"not JSON\n" + whole[:-30])
+    with Journal(tmp_path) as journal:
+        assert journal.rows == {"k1": replace(first, sha256="aa")}
+        assert journal.hashes == {("a.mcap", 5, 6): "aa"}
+        journal.add(second, "k2", None)
+    with Journal(tmp_path) as journal:
+        assert set(journal.rows) == {"k1", "k2"}
+
+
+def test_one_host_at_a_time(tmp_path):
+    pytest.importorskip("fcntl")
+    with Journal(tmp_path), pytest.raises(UsageError, match="another fleet is at work"):
+        Journal(tmp_path)
+
+
+def test_what_a_result_hangs_on():
+    keys = {row_key("aa", Settings()), row_key("ab", Settings()), row_key("aa", Settings(model="rigid")),
+            row_key("aa", Settings(confidence=0.9)), row_key("aa", Settings(tolerance=0.9))}
+    assert len(keys) == 5
+
+
+@pytest.mark.parametrize("change", [
+    {"other": 1}, {"inertia_kg_m2": "104"}, {"samples": 1.5}, {"complete": 1}, {"verdict": None},
+])
+def test_what_is_no_row(change):
+    content = asdict(FleetRow("a", "valid")) | change
+    if change == {"verdict": None}:
+        del content["verdict"]
+    with pytest.raises(ValueError, match=r"row|is no"):
+        row_from_json(content)
+
+
+@pytest.mark.parametrize(("stored", "changed"), [
+    (None, None), ({"verdict": "valid", "inertia_kg_m2": {"value": 104.0 * (1 + 1e-10)}}, False),
+    ({"verdict": "valid", "inertia_kg_m2": {"value": 105.0}}, True),
+    ({"verdict": "model_rejected", "inertia_kg_m2": None}, True), ({"verdict": 7}, None), ("what", None),
+    ({"verdict": "valid", "inertia_kg_m2": {"value": "x"}}, True),
+])
+def test_what_changed_against_the_log_s_own_result(stored, changed):
+    document = {"verdict": "valid", "reason": "as", "inertia_kg_m2": {"value": 104.0, "low": 103.0}}
+    row = row_of("a.mcap", json.loads(json.dumps(document)), settings=Settings(), stored=stored)
+    assert row.changed is changed
+    assert row.inertia_low_kg_m2 == 103.0
