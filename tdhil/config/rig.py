@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
+from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
 from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
@@ -146,6 +146,40 @@ class Limits(DataModel):
         return findings
 
 
+def _load_of(value: Any) -> Any:
+    """The word alone stands for the kind."""
+    return {"kind": value} if isinstance(value, str) else value
+
+
+class Load(DataModel):
+    """What hangs on the shaft. A pipe whose sizes are given is known to the result; the word alone will do, too."""
+
+    kind: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
+    length_m: Annotated[float, _within(1.0, 2e4)] | None = Field(
+        default=None, description="m; of uniform pipe, from the top down to where its section changes"
+    )
+    outer_diameter_m: Annotated[float, _within(1e-3, 10.0)] | None = Field(default=None, description="m; of the pipe")
+    inner_diameter_m: Annotated[float, _within(0.0, 10.0, zero=True)] | None = Field(
+        default=None, description="m; of the pipe"
+    )
+    tolerance: Annotated[float, _within(1e-3, 0.5)] = Field(
+        default=0.03, description="how well its weight and stiffness follow from that, 1 sd as a share"
+    )
+
+    @classmethod
+    def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
+        """Half a pipe, a pipe without a wall, and one on nothing."""
+        sizes = ("length_m", "outer_diameter_m", "inner_diameter_m")
+        given = [name for name in sizes if values.get(name) is not None]
+        if values.get("kind") == "none" and given:
+            return [(given[0], "belongs to kind: string")]
+        findings = [(given[0], f"needs '{name}' beside it") for name in sizes if given and name not in given]
+        outer, inner = values.get("outer_diameter_m"), values.get("inner_diameter_m")
+        if outer is not None and inner is not None and inner >= outer:
+            findings.append(("inner_diameter_m", f"must be less than outer_diameter_m, which is {outer:g}"))
+        return findings
+
+
 class Gear(DataModel):
     """Between motor and main shaft."""
 
@@ -251,7 +285,7 @@ class Rig(DataModel):
     rate_hz: float | None = Field(default=None, gt=0, le=2000, description="cycles a second")
     limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
     gear: Gear = Gear()
-    load: Literal["none", "string"] = Field(default="none", description="string: a drill string hangs on the shaft")
+    load: Annotated[Load, BeforeValidator(_load_of)] = Load()
     make_up_torque_nm: Torque | None = Field(default=None, description="N·m at the motor; of the string's joints")
     torque_ramp_nm_s: Positive | None = Field(default=None, description="N·m/s; how fast trapped torque is let go")
     allow_reverse: bool = Field(default=False, description="may the shaft turn backwards? backs off tool joints")
@@ -267,7 +301,8 @@ class Rig(DataModel):
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
         """What a string needs, and limits that don't fit the rest."""
-        is_string = values.get("load") == "string"
+        load = _load_of(values.get("load"))
+        is_string = isinstance(load, Mapping) and load.get("kind") == "string"
         findings = [
             ("load", f"string needs '{name}' ({_describe(name)})")
             for name in ("make_up_torque_nm", "torque_ramp_nm_s")

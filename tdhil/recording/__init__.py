@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, LagPrior as LagPrior,
-        Level as Level, Ramp as Ramp, Recording as Recording, Segment as Segment, Stage as Stage,
+        Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment, Stage as Stage,
         SteppedSetpoint as SteppedSetpoint, aborted_stage as aborted_stage, before_abort as before_abort,
     )
     from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended
@@ -34,7 +34,7 @@ else:
             "mcap_container": ("MAGIC",),
             "packed": ("pack_recording", "unpack_recording"),
             "recording": (
-                "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Ramp", "Recording", "Segment",
+                "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Pipe", "Ramp", "Recording", "Segment",
                 "Stage", "SteppedSetpoint", "aborted_stage", "before_abort",
             ),
             "run_log": ("Ended", "RunLog", "find_ended"),

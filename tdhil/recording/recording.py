@@ -79,6 +79,26 @@ class LagPrior:
 
 
 @dataclass(frozen=True)
+class Pipe:
+    """A drill string's uniform pipe as its sizes have it, at the motor's shaft; ``rel_sd`` of either."""
+
+    inertia_kg_m2: float               # J_s = ρ I L
+    stiffness_nm_rad: float            # k = G I/L, from end to end
+    rel_sd: float
+    source: str = ""
+
+    @property
+    def impedance_nm_s_rad(self) -> float:
+        """ζ = √(J_s k), what waves feel."""
+        return math.sqrt(self.inertia_kg_m2 * self.stiffness_nm_rad)
+
+    @property
+    def delay_s(self) -> float:
+        """√(J_s/k), from one end to the other."""
+        return math.sqrt(self.inertia_kg_m2 / self.stiffness_nm_rad)
+
+
+@dataclass(frozen=True)
 class SteppedSetpoint:
     """A speed setpoint that was stepped once in ``period_s``, and how the drive made the shaft follow it:
 
@@ -129,6 +149,7 @@ class Recording:
     gear_ratio: float = 1.0                # i = ω_motor / ω_main
     timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
+    pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did
 

@@ -76,7 +76,7 @@ def _provenance(run: Mapping[str, Any]) -> dict[str, Any]:
     rig = {
         "name": text_of(bench.get("name")),
         "file": text_of(run.get("rig_file")),
-        "load": text_of(bench.get("load")),
+        "load": text_of((_mapping(bench.get("load")) or {"kind": bench.get("load")}).get("kind")),
         "limits": {str(name): value for name, value in limits.items() if isinstance(value, int | float)},
     }
     return {

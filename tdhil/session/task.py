@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from typing import Any
 
 from drivers import Identity
 from tdhil.config import Rig, RunOptions, require_limits, simulated_default_rig
-from tdhil.recording import LagPrior
+from tdhil.recording import LagPrior, Pipe
 from tdhil.run import ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -41,7 +42,11 @@ def suited(rig: Rig | None, plant: Any) -> Rig | None:
         "time_s": TIME_S,
         "quick_stop_rad_s2": QUICK_STOP_RAD_S2,
     }
-    data |= {"load": "string", "make_up_torque_nm": most_nm, "torque_ramp_nm_s": TORQUE_SHARE * most_nm / RAMP_S}
+    data |= {
+        "load": data["load"] | {"kind": "string"},
+        "make_up_torque_nm": most_nm,
+        "torque_ramp_nm_s": TORQUE_SHARE * most_nm / RAMP_S,
+    }
     bench = Rig.model_validate(data)
     if rig is not None:
         bench._file, bench._lines = rig._file, rig._lines
@@ -89,7 +94,7 @@ def machine_limits(
         probe_torque_nm=limits.probe_torque_nm,
         probe_travel_rad=limits.probe_travel_rad,
         allow_reverse=bench.allow_reverse,
-        load=bench.load,
+        load=bench.load.kind,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
         accept_no_watchdog=accept_no_watchdog,
         accept_shared_watchdog=accept_shared_watchdog,
@@ -145,4 +150,22 @@ def facts(bench: Rig) -> dict[str, Any]:
         "gear_ratio": bench.gear.ratio,
         "torque_scale_rel_sd": ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
         "lag_prior": lag_prior(bench),
+        "pipe": pipe_of(bench),
     }
+
+
+def pipe_of(bench: Rig) -> Pipe | None:
+    """The drill string's pipe, at the motor's shaft, where rig.yaml gives its sizes."""
+    load, i = bench.load, bench.gear.ratio
+    if load.length_m is None or load.outer_diameter_m is None or load.inner_diameter_m is None:
+        return None
+    section_m4 = math.pi / 32.0 * (load.outer_diameter_m**4 - load.inner_diameter_m**4)
+    return Pipe(
+        inertia_kg_m2=STEEL_DENSITY_KG_M3 * section_m4 * load.length_m / i**2,
+        stiffness_nm_rad=STEEL_SHEAR_MODULUS_PA * section_m4 / load.length_m / i**2,
+        rel_sd=load.tolerance,
+        source="rig.yaml",
+    )
+
+
+STEEL_DENSITY_KG_M3, STEEL_SHEAR_MODULUS_PA = 7850.0, 79.3e9

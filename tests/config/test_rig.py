@@ -9,6 +9,7 @@ from drivers.errors import DataFileError, PreflightRefused
 from tdhil.config.options import OPTIONS, resolve
 from tdhil.config.rig import Limits, Rig, load_rig, require_limits, simulated_default_rig
 from tdhil.errors import UsageError
+from tdhil.session.task import pipe_of
 
 FULL = """\
 drive: canopen
@@ -86,7 +87,7 @@ def test_everything_has_its_place(tmp_path: Path) -> None:
 def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
     rig = rig_of(tmp_path, "node: 3\n")
     assert rig.limits is None
-    assert (rig.gear.ratio, rig.load, rig.allow_reverse) == (1.0, "none", False)
+    assert (rig.gear.ratio, rig.load.kind, rig.allow_reverse) == (1.0, "none", False)
     with pytest.raises(ValidationError):
         rig.node = 4
 
@@ -210,3 +211,35 @@ def test_limits_in_python_are_checked_too() -> None:
             speed_min_rad_s=3, speed_max_rad_s=2, torque_nm=1, time_s=1, quick_stop_rad_s2=1,
             probe_torque_nm=1, probe_travel_rad=1,
         )
+
+
+STRING_KEYS = "make_up_torque_nm: 300\ntorque_ramp_nm_s: 5\n"
+
+
+def test_a_string_may_be_a_word_or_a_pipe_with_its_sizes(tmp_path):
+    assert rig_of(tmp_path, "load: string\n" + STRING_KEYS).load.kind == "string"
+    pipe = "load: {kind: string, length_m: 2300, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
+    load = rig_of(tmp_path, pipe + STRING_KEYS).load
+    assert (load.kind, load.length_m, load.outer_diameter_m, load.inner_diameter_m) == ("string", 2300.0, 0.127, 0.1086)
+    assert load.tolerance == 0.03
+
+
+@pytest.mark.parametrize(("load", "said"), [
+    ("chain", "load"),
+    ("{kind: string, length_m: 2300}", "needs 'outer_diameter_m' beside it"),
+    ("{kind: string, length_m: 2300, outer_diameter_m: 0.1, inner_diameter_m: 0.1}", "less than outer_diameter_m"),
+    ("{kind: none, length_m: 2300}", "belongs to kind: string"),
+    ("{kind: string, lenght_m: 2300}", "lenght_m"),
+])
+def test_a_load_that_is_none_is_refused_with_its_line(load, said, tmp_path):
+    with pytest.raises(DataFileError, match=said) as refused:
+        rig_of(tmp_path, f"node: 5\nload: {load}\n" + STRING_KEYS)
+    assert "rig.yaml:2" in str(refused.value)
+
+
+def test_the_pipe_is_what_its_sizes_make_of_steel_at_the_motor(tmp_path):
+    pipe = "load: {kind: string, length_m: 3000, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
+    found = pipe_of(rig_of(tmp_path, "gear: {ratio: 2}\n" + pipe + STRING_KEYS))
+    assert 4.0 * found.impedance_nm_s_rad == pytest.approx(296.5, rel=1e-3)
+    assert 2.0 * found.delay_s == pytest.approx(1.888, rel=1e-3)
+    assert pipe_of(rig_of(tmp_path, "load: string\n" + STRING_KEYS)) is None

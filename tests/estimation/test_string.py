@@ -14,6 +14,7 @@ from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import Model
 from tdhil.estimation.frequency_domain.optimiser import box, lowest, minimise, rough_inertia_of
 from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, stiffness, string_resonances
+from tdhil.recording import Pipe as KnownPipe
 from tdhil.recording.recording import LagPrior
 from tests.estimation.compliant_bench import LINES, Noise, Pipe, TwoMass, run
 from tests.estimation.test_two_mass import KNOWN, MILD, S, parameters, synthetic
@@ -68,6 +69,23 @@ def test_auto_finds_the_string():
     pole = abs(pipe.impedance(shaft.antiresonance_hz.value))
     assert pole > 5.0 * max(abs(pipe.impedance(shaft.antiresonance_hz.value * by)) for by in (0.8, 1.15))
     assert any("a resonance" in warning for warning in found.warnings)
+
+
+def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
+    plant = Pipe()
+    recording = run(plant, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
+    free, found, wrong = (
+        identify(replace(recording, pipe=None if scale is None else KnownPipe(
+            scale * plant.inertia, plant.stiffness / scale, 0.03, "rig.yaml")))
+        for scale in (None, 1.0, 2.0)
+    )
+    assert found.model == free.model == wrong.model == "string"
+    assert found.inertia.value == pytest.approx(plant.motor, rel=0.01)
+    assert found.inertia.low <= plant.motor <= found.inertia.high
+    assert found.inertia.high - found.inertia.low <= free.inertia.high - free.inertia.low
+    assert any("as rig.yaml says, to 3 %" in one for one in found.inertia.conditional_on)
+    assert any("contradict the pipe's sizes in rig.yaml" in warning for warning in wrong.warnings)
+    assert wrong.inertia.low <= plant.motor <= wrong.inertia.high
 
 
 def test_waves_on_the_bench_meet_the_bench_s_own_impedance():

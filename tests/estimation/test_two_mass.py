@@ -19,10 +19,16 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
 )
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
-from tdhil.estimation.frequency_domain.shafts import StringShaft, TwoMassShaft, resonances, stiffness
+from tdhil.estimation.frequency_domain.shafts import (
+    KnownStringShaft,
+    StringShaft,
+    TwoMassShaft,
+    resonances,
+    stiffness,
+)
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import Refusal
-from tdhil.recording.recording import LagPrior
+from tdhil.recording.recording import LagPrior, Pipe
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
 
 S = 2j * np.pi * np.array(LINES)
@@ -99,6 +105,28 @@ def test_jacobian_is_the_derivative_through_every_view(shaft, view):
         step[index] = 1e-6 * m[index]
         slope = (shaft.impedance(m + step, S) - shaft.impedance(m - step, S)) / (2.0 * step[index])
         assert np.allclose(jacobian[:, index], slope, rtol=1e-5, atol=1e-6 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("view", (None, TOTAL, STIFFNESS, RESONANCE), ids=("plain", "total", "stiffness", "resonance"))
+def test_what_is_known_of_a_pipe_has_its_derivative_through_every_view(view):
+    pipe = Pipe(215.0, 410.0, 0.03)
+    shaft, m = KnownStringShaft(pipe), np.append(parameters(TwoMass()), [0.3, 0.6])
+    m[2], m[3] = 215.0 / 0.3, np.sqrt(410.0 / (215.0 / 0.3 * 0.8))
+    assert np.allclose(shaft.beliefs(m)[0], 0.0, atol=1e-12)
+    m[2] *= 1.05
+    known = shaft.beliefs(m)[0]
+    assert known == pytest.approx([np.log(1.05) / 0.03, 0.0], abs=1e-12)
+    if view is not None:
+        shaft, seen = ViewedShaft(shaft, view), m.copy()
+        seen[view.index] = view.of(m)
+        m = seen
+        assert shaft.beliefs(m)[0] == pytest.approx(known, abs=1e-9)
+    slopes = shaft.beliefs(m)[1]
+    for index in range(len(m)):
+        step = np.zeros(len(m))
+        step[index] = 1e-6 * m[index]
+        slope = (shaft.beliefs(m + step)[0] - shaft.beliefs(m - step)[0]) / (2.0 * step[index])
+        assert np.allclose(slopes[:, index], slope, rtol=1e-5, atol=1e-6 * np.abs(slopes).max())
 
 
 @pytest.fixture(scope="module")

@@ -77,14 +77,15 @@ def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
     text = re.sub(r"^# ?( *[a-z_0-9]+: +[0-9].*)$", lambda found: _indented(found[1]), EXAMPLE.read_text("utf-8"),
                   flags=re.MULTILINE)
     path = tmp_path / "rig.yaml"
-    path.write_text(text.replace("load: none", "load: string"), encoding="utf-8")
+    path.write_text(text.replace("kind: none", "kind: string"), encoding="utf-8")
     rig = load_rig(path)
-    assert rig.make_up_torque_nm == 9000
+    assert (rig.make_up_torque_nm, rig.load.length_m) == (9000, 2300)
     assert rig.drive_data.torque_lag_sd_s == 0.01
 
 
 def _indented(line: str) -> str:
-    return ("  " if "lag" in line or "temperature" in line else "") + line
+    inside = ("lag", "temperature", "length", "diameter", "tolerance")
+    return ("  " if any(word in line for word in inside) else "") + line
 
 
 def test_plant_example_is_the_default_rig_and_complete():

@@ -54,7 +54,7 @@ def test_an_example_of_a_string_needs_no_rig_to_be_stopped(tmp_path):
     from tdhil.session.task import suited
 
     bench = suited(None, load_plant(EXAMPLES / "plant_string.yaml"))
-    assert (bench.load, bench.limits.torque_nm, bench.make_up_torque_nm) == ("string", 4000.0, 8000.0)
+    assert (bench.load.kind, bench.limits.torque_nm, bench.make_up_torque_nm) == ("string", 4000.0, 8000.0)
     assert suited(None, None) is None
     assert suited(None, RigParams()) is None
     assert suited(Rig(node=3), load_plant(EXAMPLES / "plant_two_mass.yaml")).node == 3

@@ -114,7 +114,7 @@ def test_a_new_rig_loads_and_moves_nothing_real_until_it_is_filled_in(tmp_path, 
     done = tdhil("rig", "new", path, "--profile", profile, "--load", "none")
     assert done.code == 0, done.err
     bench = load_rig(path)
-    assert (bench.profile, bench.load, bench.bus.interface, bench.modbus.host) == (profile, "none", None, None)
+    assert (bench.profile, bench.load.kind, bench.bus.interface, bench.modbus.host) == (profile, "none", None, None)
     with pytest.raises(PreflightRefused, match="no machine limits"):
         require_limits(bench)
     assert "limits: speed_min_rad_s, speed_max_rad_s" in done.err
@@ -134,7 +134,7 @@ def test_a_string_is_refused_until_its_torques_are_there(tmp_path):
     assert "make_up_torque_nm" in done.err
     path.write_text(path.read_text().replace("#make_up_torque_nm:", "make_up_torque_nm: 900")
                     .replace("#torque_ramp_nm_s:", "torque_ramp_nm_s: 50"))
-    assert load_rig(path).load == "string"
+    assert load_rig(path).load.kind == "string"
 
 
 def test_what_hangs_on_the_shaft_is_never_guessed(tmp_path):

@@ -41,6 +41,7 @@ from tdhil.estimation.frequency_domain.shafts import (
     SWING,
     TWO_MASS,
     VISCOUS,
+    KnownStringShaft,
     ShaftModel,
     StringShaft,
     TwoMassShaft,
@@ -48,6 +49,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import BudgetLine, Compliant, Estimate, Refusal
+from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Two masses, or the string? The simplest that the residuals allow stands; what can't be told apart is not assumed.
@@ -73,11 +75,16 @@ _NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the 
 
 @dataclass(frozen=True)
 class Chosen:
-    """``fit`` stands, or was the last to be tried if ``rejected``; ``beside``: the string, where two masses stand."""
+    """``fit`` stands, or was the last to be tried if ``rejected``; ``beside``: the string, where two masses stand.
+
+    ``pipe``: the fit takes the pipe for what its sizes say; ``other_pipe``: it doesn't, since the data contradict them.
+    """
 
     fit: CompliantFit
     beside: CompliantFit | None = None
     rejected: bool = False
+    pipe: Pipe | None = None
+    other_pipe: bool = False
 
 
 def usable_lines(every: tuple[Line, ...], least_nu: float) -> tuple[Line, ...]:
@@ -96,10 +103,10 @@ def _clear(line: Line) -> bool:
 
 def choose(
     asked: str, lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...],
-    fixed: Fixed
+    fixed: Fixed, pipe: Pipe | None = None
 ) -> Chosen | Refusal:
     """``asked``: by its name, a compliant shaft; or two masses and the string are tried. ``priors`` and ``fixed`` as
-    with a rigid shaft.
+    with a rigid shaft. A ``pipe`` that is known makes it a string, unless the data contradict that.
     """
     model = shaft_model(asked)
     compliant = model.compliant
@@ -107,6 +114,13 @@ def choose(
     if refusal is not None:
         return refusal
 
+    if pipe is not None and model.piped and _refuse_count(STRING, lines, constraint, priors) is None:
+        near = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
+        known = fit_compliant(KnownStringShaft(pipe), lines, constraint, priors, fixed, near)
+        if not rejects(known.residual) and plausible(known):
+            return Chosen(known, pipe=pipe)
+        other = choose(asked, lines, constraint, priors, fixed)
+        return replace(other, other_pipe=True) if isinstance(other, Chosen) else other
     if compliant is not None:
         forced = fit_compliant(compliant(), lines, constraint, priors, fixed)
         return Chosen(forced, rejected=rejects(forced.residual))
@@ -304,7 +318,7 @@ def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = Non
     contradicted = rigid if isinstance(rigid, Finding) and rigid.rejected else None
     priors, fixed = known_of(case.recording.lag_prior, len(case.usable), case.constraint)
     try:
-        chosen = choose(case.options.model, case.usable, case.constraint, priors, fixed)
+        chosen = choose(case.options.model, case.usable, case.constraint, priors, fixed, case.recording.pipe)
         if isinstance(chosen, Chosen) and not chosen.rejected:
             told = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
@@ -342,7 +356,7 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
         skew_s=told.skew_s,
         compliant=told.shaft,
         lines=fitted_points(fit.fitted, case.options.confidence),
-        warnings=_caveats(fit, told),
+        warnings=_caveats(chosen, told),
     )
     if isinstance(rigid, Finding) and rigid.rejected:
         finding = replace(finding, preface=f"{rigid.contradicted}; ")
@@ -379,8 +393,17 @@ def _words(name: str) -> Words:
     return Words(model.text, f"{_LOOK_FOR}; try --model auto", _WIDE, model.explain)
 
 
+_OTHER_PIPE = (
+    "the data contradict the pipe's sizes in rig.yaml, which were left out of account: look at load.length_m and the"
+    " diameters"
+)
+
+
 def _conditions(chosen: Chosen) -> tuple[str, ...]:
-    if chosen.fit.is_string:
+    if chosen.pipe is not None:
+        told = f"{chosen.pipe.source} says, to {100.0 * chosen.pipe.rel_sd:.2g} % (1 sd)"
+        shaft = f"the motor turns a uniform string whose pipe weighs and yields as {told}"
+    elif chosen.fit.is_string:
         shaft = "the motor turns a uniform string"
     else:
         shaft = "the spring weighs nothing" if chosen.beside is None else "the motor turns a spring or a uniform string"
@@ -388,8 +411,10 @@ def _conditions(chosen: Chosen) -> tuple[str, ...]:
     return shaft, f"its lowest swing is above {slowest_hz:.3g} Hz"
 
 
-def _caveats(fit: CompliantFit, found: CompliantResult) -> tuple[str, ...]:
-    said = ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
+def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
+    fit = chosen.fit
+    said = [_OTHER_PIPE] if chosen.other_pipe else []
+    said += ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
     if not _told(found.shaft.total_inertia):
         said.append("J_r + J_L is left open on one side: a slower line, well below the resonance, would show it")
     hertz = [line.hertz for line in fit.fitted.problem.lines]

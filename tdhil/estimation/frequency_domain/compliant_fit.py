@@ -20,6 +20,7 @@ from tdhil.estimation.frequency_domain.shafts import (
     STRING_SHARE,
     SWING,
     VISCOUS,
+    Believing,
     RigidShaft,
     Shaft,
     string_resonances,
@@ -239,6 +240,16 @@ class ViewedShaft:
         if self.view is STIFFNESS:
             scales[self.view.index] = rough_inertia * float(np.median(np.abs(s))) ** 2
         return scales
+
+    def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of the shaft inside; none where nothing is known of it."""
+        if not isinstance(self.inner, Believing):
+            return np.zeros(0), np.zeros((0, len(m)))
+        inside, slope = self._inside(m)
+        off, slopes = self.inner.beliefs(inside)
+        by_index = slopes[:, self.view.index].copy()
+        slopes[:, self.view.index] = 0.0
+        return off, slopes + by_index[:, None] * slope
 
     def _inside(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
         inside = m.copy()

@@ -76,6 +76,9 @@ def residual_test(problem: Likelihood, theta: FloatArray, fitted: int) -> Residu
     measured = 2.0 * float(np.sum(m)) + len(problem.priors)
     statistic = float(np.sum((2.0 * nu + m - 1.0) * np.log1p(q / nu)))
     statistic += float(sum(((theta[p.index] - p.mean) / p.sd) ** 2 for p in problem.priors))
+    beliefs, _ = problem.beliefs(theta)
+    measured += len(beliefs)
+    statistic += float(beliefs @ beliefs)
     if problem.constraint is not None:
         n = problem.constraint.dof
         measured += 1.0

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
+from tdhil.estimation.frequency_domain.shafts import Believing
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.recording import FloatArray
 
@@ -58,6 +59,7 @@ class Likelihood:
         self.segments = np.array([float(len(line.speed)) for line in lines])
         self._scale = 2.0 * (self.nu + self.segments) / self.nu
         self._load = load
+        self._believing = model.shaft if isinstance(model.shaft, Believing) else None
         self._of_line = np.equal.outer(np.arange(len(lines)), self.owner).astype(np.float64)
         known = (*priors, *model.plausible({prior.index for prior in priors}))
         self._prior_rows = np.zeros((len(known), model.size))
@@ -72,7 +74,15 @@ class Likelihood:
     @property
     def numbers(self) -> int:
         """n: how many real numbers are fitted."""
-        return 2 * len(self.owner) + len(self.priors) + (self.constraint is not None)
+        beliefs = len(self.beliefs(np.ones(self.model.size))[0])
+        return 2 * len(self.owner) + len(self.priors) + (self.constraint is not None) + beliefs
+
+    def beliefs(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far theta is from what is known of the shaft beforehand, in sd, (R,), and the slopes, (R, P)."""
+        if self._believing is None:
+            return np.zeros(0), np.zeros((0, self.model.size))
+        off, slopes = self._believing.beliefs(theta[: self.model.mechanical])
+        return off, np.pad(slopes, ((0, 0), (0, self.model.size - slopes.shape[1])))
 
     def unloaded(self, theta: FloatArray) -> tuple[Line, ...]:
         """The lines without the torque of the load."""
@@ -165,6 +175,8 @@ class Likelihood:
 
     def _prior_residuals(self, theta: FloatArray) -> FloatArray:
         known: FloatArray = (theta[self._prior_index] - self._prior_mean) / self._prior_sd
+        if self._believing is not None:
+            known = np.concatenate([known, self.beliefs(theta)[0]])
         if self.constraint is None:
             return known
         z = self.tie_error(theta)
@@ -174,12 +186,15 @@ class Likelihood:
         return found
 
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
+        rows = self._prior_rows
+        if self._believing is not None:
+            rows = np.concatenate([rows, self.beliefs(theta)[1]])
         if self.constraint is None:
-            return self._prior_rows
+            return rows
         z, n = self.tie_error(theta), self.constraint.dof
         value = np.sqrt((n + 1.0) * np.log1p(z * z / n))
         slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else np.sqrt((n + 1.0) / n)
-        return np.concatenate([self._prior_rows, slope / self.constraint.sd * self._tie_row[None, :]])
+        return np.concatenate([rows, slope / self.constraint.sd * self._tie_row[None, :]])
 
     def tie_error(self, theta: FloatArray) -> float:
         """How far the friction is from what the levels say, in standard deviations.
@@ -204,6 +219,7 @@ class Likelihood:
             part: FloatArray = weight[k] * shrink * (own.conj().T @ own).real
             parts.append((part, 2.0 * float(self.nu[k])))
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
+        parts += [(np.outer(row, row), np.inf) for row in self.beliefs(theta)[1]]
         if self.constraint is not None:
             parts.append((np.outer(self._tie_row, self._tie_row) / self.constraint.sd**2, self.constraint.dof))
         return np.sum([part for part, _ in parts], axis=0), parts

@@ -6,13 +6,13 @@ About a mean speed that keeps its sign Coulomb friction is constant, and the sha
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from tdhil.config import MODELS, load
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray
-from tdhil.recording import FloatArray
+from tdhil.recording import FloatArray, Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Two masses on a torsion spring, seen from the motor (the paper's figure 7, which it draws and then drops).
@@ -230,6 +230,42 @@ class StringShaft:
         return np.append(TwoMassShaft().scales(rough_inertia, s), [0.3, 0.3])
 
 
+@runtime_checkable
+class Believing(Protocol):
+    """A shaft of which something is known beforehand."""
+
+    def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How far m is from that, in standard deviations, (R,), and the slopes of it, (R, M)."""
+        ...
+
+
+class KnownStringShaft(StringShaft):
+    """A string whose pipe is known: ζ = √(J_s k) to its tolerance, and √(J_s/k), the waves' way, to a third of that.
+
+    What the pipe's section is wrong by is in J_s and in k alike, and leaves the waves' speed alone: steel's.
+    """
+
+    def __init__(self, pipe: Pipe) -> None:
+        self.pipe = pipe
+
+    def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """With ln J_s = ln η + ln J_L, ln k = 2 ln ω_a + ln J_L + ln(1 − 2η/3)."""
+        share, load, swing = max(float(m[STRING_SHARE]), 1e-6), float(m[LOAD]), float(m[SWING])
+        light = 1.0 - _RAYLEIGH * share
+        inertia = math.log(share * load / self.pipe.inertia_kg_m2)
+        spring = math.log(swing**2 * load * light / self.pipe.stiffness_nm_rad)
+        by_inertia, by_spring = np.zeros(len(m)), np.zeros(len(m))
+        by_inertia[STRING_SHARE], by_inertia[LOAD] = 1.0 / share, 1.0 / load
+        by_spring[STRING_SHARE], by_spring[LOAD], by_spring[SWING] = -_RAYLEIGH / light, 1.0 / load, 2.0 / swing
+        sds = np.array([self.pipe.rel_sd, self.pipe.rel_sd / DELAY_SURER])
+        off = np.array([0.5 * (inertia + spring), 0.5 * (inertia - spring)]) / sds
+        slopes = np.stack([0.5 * (by_inertia + by_spring), 0.5 * (by_inertia - by_spring)]) / sds[:, None]
+        return off, slopes
+
+
+DELAY_SURER = 3.0
+
+
 def _end_and_string(m: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Z_e and b."""
     share, drag_share = m[STRING_SHARE], m[DRAG_SHARE]
@@ -292,7 +328,7 @@ class ShaftModel:
     ``compliant``: makes the shaft whose swing is fitted, whose m begins as that of two masses does; None: a rigid one.
     ``text``: of a compliant shaft, what it is, for the reader; ``explain``: what it does with the data, if so;
     ``have``: what has the unknowns of its fit. ``lags``: are the reports taken to lag? ``widened``: where a rigid
-    shaft is contradicted or in doubt, are others tried?
+    shaft is contradicted or in doubt, are others tried? ``piped``: is a pipe made use of whose sizes are known?
     """
 
     compliant: Callable[[], Shaft] | None = None
@@ -301,14 +337,17 @@ class ShaftModel:
     have: str = ""
     lags: bool = True
     widened: bool = False
+    piped: bool = False
 
 
-AUTO = ShaftModel(widened=True)
+AUTO = ShaftModel(widened=True, piped=True)
 RIGID = ShaftModel()
 TWO_MASS = ShaftModel(
     TwoMassShaft, "two masses on a spring", "explain the data", "two masses on a spring behind a drive's reports have"
 )
-STRING = ShaftModel(StringShaft, "a string with a mass at its end", have="a string behind a drive's reports has")
+STRING = ShaftModel(
+    StringShaft, "a string with a mass at its end", have="a string behind a drive's reports has", piped=True
+)
 PAPER = ShaftModel(lags=False)
 
 
