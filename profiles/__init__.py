@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from profiles.eds_reader import read_eds as read_eds
     from profiles.entry import (
         Confidence as Confidence, DriveProfile as DriveProfile, Entry as Entry, Require as Require,
+        SpeedControllerParameters as SpeedControllerParameters,
     )
     from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError
     from profiles.face import lazy_face as lazy_face
@@ -39,7 +40,7 @@ else:
         {
             "eds_import": ("begin_profile",),
             "eds_reader": ("read_eds",),
-            "entry": ("Confidence", "DriveProfile", "Entry", "Require"),
+            "entry": ("Confidence", "DriveProfile", "Entry", "Require", "SpeedControllerParameters"),
             "errors": ("DataFileError", "Problem", "TdhilError"),
             "face": ("lazy_face",),
             "library": (

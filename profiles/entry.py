@@ -44,6 +44,37 @@ class Entry(DataModel):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# The speed controller's own parameters, for whoever types gains into the drive. No run reads or writes them.
+
+
+class ControllerGain(Entry):
+    """Its proportional gain."""
+
+    title: str = Field(min_length=3, description="the manual's number and name, such as 'p1470 P gain'")
+    unit: Literal["nm_s_rad", "percent_per_percent", "unknown"] = Field(
+        description="nm_s_rad: N·m per rad/s; percent_per_percent: torque in % of rated for a speed error in % of the "
+        "rated (or reference) speed; unknown: the manual gives none"
+    )
+
+
+class ControllerIntegral(Entry):
+    """Its integral part."""
+
+    title: str = Field(min_length=3, description="the manual's number and name")
+    unit: Literal["s", "ms", "nm_rad", "unknown"] = Field(
+        description="s, ms: an integral time T_I, so that I = P/T_I; nm_rad: the integral gain itself"
+    )
+
+
+class SpeedControllerParameters(DataModel):
+    """What to type where, of gains that `tdhil tune` finds; by hand, never by this program."""
+
+    gain: ControllerGain
+    integral: ControllerIntegral
+    note: str | None = Field(default=None, description="what to know beside: adaptation, a filter, where it acts")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 class DriveProfile(DataModel):
     """What every profile says, whatever its bus; each bus has its own below this, in a module of its name."""
@@ -52,6 +83,9 @@ class DriveProfile(DataModel):
     title: str = Field(min_length=3, description="one line for tables and reports")
     bus: str
     experimental: bool = Field(default=False, description="second-hand, or never tried on the bus that it names")
+    speed_controller: SpeedControllerParameters | None = Field(
+        default=None, description="its speed controller's gains, for `tdhil tune`; no run touches them"
+    )
 
     def entries(self) -> tuple[tuple[str, Entry], ...]:
         """(name, entry) of everything that the profile says, with its source and confidence."""

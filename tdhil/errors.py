@@ -18,6 +18,7 @@
     │   ├── LogBroken               the disk ran full in mid-run; the shaft was stopped          3
     │   ├── LogRefused              too little space to begin with; nothing moved                4
     │   └── NothingRecoverable      not one message of the file can be read                     10
+    ├── TuningRefused               `tdhil tune`: such gains would make the string swing        11
     └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT (143)
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
@@ -53,6 +54,7 @@ class ExitCode(IntEnum):
     STOP_NOT_CONFIRMED = 8      # use the hard-wired emergency stop
     NOT_IDENTIFIABLE = 9        # not identifiable, or the model was rejected
     NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
+    TUNING_REFUSED = 11         # the gains that were asked for can't be recommended
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
     TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\)
 

@@ -17,6 +17,7 @@ _COMMANDS = {
     "replay": "identify again from a log, or from a trace that a drive's own tool exported",
     "fleet": "identify many logs again, into one table: by processes here, or on a Dask cluster",
     "watch": "identify new logs in a folder as they come",
+    "tune": "from J to a speed controller that damps the drill string; nothing moves",
     "export": "a log's CAN frames or samples in another program's format",
     "profiles": "what is known of which drive, what it needs set, and how sure that is",
     "scan": "find out who is on the bus; writes nothing to any drive",
@@ -95,6 +96,8 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.cli.fleet import add_arguments
     elif name == "watch":
         from tdhil.cli.fleet import add_watch_arguments as add_arguments
+    elif name == "tune":
+        from tdhil.cli.tune import add_arguments
     elif name == "stop":
         from tdhil.cli.stop import add_arguments
     elif name == "study":

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
         require_extra as require_extra,
     )
     from tdhil.report.plots import draw_run as draw_run
+    from tdhil.report.tuning import (
+        TunedFor as TunedFor, print_tuning as print_tuning, showcase_of as showcase_of,
+        tuning_document as tuning_document, write_tuning_report as write_tuning_report,
+    )
 else:
     __getattr__, __dir__ = lazy_face(
         __name__,
@@ -28,5 +32,6 @@ else:
             "live": ("LiveDisplay", "stderr_console"),
             "page": ("STYLE", "install_command", "repeatable_figures", "require_extra"),
             "plots": ("draw_run",),
+            "tuning": ("TunedFor", "print_tuning", "showcase_of", "tuning_document", "write_tuning_report"),
         },
     )

@@ -48,24 +48,35 @@ def write_report(document: Mapping[str, Any], recording: Recording, path: Path) 
     That is beside a file that has come there meanwhile. Raises UsageError where it can't be written.
     """
     try:
-        report = report_of(document, recording, sha256_of(Path(document["log"])))
-        if path.suffix.lower() == PDF:
-            from tdhil.report.pdf import pdf_bytes
-
-            data = pdf_bytes(report)
-        else:
-            data = report_page(report).encode()
-        if path.is_file():
-            path = fresh(path)
-        with path.open("xb" if not path.exists() else "wb") as file:
-            file.write(data)
-        return path
+        return _put(report_of(document, recording, sha256_of(Path(document["log"]))), path)
     except OSError as error:      # of the file; or of a module or a font, with no descriptor left to read it by
         raise UsageError(
             f"can't be written ({error.strerror or error})",
             where=f"--report {path}",
             next_step=f"The run and its log are whole: tdhil replay {document['log']} --report {path.name}",
         ) from error
+
+
+def write_blocks(report: Report, path: Path) -> Path:
+    """Any report, as PDF where the name ends so; and where it went. Raises UsageError where it can't be written."""
+    try:
+        return _put(report, path)
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--report {path}") from error
+
+
+def _put(report: Report, path: Path) -> Path:
+    if path.suffix.lower() == PDF:
+        from tdhil.report.pdf import pdf_bytes
+
+        data = pdf_bytes(report)
+    else:
+        data = report_page(report).encode()
+    if path.is_file():
+        path = fresh(path)
+    with path.open("xb" if not path.exists() else "wb") as file:
+        file.write(data)
+    return path
 
 
 def sha256_of(path: Path) -> str:

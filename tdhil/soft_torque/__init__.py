@@ -15,11 +15,20 @@ if TYPE_CHECKING:
         inner_lags as inner_lags, margins as margins, reflection as reflection, reflection_at as reflection_at,
         softest_allowed as softest_allowed, stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
+    from tdhil.soft_torque.own_units import (
+        DriveSetting as DriveSetting, drive_settings as drive_settings,
+    )
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
     from tdhil.soft_torque.simulation import (
         Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search, Trace as Trace,
         critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
         onset_speeds as onset_speeds, simulate as simulate,
+    )
+    from tdhil.soft_torque.tuning import (
+        BAND_HZ as BAND_HZ, Interval as Interval, TUNING_REFUSED as TUNING_REFUSED, TuneCase as TuneCase,
+        Tuned as Tuned, Tuning as Tuning, TuningRefused as TuningRefused, WrongInertia as WrongInertia,
+        figures_at as figures_at, largest_stable_share as largest_stable_share, least_damping as least_damping,
+        recipe_with as recipe_with, string_modes_hz as string_modes_hz, tune as tune,
     )
 else:
     __getattr__, __dir__ = lazy_face(
@@ -33,10 +42,16 @@ else:
                 "impedance", "inner_lags", "margins", "reflection", "reflection_at", "softest_allowed",
                 "stiff_controller", "tuned_controller",
             ),
+            "own_units": ("DriveSetting", "drive_settings"),
             "roots": ("RootsLost", "count_in", "roots_in"),
             "simulation": (
                 "Begin", "CriticalSpeeds", "Grid", "RPM", "Search", "Trace", "critical_speeds", "grid_of",
                 "lowest_turning", "onset_speeds", "simulate",
+            ),
+            "tuning": (
+                "BAND_HZ", "Interval", "TUNING_REFUSED", "TuneCase", "Tuned", "Tuning", "TuningRefused",
+                "WrongInertia", "figures_at", "largest_stable_share", "least_damping", "recipe_with",
+                "string_modes_hz", "tune",
             ),
         },
     )

@@ -1,0 +1,211 @@
+"""`tdhil tune`: from a result's J to a speed controller that damps the drill string; numbers only, nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from profiles.quantities import RPM, TIME, TORQUE
+from tdhil.cli.arguments import amount, share
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from profiles import Profile
+    from tdhil.report import TunedFor
+    from tdhil.soft_torque import DriveSetting, TuneCase, Tuning
+
+ASSUMED_LAGS_S = (0.020, 0.010, 0.003)
+"""Speed filter, torque loop and sampling of an inverter in vector control: of that order, not measured."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of tune."""
+    parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
+                        help="what tdhil identify --json wrote, or the log of a run")
+    parser.add_argument("--string", type=Path, required=True, metavar="string.yaml",
+                        help="drill string, bottom and bit (docs/soft_torque.md)")
+    parser.add_argument("--loop", choices=("drive", "bus"), default="drive",
+                        help="where the speed loop runs: in the drive (default), or in a host over the bus")
+    parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
+                        help="time constants inside the drive's speed loop (default 0.02 0.01 0.003, assumed)")
+    parser.add_argument("--phase-margin", type=float, default=60.0, metavar="DEG", help="of the stiff controller (60)")
+    parser.add_argument("--a", type=float, metavar="A", help="softness, P = ζ/a (default: the one that damps most)")
+    parser.add_argument("--compensate", type=share, metavar="SHARE",
+                        help="of J that the controller gives back (default: what damps most, with a reserve)")
+    parser.add_argument("--profile", metavar="NAME", help="of the drive, for its parameters (default: the result's)")
+    parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM", help="of the motor, for gains in %%")
+    parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM", help="of the motor, for gains in %%")
+    parser.add_argument("--no-simulation", action="store_true", help="without critical speeds, which take a minute")
+    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="with pictures: tune.html, or tune.pdf")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read, tune, print."""
+    from profiles import load_profile
+    from tdhil.report import (
+        PlainConsole,
+        check_report_path,
+        print_tuning,
+        showcase_of,
+        stderr_console,
+        tuning_document,
+        write_tuning_report,
+    )
+    from tdhil.soft_torque import Search, tune
+
+    _check(namespace)
+    if namespace.report is not None:
+        check_report_path(namespace.report, namespace.result)
+    result = _result(namespace.result)
+    case, lags_from = case_of(result, namespace)
+    name = namespace.profile or (result.get("profile") or {}).get("name")
+    profile = load_profile(str(name)) if name is not None else None
+    told = stderr_console()
+
+    def tell(text: str) -> None:
+        told.print(f"tune: {text} …", style="dim", markup=False)
+
+    tuning = tune(case, None if namespace.no_simulation else Search(), tell)
+    tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
+    document = tuning_document(tuning, tuned_for)
+    if namespace.json:
+        json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+        sys.stdout.write("\n")
+    else:
+        print_tuning(document, PlainConsole())
+    if namespace.report is not None:
+        written = write_tuning_report(document, showcase_of(tuning), namespace.report)
+        told.print(f"report: {written}", markup=False, soft_wrap=True)
+    return int(ExitCode.OK)
+
+
+def _check(namespace: argparse.Namespace) -> None:
+    for name, low, high, wanted in (
+        ("phase_margin", 20.0, 85.0, "from 20 to 85 degrees"),
+        ("a", 0.01, 10.0, "from 0.01 to 10"),
+        ("compensate", 0.0, 1.0, "a share from 0 to 1"),
+        ("rated_torque", 1e-6, 1e9, "a positive number of N·m"),
+        ("rated_speed", 1e-3, 1e6, "a positive number of rpm"),
+    ):
+        value = getattr(namespace, name)
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{value:g}: must be {wanted}", where=f"--{name.replace('_', '-')}")
+    for lag in namespace.inner_lags or ():
+        if not 0.0 <= lag <= 5.0:
+            raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags")
+
+
+def _result(path: Path) -> Mapping[str, Any]:
+    """The result's document: as --json wrote it, or identified again from the log."""
+    from tdhil.session import is_log
+
+    if not path.is_file():
+        raise UsageError("there is no such file", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap")
+    if is_log(path):
+        from tdhil.api import identify, read
+
+        return identify(read(path)).document
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"is neither a log nor JSON ({str(error)[:80]})", where=str(path),
+                         next_step="Name a result.json of tdhil identify --json, or a run.mcap") from None
+    if not isinstance(document, dict) or not {"inertia_kg_m2", "gear_ratio", "verdict"} <= document.keys():
+        raise UsageError("is JSON, but no result of tdhil identify", where=str(path),
+                         next_step="tdhil identify … --json > result.json")
+    return document
+
+
+def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
+    """All at the main shaft, and where the lags come from. Raises TuningRefused where the result has no J."""
+    from tdhil.soft_torque import Interval, TopDrive, TuneCase, TuningRefused, load_string
+
+    inertia = result["inertia_kg_m2"]
+    if not isinstance(inertia, dict) or not all(_is_number(inertia.get(key)) for key in
+                                                ("value", "low_total", "high_total")):
+        raise TuningRefused(f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
+                            next_step="Identify again with a motion that tells it")
+    square = _positive(result, "gear_ratio", namespace) ** 2
+    low, value, high = (square * float(inertia[key]) for key in ("low_total", "value", "high_total"))
+    if not 0.0 < low <= value <= high:
+        raise TuningRefused("J's interval reaches down to nothing", where=str(namespace.result),
+                            next_step="Identify again, for longer")
+    lags, lags_from = _lags(result, namespace)
+    drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
+                     square**0.5 * _estimate(result, "coulomb_nm"), lags)
+    case = TuneCase(load_string(namespace.string), drive, Interval(value, low, high), namespace.phase_margin,
+                    namespace.a, namespace.compensate)
+    return case, lags_from
+
+
+def _lags(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[tuple[float, ...], str]:
+    inner = tuple(lag for lag in namespace.inner_lags or ASSUMED_LAGS_S if lag > 0.0)
+    said = "as stated" if namespace.inner_lags else "assumed: nobody measured them"
+    if namespace.loop == "drive":
+        if not inner:
+            raise UsageError("no lag at all: no loop is like that", where="--inner-lags")
+        return inner, said
+    reported = result.get("speed_lag_s")
+    if not isinstance(reported, dict) or not _is_number(reported.get("value")):
+        raise UsageError("the result doesn't say how late the reported speed is", where="--loop bus",
+                         next_step="Identify with a multisine, which tells it")
+    period: Any = (result.get("cycle") or {}).get("period_s")
+    waiting = 1.5 * float(period) if _is_number(period) else 0.0
+    late = max(0.0, float(reported["value"]))
+    return tuple(lag for lag in (late, waiting, *inner[1:]) if lag > 0.0), (
+        f"the reported speed's lag as identified and a cycle and a half; the rest {said}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _positive(result: Mapping[str, Any], key: str, namespace: argparse.Namespace) -> float:
+    value = result[key]
+    if not _is_number(value) or value <= 0.0:
+        raise UsageError(f"{key} is no positive number", where=str(namespace.result))
+    return float(value)
+
+
+def _estimate(result: Mapping[str, Any], key: str) -> float:
+    """0 where the result doesn't have it, or has it negative."""
+    part = result.get(key)
+    value = part.get("value") if isinstance(part, dict) else None
+    return max(0.0, float(value)) if isinstance(value, int | float) else 0.0
+
+
+def _tuned_for(
+    result: Mapping[str, Any], namespace: argparse.Namespace, tuning: Tuning, lags_from: str, profile: Profile | None
+) -> TunedFor:
+    from tdhil.report import TunedFor
+    from tdhil.soft_torque import drive_settings
+
+    settings: dict[str, tuple[DriveSetting, ...]] = {}
+    warnings = []
+    ratio = float(result["gear_ratio"])
+    if profile is not None and namespace.loop == "drive":
+        parameters = profile.speed_controller
+        for one in tuning.tuned:
+            if one.controller is not None and parameters is not None:
+                at_motor = one.controller.at_shaft(ratio)
+                settings[one.kind] = drive_settings(parameters, at_motor, namespace.rated_torque, namespace.rated_speed)
+        if parameters is not None and parameters.note:
+            warnings.append(f"{profile.name}: {parameters.note}")
+        if any(one.compensated_share for one in tuning.tuned):
+            warnings.append("inertia compensation needs the derivative of the measured speed in the drive; few drives "
+                            "have it, and a feed-forward of the set speed's acceleration is not it")
+    if not namespace.inner_lags:
+        warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
+                        "them with --inner-lags")
+    if tuning.case.string.bit is None:
+        warnings.append("no bit is stated in string.yaml: critical speeds need one")
+    return TunedFor(str(namespace.result), bool(result.get("simulated")),
+                    None if profile is None else profile.name, ratio, namespace.loop, lags_from,
+                    settings, tuple(warnings))

@@ -1,0 +1,469 @@
+"""`tdhil tune`'s findings: as a document for machines, on a terminal, and as a page with pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.table import Table as Grid
+from rich.text import Text as Words
+
+from tdhil.report.card import with_interval
+from tdhil.report.console import PlainConsole
+from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, Text
+from tdhil.report.document import SIMULATED
+from tdhil.report.html import write_blocks
+from tdhil.soft_torque import (
+    BAND_HZ,
+    RPM,
+    Begin,
+    CriticalSpeeds,
+    DriveSetting,
+    Interval,
+    SpeedController,
+    Trace,
+    Tuned,
+    Tuning,
+    reflection_at,
+    simulate,
+)
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+Part = Mapping[str, Any]
+
+_WHAT = {
+    "stiff": "the stiffest that keeps its phase margin",
+    "soft": "P = ζ/a, I = ω²J: rotor and I tuned to the string's lowest mode",
+    "compensated": "the same, part of the rotor's inertia given back",
+    "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
+}
+_COLOURS = {"stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
+_CRITICAL = ("cure", "start", "onset")
+_MEANT = {
+    "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
+    "start": "the same after a ramp from rest",
+    "onset": "set speed, falling from rotation, at which the bit first sticks",
+}
+
+
+@dataclass(frozen=True)
+class TunedFor:
+    """Where the numbers come from."""
+
+    source: str
+    """The result or log."""
+    simulated: bool
+    profile: str | None
+    gear_ratio: float
+    loop: str
+    lags_from: str
+    """Who says what the lags in the loop are."""
+    settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
+    """In the drive's own parameters, by the controller's kind."""
+    warnings: tuple[str, ...] = ()
+
+
+def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
+    """Plain data for `json.dumps`: torques, inertias and gains at the shaft that is named; nothing is infinite."""
+    import numpy as np
+
+    case, string = tuning.case, tuning.case.string
+    ratio = tuned_for.gear_ratio
+    hertz = np.round(np.geomspace(0.02, 2.0, 160), 5)
+    taken = [one for one in tuning.tuned if one.controller is not None]
+    search = tuning.searched
+    return {
+        "tuned_for": {
+            "source": tuned_for.source, "simulated": tuned_for.simulated, "profile": tuned_for.profile,
+            "loop": tuned_for.loop, "gear_ratio": ratio,
+        },
+        "main_shaft": {
+            "inertia_kg_m2": asdict(case.inertia_kg_m2),
+            "viscous_nm_s_rad": case.drive.viscous_nm_s_rad,
+            "coulomb_nm": case.drive.coulomb_nm,
+            "inner_lags_s": list(case.drive.inner_lags_s),
+            "inner_lags_from": tuned_for.lags_from,
+        },
+        "string": {
+            "name": string.name,
+            "impedance_nm_s_rad": string.impedance_nm_s_rad,
+            "stiffness_nm_rad": string.stiffness_nm_rad,
+            "echo_s": string.echo_s,
+            "modes_hz": list(tuning.string_modes_hz),
+            "bottom_inertia_kg_m2": string.bottom_inertia_kg_m2,
+            "bit": None if string.bit is None else {
+                **_finite(asdict(string.bit)), "viscous_nm_s_rad": string.bottom_viscous_nm_s_rad,
+                "words": f"{string.bit.describe()}, viscous {string.bottom_viscous_nm_s_rad:g} N·m·s/rad",
+            },
+        },
+        "controllers": [_controller(one, ratio, tuned_for.settings.get(one.kind, ())) for one in tuning.tuned],
+        "reflection": {
+            "hertz": hertz.tolist(),
+            **{one.kind: reflection_at(case.drive, one.controller, string, hertz).tolist()
+               for one in taken if one.controller is not None},
+        },
+        "critical_speeds": None if search is None else {
+            "meant": dict(_MEANT), "bit": "as stated in string.bit: they hold for it alone",
+            "resolution_rpm": search.resolution_rpm, "highest_rpm": search.highest_rpm,
+            "start_ramp_rpm_s": search.start_ramp_rpm_s, "onset_from_rpm": search.onset_from_rpm,
+            "onset_fall_rpm_s": search.onset_fall_rpm_s,
+        },
+        "warnings": [*tuned_for.warnings, *_sends_back_more(tuning)],
+        "tdhil": __version__,
+    }
+
+
+def _sends_back_more(tuning: Tuning) -> Iterator[str]:
+    """Where |r| > 1: what is stable there is so by the string's own losses, which nobody has measured."""
+    import numpy as np
+
+    hertz = np.geomspace(0.02, 5.0, 300)
+    for one in tuning.tuned:
+        if one.controller is not None:
+            over = reflection_at(tuning.case.drive, one.controller, tuning.case.string, hertz)
+            if over.max() > 1.001:
+                yield (f"{one.kind} sends back up to {over.max():.3f} of a wave at {hertz[int(over.argmax())]:.2g} Hz: "
+                       "what keeps it stable there is the drag of mud and bit as stated in string.yaml")
+
+
+def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> dict[str, Any]:
+    law = one.controller
+    head = {"kind": one.kind, "refused": one.refusal or None}
+    if law is None:
+        return {**head, "softest_a": _number(one.softest), "largest_share": one.largest_share}
+    assert one.reflection and one.band_reflection and one.damping and one.margins
+    return {
+        **head,
+        "a": one.softness, "softest_a": _number(one.softest),
+        "compensated_share": one.compensated_share, "largest_share": one.largest_share,
+        "at_main_shaft": _gains(law), "at_motor": _gains(law.at_shaft(ratio)),
+        "integral_nm_rad_by_inertia": None if one.integral_nm_rad is None else asdict(one.integral_nm_rad),
+        "drive_parameters": [asdict(setting) for setting in settings],
+        "reflection_at_lowest_mode": asdict(one.reflection),
+        "mean_reflection": {**asdict(one.band_reflection), "from_hz": BAND_HZ[0], "to_hz": BAND_HZ[1]},
+        "least_damping": asdict(one.damping),
+        "modes": [{"hertz": mode.frequency_hz, "damping": mode.damping} for mode in one.modes],
+        "phase_margin_deg": one.margins.phase_deg, "crossover_rad_s": one.margins.crossover_rad_s,
+        "least_distance_from_minus_1": one.margins.modulus,
+        "lag_reserve_s": one.lag_reserve_s,
+        "critical_rpm": None if one.critical is None else {
+            name: _critical_part(one, name) for name in _CRITICAL
+        },
+        "inertia_wrong_by": [asdict(wrong) for wrong in one.wrong],
+    }
+
+
+def _critical_part(one: Tuned, name: str) -> dict[str, float | None]:
+    """Value, and ends over J's interval; an end that is None was not found below the highest speed tried."""
+    def of(speeds: CriticalSpeeds | None) -> float | None:
+        found: float | None = None if speeds is None else getattr(speeds, f"{name}_rpm")
+        return found
+
+    value, ends = of(one.critical), [of(one.critical), of(one.critical_low), of(one.critical_high)]
+    known = [end for end in ends if end is not None]
+    return {"value": value, "low": min(known) if known else None, "high": None if None in ends else max(known)}
+
+
+def _gains(law: SpeedController) -> dict[str, float]:
+    return {
+        "gain_nm_s_rad": law.gain_nm_s_rad, "integral_nm_rad": law.integral_nm_rad,
+        "compensated_kg_m2": law.compensated_kg_m2, "derivative_filter_s": law.derivative_filter_s,
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value if not isinstance(value, float) or math.isfinite(value) else None
+            for name, value in values.items()}
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# On a terminal.
+
+
+def print_tuning(document: Part, console: PlainConsole) -> None:
+    """Gains, what they do, what they rest on. 80 columns do."""
+    simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
+    console.print(Words(f"speed controller for {_string_words(document)}{simulated}", style="bold"))
+    facts = Grid.grid(padding=(0, 2))
+    facts.add_column(no_wrap=True, style="dim")
+    facts.add_column(overflow="fold")
+    for name, text in _rests_on(document):
+        facts.add_row(name, text)
+    console.print(facts)
+    console.print()
+    grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    grid.add_column("")
+    taken = [one for one in document["controllers"] if not one["refused"]]
+    for one in taken:
+        grid.add_column(one["kind"], justify="right")
+    for name, cells in _rows(document):
+        grid.add_row(name, *cells)
+    console.print(grid)
+    for one in document["controllers"]:
+        if one["refused"]:
+            console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
+    settings = list(_setting_rows(document))
+    if settings:
+        console.print(Words("to be typed into the drive, by hand", style="bold"))
+        own = Grid.grid(padding=(0, 2))
+        own.add_column(overflow="fold")
+        own.add_column(overflow="fold")
+        for title, values, sure in settings:
+            own.add_row(title, f"{values} ({sure})")
+        console.print(own)
+        console.print()
+    for warning in document["warnings"]:
+        console.print(Words(warning, style="yellow"))
+
+
+def _string_words(document: Part) -> str:
+    string = document["string"]
+    return string["name"] or f"a string of ζ = {string['impedance_nm_s_rad']:.4g} N·m·s/rad"
+
+
+def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
+    main, string, tuned_for = document["main_shaft"], document["string"], document["tuned_for"]
+    inertia = main["inertia_kg_m2"]
+    yield "J, main shaft", with_interval(inertia["value"], inertia["low"], inertia["high"], "kg·m²")
+    lags = " + ".join(f"{1e3 * lag:g}" for lag in main["inner_lags_s"])
+    yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}"
+    yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
+                     + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")
+    yield "bit", string["bit"]["words"] if string["bit"] else "not stated: no critical speeds"
+    if tuned_for["loop"] == "bus":
+        yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
+
+
+def _interval(part: Part, digits: int = 2) -> str:
+    return f"{part['value']:.{digits}f} ({part['low']:.{digits}f}–{part['high']:.{digits}f})"
+
+
+def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
+    """(what it is, for each controller that was found)."""
+    taken = [one for one in document["controllers"] if not one["refused"]]
+    ratio = document["tuned_for"]["gear_ratio"]
+    shafts = [("at_main_shaft", ", main"), ("at_motor", ", motor")] if ratio != 1.0 else [("at_motor", "")]
+    for key, shaft in shafts:
+        yield f"P{shaft}, N·m·s/rad", [_gain(one[key]["gain_nm_s_rad"]) for one in taken]
+        yield f"I{shaft}, N·m/rad", [_gain(one[key]["integral_nm_rad"]) for one in taken]
+        if any(one[key]["compensated_kg_m2"] for one in taken):
+            yield f"J_c{shaft}, kg·m²", [_gain(one[key]["compensated_kg_m2"]) for one in taken]
+    yield "a", ["–" if one["a"] is None else f"{one['a']:.3g}" for one in taken]
+    yield "J compensated", [f"{100 * one['compensated_share']:.0f} %" for one in taken]
+    yield "|r|, lowest mode", [_interval(one["reflection_at_lowest_mode"]) for one in taken]
+    yield f"|r|, {BAND_HZ[0]:g}–{BAND_HZ[1]:g} Hz", [f"{one['mean_reflection']['value']:.2f}" for one in taken]
+    yield "least damping", [_interval(one["least_damping"]) for one in taken]
+    if document["critical_speeds"] is not None:
+        for name in _CRITICAL:
+            yield f"{name}, rpm", [_speed(one["critical_rpm"][name], document) for one in taken]
+    yield "phase margin", ["–" if one["phase_margin_deg"] is None else f"{one['phase_margin_deg']:.0f}°"
+                           for one in taken]
+    yield "L to −1, least", [f"{one['least_distance_from_minus_1']:.2f}" for one in taken]
+    yield "one more lag", ["> 1 s" if one["lag_reserve_s"] is None else f"{1e3 * one['lag_reserve_s']:.0f} ms"
+                                for one in taken]
+    for k in range(len(taken[0]["inertia_wrong_by"]) if taken else 0):
+        yield (f"J {100 * taken[0]['inertia_wrong_by'][k]['error']:+.3g} % wrong",
+               [_wrong(one["inertia_wrong_by"][k]) for one in taken])
+
+
+def _gain(value: float) -> str:
+    """Four digits, and no power of ten."""
+    return f"{value:.0f}" if value >= 1e3 else f"{value:.4g}"
+
+
+def _speed(part: Part, document: Part) -> str:
+    if part["value"] is None:
+        return f"> {document['critical_speeds']['highest_rpm']:.0f}"
+    high = "?" if part["high"] is None else f"{part['high']:.0f}"
+    return f"{part['value']:.0f} ({part['low']:.0f}–{high})"
+
+
+def _wrong(part: Part) -> str:
+    if not part["stable"]:
+        return "unstable"
+    cure = "" if part["cure_rpm"] is None else f", cure {part['cure_rpm']:.0f}"
+    return f"{part['damping']:.2f}{cure}"
+
+
+def _setting_rows(document: Part) -> Iterator[tuple[str, str, str]]:
+    """(parameter, what to type for each controller, how sure), a row a parameter."""
+    taken = [one for one in document["controllers"] if one.get("drive_parameters")]
+    for k in range(len(taken[0]["drive_parameters"]) if taken else 0):
+        own = [one["drive_parameters"][k] for one in taken]
+        first = own[0]
+        values = first["why"] if first["value"] is None else ", ".join(
+            f"{one['kind']} {_gain(setting['value'])}" for one, setting in zip(taken, own, strict=True)
+        ) + f" {first['unit']}"
+        yield first["title"], values, first["confidence"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# As a page.
+
+
+@dataclass(frozen=True)
+class Showcase:
+    """Stick-slip with and without: bit and top at one set speed, under the stiff loop and a tuned one."""
+
+    set_rpm: float
+    kinds: tuple[str, ...]
+    trace: Trace
+
+
+def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
+    """At a set speed at which the stiff loop leaves the bit sticking and the best tuned one frees it; None: no such."""
+    import numpy as np
+
+    found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.critical is not None}
+    stiff = found.get("stiff")
+    tuned = [one for kind, one in found.items() if kind != "stiff" and one.critical and one.critical.cure_rpm]
+    if stiff is None or stiff.critical is None or not tuned or tuning.searched is None:
+        return None
+    best = min(tuned, key=lambda one: one.critical.cure_rpm if one.critical and one.critical.cure_rpm else math.inf)
+    assert best.critical is not None and best.critical.cure_rpm is not None
+    above = stiff.critical.cure_rpm or tuning.searched.highest_rpm
+    if above < 1.1 * best.critical.cure_rpm:
+        return None
+    rpm = float(round(math.sqrt(above * best.critical.cure_rpm)))
+    loops = [(tuning.case.drive, one.controller) for one in (stiff, best) if one.controller is not None]
+    target = np.full((len(loops), 1), rpm * RPM)
+    trace = simulate(tuning.case.string, loops, Begin("stuck", target), target, 1.0, seconds, 0.05)
+    return Showcase(rpm, (stiff.kind, best.kind), trace)
+
+
+def write_tuning_report(document: Part, showcase: Showcase | None, path: Path) -> Path:
+    """The page, HTML or PDF by its name; where it went. Raises UsageError where it can't be written."""
+    return write_blocks(tuning_report(document, showcase), path)
+
+
+def tuning_report(document: Part, showcase: Showcase | None) -> Report:
+    """The blocks of the page."""
+    taken = [one for one in document["controllers"] if not one["refused"]]
+    # what any drive can take goes first: a proportional gain and an integral time
+    best = next((one for kind in ("soft", "compensated") for one in taken if one["kind"] == kind), None)
+    sections = [
+        Section("Controllers", (
+            Table((Column("", 0.24), *(Column(one["kind"], 0.76 / max(1, len(taken)), number=True) for one in taken)),
+                  tuple((name, *cells) for name, cells in _rows(document))),
+            Pairs(tuple((one["kind"], _WHAT[one["kind"]]) for one in taken)),
+            *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
+        )),
+        Section("What the top drive sends back up the string", (
+            Picture(partial(draw_reflection, document=document), 2.6,
+                    "|r(f)| at the top of the string: 1 is a wall, 0 swallows every wave. Dotted: the string's modes "
+                    "with the top held."),
+        )),
+        Section("Modes and their damping", (
+            Picture(partial(draw_modes, document=document), 2.3,
+                    "Damping ratio of each mode of string and top drive together; the lowest pair decides."),
+        )),
+    ]
+    if showcase is not None:
+        sections.append(Section("Stick-slip, with and without", (
+            Picture(partial(draw_showcase, showcase=showcase), 1.7 * len(showcase.kinds) + 0.5,
+                    f"Simulated: a stuck bit at a set speed of {showcase.set_rpm:.0f} rpm; the bit in colour, the top "
+                    "drive in grey."),
+        )))
+    settings = list(_setting_rows(document))
+    if settings:
+        sections.append(Section("To be typed into the drive, by hand", (
+            Table((Column("parameter", 0.4), Column("value", 0.45), Column("how sure", 0.15)), tuple(settings)),
+            Text("Nothing here was written into any drive. Change one thing at a time, at a low speed, with the "
+                 "hard-wired stop in reach."),
+        )))
+    rests: list[tuple[str, str]] = list(_rests_on(document))
+    rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
+    if document["critical_speeds"] is not None:
+        rests += [(name, _MEANT[name]) for name in _CRITICAL]
+    rests.append(("in brackets", "over J's 95 % interval, the gains as they are"))
+    sections.append(Section("What it rests on", (Pairs(tuple(rests)),)))
+    simulated = document["tuned_for"]["simulated"]
+    return Report(
+        title="Speed controller and drill string",
+        subtitle=_string_words(document),
+        simulated=f"{SIMULATED}: J is that of a simulated rig" if simulated else "",
+        answer=_answer(best, document),
+        warnings=tuple(document["warnings"]),
+        sections=tuple(sections),
+        footer=f"tdhil {document['tdhil']}",
+    )
+
+
+def _answer(best: Part | None, document: Part) -> Answer:
+    if best is None:
+        return Answer("red", "No tuned controller", (), "refused",
+                      "Nothing softer than the stiff loop can be recommended.", "")
+    gains = best["at_motor"]
+    lines = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
+    if gains["compensated_kg_m2"]:
+        lines.append(f"inertia compensation J_c = {gains['compensated_kg_m2']:.4g} kg·m², its derivative filtered by "
+                     f"{1e3 * gains['derivative_filter_s']:g} ms")
+    reason = f"It damps the lowest modes by {_interval(best['least_damping'])}."
+    if best["critical_rpm"] is not None:
+        cure = _speed(best["critical_rpm"]["cure"], document)
+        reason += f" With the bit as stated, a stuck bit is freed from {cure} rpm."
+    headline = f"P = {_gain(gains['gain_nm_s_rad'])} N·m·s/rad, I = {_gain(gains['integral_nm_rad'])} N·m/rad"
+    return Answer("green", headline, tuple(lines), "most damping that these two gains can give", reason, "")
+
+
+def draw_reflection(figure: FigureBase, document: Part) -> None:
+    """|r(f)| of every controller."""
+    axes = figure.subplots()
+    curves = document["reflection"]
+    for hertz in document["string"]["modes_hz"]:
+        axes.axvline(hertz, color="0.6", lw=0.8, ls=":")
+    for kind, colour in _COLOURS.items():
+        if kind in curves:
+            axes.semilogx(curves["hertz"], curves[kind], color=colour, lw=1.5, label=kind)
+    axes.set(xlabel="frequency, Hz", ylabel="|r|", ylim=(0.0, 1.05), xlim=(curves["hertz"][0], curves["hertz"][-1]))
+    ticks = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", loc="lower right")
+
+
+def draw_modes(figure: FigureBase, document: Part) -> None:
+    """Damping over frequency."""
+    axes = figure.subplots()
+    for one in document["controllers"]:
+        if not one["refused"]:
+            axes.plot([mode["hertz"] for mode in one["modes"]], [mode["damping"] for mode in one["modes"]], "o",
+                      color=_COLOURS[one["kind"]], ms=6, alpha=0.85, label=one["kind"])
+    axes.axhline(0.0, color="0.3", lw=0.8)
+    axes.set(xlabel="frequency, Hz", ylabel="damping ratio", xlim=(0.0, None))
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+
+
+def draw_showcase(figure: FigureBase, showcase: Showcase) -> None:
+    """Bit and top over time, a picture a controller."""
+    every = figure.subplots(len(showcase.kinds), 1, sharex=True, squeeze=False)
+    for row, kind in enumerate(showcase.kinds):
+        axes = every[row][0]
+        trace = showcase.trace
+        axes.plot(trace.time_s, trace.bit_rad_s[:, row, 0] / RPM, color=_COLOURS[kind], lw=1.2, label=f"bit, {kind}")
+        axes.plot(trace.time_s, trace.top_rad_s[:, row, 0] / RPM, color="0.45", lw=1.0, label="top drive")
+        axes.set_ylabel("rpm")
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.0)
+        axes.legend(fontsize="small", loc="upper right")
+    every[-1][0].set_xlabel("time, s")
+
+
+__all__ = [
+    "Interval", "Showcase", "TunedFor", "print_tuning", "showcase_of", "tuning_document", "tuning_report",
+    "write_tuning_report",
+]

@@ -1,0 +1,54 @@
+r"""Gains in a drive's own parameters: what to type where, as far as its profile knows. Written by hand, never by us.
+
+::
+
+    N·m·s/rad             P as it is, at the motor shaft
+    %/%                   P ω_r/T_r: torque in % of rated torque for a speed error in % of rated speed
+    integral time         T_I = P/I
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+from profiles import SpeedControllerParameters
+from tdhil.soft_torque.controller import SpeedController
+
+
+@dataclass(frozen=True)
+class DriveSetting:
+    """One parameter. ``value`` None: its unit isn't known, or what it is a share of wasn't said; ``why`` says which."""
+
+    title: str
+    value: float | None
+    unit: str
+    source: str
+    confidence: str
+    why: str = ""
+
+
+def drive_settings(
+    parameters: SpeedControllerParameters | None, at_motor: SpeedController,
+    rated_torque_nm: float | None = None, rated_speed_rpm: float | None = None,
+) -> tuple[DriveSetting, ...]:
+    """What to type for these gains of the motor shaft; () where the profile says nothing of its speed controller."""
+    if parameters is None:
+        return ()
+    gain, integral = parameters.gain, parameters.integral
+    value: float | None = None
+    why, unit = "", {"nm_s_rad": "N·m·s/rad", "percent_per_percent": "%/%", "unknown": "?"}[gain.unit]
+    if gain.unit == "nm_s_rad":
+        value = at_motor.gain_nm_s_rad
+    elif gain.unit == "unknown":
+        why = "its unit isn't known: look it up in the manual"
+    elif rated_torque_nm is None or rated_speed_rpm is None:
+        why = "needs --rated-torque and --rated-speed of the motor's name plate"
+    else:
+        value = at_motor.gain_nm_s_rad * rated_speed_rpm * 2.0 * pi / 60.0 / rated_torque_nm
+    proportional = DriveSetting(gain.title, value, unit, gain.source, gain.confidence, why)
+    time_s = at_motor.gain_nm_s_rad / at_motor.integral_nm_rad
+    number = {"s": time_s, "ms": 1e3 * time_s, "nm_rad": at_motor.integral_nm_rad}.get(integral.unit)
+    why = "" if number is not None else "its unit isn't known: look it up in the manual"
+    unit = {"s": "s", "ms": "ms", "nm_rad": "N·m/rad", "unknown": "?"}[integral.unit]
+    return proportional, DriveSetting(integral.title, number, unit, integral.source, integral.confidence, why)

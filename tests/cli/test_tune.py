@@ -1,0 +1,141 @@
+"""`tdhil tune` from a result's file: gains at both shafts and in the drive's units, refusals, and mistakes in files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tdhil.cli.main import main
+from tdhil.errors import ExitCode
+from tdhil.report import showcase_of, tuning_document, write_tuning_report
+from tdhil.report.tuning import TunedFor, tuning_report
+from tdhil.soft_torque import CriticalSpeeds, Interval, Search, TuneCase, tune
+from tests.soft_torque.cases import DRIVE, STRING
+
+STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
+
+
+def estimate(value, low, high):
+    return {"value": value, "low": low, "high": high, "low_total": low, "high_total": high}
+
+
+def result(**said):
+    return {
+        "verdict": "valid", "gear_ratio": 10.0, "inertia_kg_m2": estimate(15.0, 14.4, 15.6), "simulated": True,
+        "viscous_nm_s_rad": estimate(0.08, 0.07, 0.09), "coulomb_nm": estimate(6.0, 5.9, 6.1),
+        "speed_lag_s": estimate(0.4, 0.39, 0.41), "cycle": {"period_s": 0.02}, "profile": None, **said,
+    }
+
+
+@pytest.fixture
+def tuned(tmp_path, capsys):
+    """Run it, without the simulation: (exit code, document or text, stderr)."""
+    def run(*words, string=STRING_YAML, as_json=True, **said):
+        path = tmp_path / "result.json"
+        path.write_text(json.dumps(result(**said)), encoding="utf-8")
+        options = ["--json"] if as_json else []
+        code = main(["tune", str(path), "--string", str(string), "--no-simulation", *options, *words])
+        out, err = capsys.readouterr()
+        return code, json.loads(out) if as_json else out, err
+
+    return run
+
+
+def test_gains_stand_at_main_shaft_and_motor_and_in_the_drives_parameters(tuned):
+    code, document, _ = tuned(profile={"name": "siemens/s120-canopen"})
+    assert code == 0
+    assert document["main_shaft"]["inertia_kg_m2"] == {"value": 1500.0, "low": 1440.0, "high": 1560.0}
+    assert document["main_shaft"]["coulomb_nm"] == pytest.approx(60.0)
+    kinds = [one["kind"] for one in document["controllers"]]
+    assert kinds == ["stiff", "soft", "compensated", "broadband"]
+    soft = document["controllers"][1]
+    assert soft["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(100.0 * soft["at_motor"]["gain_nm_s_rad"])
+    assert soft["integral_nm_rad_by_inertia"]["high"] == pytest.approx(soft["at_main_shaft"]["integral_nm_rad"] * 1.04)
+    first, second = soft["drive_parameters"]
+    assert first["title"].startswith("p1460")
+    assert first["value"] == pytest.approx(soft["at_motor"]["gain_nm_s_rad"])
+    assert second["unit"] == "ms"
+    assert any("--inner-lags" in warning for warning in document["warnings"])
+    assert any("compensated sends back" in warning for warning in document["warnings"])
+
+
+def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
+    code, text, _ = tuned("--inner-lags", "20ms", "10ms", "3ms", "--profile", "abb/acs880-enhanced", as_json=False)
+    assert code == 0
+    words = " ".join(text.split())
+    assert "SIMULATED" in words
+    assert "20 + 10 + 3 ms, as stated" in words
+    assert "static 5000 N·m" in words
+    assert "broadband refused" in words
+    assert "25.02 Speed proportional gain" in words
+    assert "--rated-torque" in words
+
+
+@pytest.mark.parametrize(("words", "said", "code", "message"), [
+    (("--compensate", "80%"), {}, 11, "swings by itself"),
+    (("--loop", "bus", "--a", "1.5"), {}, 11, "is beyond ζ/(ω² J Στ)"),
+    ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
+    (("--loop", "bus"), {"speed_lag_s": None}, 2, "how late the reported speed is"),
+    (("--a", "20"), {}, 2, "--a: 20: must be from 0.01 to 10"),
+    (("--inner-lags", "0"), {}, 2, "no lag at all"),
+    (("--profile", "nobody/none"), {}, 2, "nobody/none"),
+])
+def test_what_is_refused(tuned, words, said, code, message):
+    seen, document, err = tuned(*words, **said)
+    assert seen == code
+    assert message in document["error"]["message"]
+    assert message.split()[-1] in err
+    assert "Traceback" not in err
+
+
+def test_over_the_bus_the_reported_speeds_lag_is_in_the_loop(tuned):
+    _, document, _ = tuned("--loop", "bus")
+    assert document["main_shaft"]["inner_lags_s"] == pytest.approx([0.4, 0.03, 0.01, 0.003])
+    soft = document["controllers"][1]
+    assert soft["softest_a"] < 0.8
+    assert soft["drive_parameters"] == []
+
+
+def test_files_that_are_none_are_named(tmp_path, capsys):
+    wrong = tmp_path / "wrong.json"
+    for text, message in (("{}", "no result of tdhil identify"), ("not json", "neither a log nor JSON")):
+        wrong.write_text(text, encoding="utf-8")
+        assert main(["tune", str(wrong), "--string", str(STRING_YAML)]) == ExitCode.USAGE
+        assert message in capsys.readouterr().err
+    assert main(["tune", str(tmp_path / "none"), "--string", str(STRING_YAML)]) == ExitCode.USAGE
+    good = tmp_path / "result.json"
+    good.write_text(json.dumps(result()), encoding="utf-8")
+    bad = tmp_path / "string.yaml"
+    bad.write_text("sections:\n  - {length_m: -1, outer_diameter_m: 0.1, inner_diameter_m: 0}\n", encoding="utf-8")
+    assert main(["tune", str(good), "--string", str(bad)]) == ExitCode.USAGE
+    assert "string.yaml:2" in capsys.readouterr().err
+
+
+def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
+    """Stick-slip is shown at a set speed between the two cure speeds, here given and not searched for."""
+    pytest.importorskip("matplotlib")
+    tuning = tune(TuneCase(STRING, DRIVE, Interval(1500.0, 1440.0, 1560.0), 60.0, 0.2, 0.4), None)
+    speeds = {"stiff": CriticalSpeeds(None, 150.0, 24.0), "soft": CriticalSpeeds(61.0, 62.0, 22.0)}
+    tuning = replace(tuning, searched=Search(highest_rpm=160.0), tuned=tuple(
+        replace(one, critical=speeds[one.kind], critical_low=speeds[one.kind], critical_high=speeds[one.kind])
+        for one in tuning.tuned if one.kind in speeds))
+    document = tuning_document(tuning, TunedFor("result.json", True, None, 1.0, "drive", "as stated"))
+    json.dumps(document, allow_nan=False)
+    stiff, soft = document["controllers"][:2]
+    assert stiff["critical_rpm"]["cure"]["value"] is None      # above all that were tried
+    assert soft["critical_rpm"]["cure"] == {"value": 61.0, "low": 61.0, "high": 61.0}
+    showcase = showcase_of(tuning, seconds=20.0)
+    assert showcase is not None
+    assert 61.0 < showcase.set_rpm < 160.0
+    stuck = [showcase.trace.last_stuck_s[row, 0] for row in (0, 1)]
+    assert stuck[0] > 10.0 > stuck[1]
+    page = tuning_report(document, showcase)
+    assert [section.heading for section in page.sections][3] == "Stick-slip, with and without"
+    written = write_tuning_report(document, showcase, tmp_path / "tune.html")
+    text = written.read_text(encoding="utf-8")
+    assert text.count("<svg") == 3
+    assert "SIMULATED" in text
+    assert write_tuning_report(document, None, tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
