@@ -31,7 +31,6 @@ HIGHEST_NODE = 127
 FOREIGN_WRITES = 3
 """So many writes of what drives the shaft, in one run, are a second master's."""
 DRIVING = frozenset({0x6040, 0x6042, 0x6060, 0x6071, 0x60FF})
-_SYNC = 0x080
 _MOST_REMARKS = 20
 _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 

@@ -108,11 +108,6 @@ def consumer_heartbeat(node: int, time_ms: int) -> int:
     return node << 16 | time_ms
 
 
-def lsb_decimals(per_lsb: float) -> int:
-    """How many decimals show one LSB without false precision."""
-    return max(0, math.ceil(-math.log10(per_lsb)))
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # What a drive reported last, in its own counts, and the Sample in SI at the motor shaft that is made of it.
 

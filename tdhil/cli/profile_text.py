@@ -90,13 +90,6 @@ def unit_text(unit: str) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What a profile only supposes of a drive is refused before a real shaft moves, unless the operator takes it by name.
-#
-# A wrong scale or word order in a profile is a wrong moment of inertia, or a shaft that turns the wrong way. `likely`
-# entries may be taken all at once, or a whole section of them; `unverified` ones each by its own name.
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 LEVELS: tuple[Confidence, ...] = ("verified", "likely", "unverified")
 

@@ -8,9 +8,8 @@ if TYPE_CHECKING:
     from tdhil.session.conclusion import conclude as conclude
     from tdhil.session.confirm import AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant
     from tdhil.session.connection import (
-        BusKind as BusKind, Connection as Connection, LineConfig as LineConfig, PeerPlan as PeerPlan,
-        bus_kind as bus_kind, bus_kinds as bus_kinds, connection_of as connection_of,
-        simulated_connection as simulated_connection,
+        Connection as Connection, PeerPlan as PeerPlan, bus_kind as bus_kind, bus_kinds as bus_kinds,
+        connection_of as connection_of, simulated_connection as simulated_connection,
     )
     from tdhil.session.consent import (
         UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
     from tdhil.session.plan_ahead import (
         BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_dry as plan_dry,
-        refuse_hopeless as refuse_hopeless,
     )
     from tdhil.session.recorded import (
         RunRecord as RunRecord, is_log as is_log, read as read,
@@ -37,7 +35,7 @@ if TYPE_CHECKING:
     from tdhil.session.stop_signals import stop_on_signals as stop_on_signals
     from tdhil.session.task import (
         bench_of as bench_of, excitation_request as excitation_request, facts as facts,
-        machine_limits as machine_limits, stated_lags as stated_lags, suited as suited,
+        machine_limits as machine_limits, stated_lags as stated_lags,
     )
 else:
     __getattr__, __dir__ = lazy_face(
@@ -46,17 +44,16 @@ else:
             "conclusion": ("conclude",),
             "confirm": ("AskingAttendant", "TerminalAttendant"),
             "connection": (
-                "BusKind", "Connection", "LineConfig", "PeerPlan", "bus_kind", "bus_kinds", "connection_of",
-                "simulated_connection",
+                "Connection", "PeerPlan", "bus_kind", "bus_kinds", "connection_of", "simulated_connection",
             ),
             "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
             "holder": ("DriveHeld", "Holder", "address_of", "hold", "holder_of"),
             "log_place": ("check_different_files", "check_log_path", "is_live", "make_room"),
             "opening": ("open_drive", "plan_peer", "with_faults"),
-            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry", "refuse_hopeless"),
+            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry"),
             "recorded": ("RunRecord", "is_log", "read"),
             "run_session": ("Attendant", "Consent", "RunRequest", "RunSession"),
             "stop_signals": ("stop_on_signals",),
-            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "stated_lags", "suited"),
+            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "stated_lags"),
         },
     )

@@ -50,11 +50,6 @@ class StudyOutcome:
     figure_size_in: tuple[float, float] = (8.0, 5.0)
     interrupted: bool = False                                      # by Ctrl-C: the figures are of what was done by then
 
-    @property
-    def cost_ms_per_simulated_s(self) -> float | None:
-        """Wall time for a second of plant time, one run; None where nothing was simulated."""
-        return 1000.0 * self.simulation_wall_s / self.simulated_s if self.simulated_s > 0.0 else None
-
 
 Progress = Callable[[float, str], None]
 """Share done (0 to 1) and what is being done."""

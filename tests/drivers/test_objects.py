@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen import pdo as objects
-from drivers.canopen.pdo import Units, consumer_heartbeat, encode_speed, encode_torque, lsb_decimals, mapping_entry
+from drivers.canopen.pdo import Units, consumer_heartbeat, encode_speed, encode_torque, mapping_entry
 from drivers.canopen.pdo_mapping import layout
 from drivers.errors import CommandRejected
 
@@ -109,8 +109,3 @@ def test_mapping_and_frames_are_of_one_length():
 def test_consumer_heartbeat():
     assert consumer_heartbeat(127, 500) == 0x007F01F4
     assert consumer_heartbeat(1, 65535) == 0x0001FFFF
-
-
-@pytest.mark.parametrize(("lsb", "decimals"), [(1.0, 0), (0.1, 1), (0.01047, 2), (25.0, 0), (0.001, 3)])
-def test_decimals_of_an_lsb(lsb, decimals):
-    assert lsb_decimals(lsb) == decimals

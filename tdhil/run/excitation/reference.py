@@ -211,10 +211,6 @@ class Transition:
     duration_s: float
     guess: RigGuess
 
-    @property
-    def peak_acceleration_rad_s2(self) -> float:
-        return math.pi * abs(self.to_rad_s - self.from_rad_s) / (2.0 * self.duration_s)
-
     def reference(self, t_s: float) -> tuple[float, float]:
         """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the end's steady values afterwards."""
         if t_s >= self.duration_s:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 from drivers import Command, LimitHit, Mode
 from tdhil.run.control_loop import ControlLoop
@@ -54,15 +53,6 @@ TIMEOUT_S = 90.0
 """Beyond the ramp, which takes a heavy shaft long."""
 
 
-@dataclass(frozen=True)
-class HoldResult:
-    """The steady point: where it is, and the torque that holds it beside the model's friction."""
-
-    speed_rad_s: float
-    correction_nm: float
-    settling_s: float
-
-
 def run_hold(
     loop: ControlLoop,
     limits: MachineLimits,
@@ -71,7 +61,7 @@ def run_hold(
     target_rad_s: float,
     start_rad_s: float,
     speed_resolution_rad_s: float,
-) -> HoldResult:
+) -> None:
     """Bring the mean speed into a window of 2 % and keep it there for 3 s, in torque mode.
 
     The wanted speed is ramped from where the shaft is, at a rate that takes a quarter of the torque limit.
@@ -79,10 +69,8 @@ def run_hold(
     tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s)
     recent: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
     rate = min(0.25 * limits.torque_nm / model.inertia_kg_m2, (limits.speed_max_rad_s - limits.speed_min_rad_s) / 5.0)
-    begun_s = loop.now_s
     inside_since_s: float | None = None
     wanted = reported = start_rad_s
-    correction = 0.0
     timeout_s = TIMEOUT_S + abs(target_rad_s - start_rad_s) / rate
     for _ in range(loop.cycles(timeout_s)):
         step = max(-rate * loop.period_s, min(rate * loop.period_s, target_rad_s - wanted))
@@ -99,7 +87,7 @@ def run_hold(
         elif inside_since_s is None:
             inside_since_s = sample.time_s
         elif sample.time_s - inside_since_s >= SETTLED_S:
-            return HoldResult(mean, correction, sample.time_s - begun_s)
+            return
     raise LimitHit(
         f"no steady speed near {target_rad_s:.3f} rad/s within {timeout_s:.0f} s (last {mean:.3f} rad/s)",
         where="stage hold",
