@@ -41,7 +41,15 @@ def read_damaged(path, data):
         return None
 
 
+def samples_left(path, data):
+    """Samples alone, where what else is left shows in the tests of any cut and of any flip."""
+    path.write_bytes(data)
+    return list(read_samples(path))
+
+
 def is_part(part, everything):
+    if part == everything[:len(part)]:
+        return True
     rest = iter(everything)
     return all(any(one == other for other in rest) for one in part)
 
@@ -69,7 +77,7 @@ def test_every_byte_that_is_cut_costs_at_most_a_chunk(good, tmp_path):
     data, _, samples, _ = good
     lengths = []
     for cut in range(len(data) // 2, len(data), 997):
-        _, some, _ = read_damaged(tmp_path / "cut.mcap", data[:cut])
+        some = samples_left(tmp_path / "cut.mcap", data[:cut])
         lengths.append(len(some))
     assert lengths == sorted(lengths)
     assert lengths[-1] == len(samples)
@@ -107,7 +115,7 @@ def test_every_flip_in_the_heads_of_records(good, tmp_path):
     for place in places:
         damaged = bytearray(data)
         damaged[place] ^= 1 << rng.randrange(8)
-        _, some, _ = read_damaged(tmp_path / "flip.mcap", bytes(damaged))
+        some = samples_left(tmp_path / "flip.mcap", bytes(damaged))
         assert len(some) >= len(samples) - 101
         assert is_part(some, samples)
 
@@ -238,5 +246,5 @@ def test_random_bytes_after_the_magic(tmp_path):
 def test_a_short_run_cut_every_few_bytes(tmp_path):
     make_run(tmp_path / "short.mcap", 3)
     data = (tmp_path / "short.mcap").read_bytes()
-    for cut in range(0, len(data), 11):
+    for cut in range(0, len(data), 29):
         read_damaged(tmp_path / "cut.mcap", data[:cut])
