@@ -33,7 +33,8 @@ limits:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    return identify(tmp_path_factory.mktemp("modbus"), "--drive", "modbus", "--simulate", *QUICK, "--seed", 1)
+    return identify(tmp_path_factory.mktemp("modbus"), "--drive", "modbus", "--simulate", *QUICK, "--seed", 1,
+                    "--periods", 4)
 
 
 def test_the_inertia_of_the_simulated_rig(run):
