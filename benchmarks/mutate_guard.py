@@ -75,11 +75,11 @@ SUBJECTS = {
     "torque": _run("stages/torque", *_RUNS, "test_brake_test.py"),
     "hold": _run(
         "stages/hold", "test_kept_within.py", *_RUNS, "test_control.py",
-        within="WINDOW_SHARE SETTLED_S MEAN_S TIMEOUT_S HoldResult run_hold",
+        within="WINDOW_SHARE SETTLED_S MEAN_S TIMEOUT_S run_hold",
     ),
     "acquire": _run(
         "stages/acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_adaptive_duration.py",
-        within="AcquireResult Follower run_acquire _beside _Course",
+        within="AcquireResult Follower run_acquire _dither_of _Course",
     ),
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"
@@ -108,7 +108,7 @@ SUBJECTS = {
     "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
     "modbus/preflight": _driver(
         "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py",
-        within="SHARES LOOKS ECHO_LOOK_S clear_setpoints check_setpoints _check_one",
+        within="SHARES ECHO_POLLS ECHO_POLL_S clear_setpoints check_setpoints _check_one",
     ),
     "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/parameters": _driver(

@@ -57,7 +57,7 @@ class OtherMaster:
         self._sent: dict[int, deque[int]] = {}
         self._settings: list[tuple[Span, list[tuple[Parameter, int]]]] = []
         self._values: Mapping[str, float] = {}
-        self._keep = self._looks = self._settings_looks = 0
+        self._keep = self._polls = self._settings_polls = 0
         self._tight = False
         self._next_s = 0.0
         self.seen = False              # somebody else has commanded, at some time
@@ -107,17 +107,17 @@ class OtherMaster:
         now_s = self._access.clock.now_s()
         if now_s < self._next_s - 1e-9 or not self._keep:
             return
-        self._looks += 1
-        self._next_s = now_s + (EVERY_TIGHT_S if self._tight else EVERY_S) * (0.5 + self._looks * GOLDEN % 1.0)
+        self._polls += 1
+        self._next_s = now_s + (EVERY_TIGHT_S if self._tight else EVERY_S) * (0.5 + self._polls * GOLDEN % 1.0)
         every = SETTINGS_EVERY_TIGHT if self._tight else SETTINGS_EVERY
-        if self._settings and (self._looks % every == 0 or not self._spans):
-            span, parameters = self._settings[self._settings_looks % len(self._settings)]
-            self._settings_looks += 1
+        if self._settings and (self._polls % every == 0 or not self._spans):
+            span, parameters = self._settings[self._settings_polls % len(self._settings)]
+            self._settings_polls += 1
             found = self._read(span, timeout_s)
             if found is not None:
                 self._compare_settings(span, found, parameters)
         elif self._spans and self._sent:
-            span = self._spans[self._looks % len(self._spans)]
+            span = self._spans[self._polls % len(self._spans)]
             found = self._read(span, timeout_s)
             if found is not None:
                 self._compare_words(span, found)

@@ -29,7 +29,7 @@ class Heat:
         self._watched: list[Temperature] = []
         self._told: set[str] = set()
         self._next_s = 0.0
-        self._looks = 0
+        self._polls = 0
 
     def prepare(self, table: Table, limit_c: float | None) -> None:
         """A row each, as it is now; one that is too hot already is refused. ``limit_c``: rig.yaml's, °C, if any."""
@@ -76,8 +76,8 @@ class Heat:
         if not numbers or now_s < self._next_s:
             return
         self._next_s = now_s + EVERY_S
-        one = numbers[self._looks % len(numbers)]
-        self._looks += 1
+        one = numbers[self._polls % len(numbers)]
+        self._polls += 1
         register = one.register_
         function = pdu.READ_HOLDING if register.table == "holding" else pdu.READ_INPUT
         try:
