@@ -11,7 +11,16 @@ from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
 from tdhil.estimation.frequency_domain.model import Model
-from tdhil.estimation.frequency_domain.nonlinear_friction import BEND, MODEL, Bend, BentShaft, Wave, bends
+from tdhil.estimation.frequency_domain.nonlinear_friction import (
+    BEND,
+    MODEL,
+    Bend,
+    BentShaft,
+    Motion,
+    Wave,
+    bends,
+    starts_of,
+)
 from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import Verdict
 from tests.estimation.analytic import LINES, closed_form
@@ -87,7 +96,7 @@ def test_lines_are_shown_without_the_bend():
     assert problem.weighted(theta)[0] == pytest.approx(error * 3.0 / root_v[problem.owner])
 
 
-def bent(recording, friction):
+def bent(recording, friction, speed_lag=0.40, torque_lag=0.15):
     """The closed form's record with friction(ω) besides, by its Fourier series through the torque's filter."""
     torque = recording.torque_nm.copy()
     s_of = 2j * np.pi
@@ -96,13 +105,13 @@ def bent(recording, friction):
         inside = (time >= segment.start_s - 1e-9) & (time < segment.end_s - 1e-9)
         at = time[inside] - segment.start_s
         lines = np.array(segment.amplitudes_rad_s) * np.exp(1j * np.array(segment.phases_rad))
-        true = lines * (1.0 + 0.40 * s_of * np.array(LINES))
+        true = lines * (1.0 + speed_lag * s_of * np.array(LINES))
         fine = np.arange(4000) * segment.period_s / 4000
         speed = segment.offset_rad_s + (np.exp(s_of * np.outer(fine, LINES)) @ true).real
         assert speed.min() > 0.0, speed.min()
         series = np.fft.rfft(friction(speed))[:60] / 4000
         hertz = np.arange(60) / segment.period_s
-        series = series / (1.0 + 0.15 * s_of * hertz) * np.where(hertz > 0.0, 2.0, 1.0)
+        series = series / (1.0 + torque_lag * s_of * hertz) * np.where(hertz > 0.0, 2.0, 1.0)
         torque[inside] += (np.exp(s_of * np.outer(at, hertz)) @ series).real
     return replace(recording, torque_nm=torque)
 
@@ -120,6 +129,26 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
     assert sum("no straight line" in text for text in said.warnings) == 1
     total = np.sqrt(sum(line.half_width_kg_m2**2 for line in said.budget if line.source != "torque scale"))
     assert total == pytest.approx(0.5 * (said.inertia.high - said.inertia.low), rel=0.3)
+
+
+def test_a_bend_is_seen_behind_short_lags():
+    """Reports of 5 and 3 ms: descents that leave a lag in common on the way had ended there, and at p = 1e-158."""
+    recording = bent(closed_form(speed_lag=0.005, torque_lag=0.003, noise=0.05),
+                     lambda w: 25.0 * np.exp(-((w / 1.7) ** 2)), 0.005, 0.003)
+    said = identify(recording, Options(model="rigid"))
+    assert said.model == MODEL, said.reason
+    assert said.inertia.value == pytest.approx(104.0, rel=1e-3)
+    assert said.inertia.low <= 104.0 <= said.inertia.high
+
+
+def test_lags_that_all_but_cancel_are_taken_out_of_the_wave():
+    """A straight fit with a second on both reports: by its lags the shaft would turn back and forth."""
+    wave = Wave((0.1, 0.4), np.array([1.0 + 0.5j, 0.8j]), 4.0, 10.0)
+    motion = Motion((wave,), None, (), None)
+    straight = np.array([104.0, 8.0, 1.01, 0.0, 1.0, 0.0, 0.0, 0.01])
+    assert wave.over_period(straight[2:]).min() < 0.0 < wave.over_period(np.zeros(6)).min()
+    (start,) = starts_of(motion, straight)
+    assert start == pytest.approx([104.0, 8.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.01])
 
 
 def test_straight_friction_is_not_bent():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tdhil.estimation.frequency_domain.signal_filters import (
         AVERAGE as AVERAGE, LAG_BOUND_S as LAG_BOUND_S, SHAPE_BOUND as SHAPE_BOUND, SKEW as SKEW,
         SKEW_BOUND_S as SKEW_BOUND_S, SPEED_LAG as SPEED_LAG, SPEED_SHAPE as SPEED_SHAPE, TORQUE_LAG as TORQUE_LAG,
-        TORQUE_SHAPE as TORQUE_SHAPE,
+        TORQUE_SHAPE as TORQUE_SHAPE, shared_lag as shared_lag, unseen_lag as unseen_lag,
     )
     from tdhil.estimation.frequency_domain.spectrum import (
         ComplexArray as ComplexArray, Line as Line, PeriodLines as PeriodLines, period_lines as period_lines,
@@ -50,7 +50,7 @@ else:
             "shafts": ("VISCOUS", "shaft_model"),
             "signal_filters": (
                 "AVERAGE", "LAG_BOUND_S", "SHAPE_BOUND", "SKEW", "SKEW_BOUND_S", "SPEED_LAG", "SPEED_SHAPE",
-                "TORQUE_LAG", "TORQUE_SHAPE",
+                "TORQUE_LAG", "TORQUE_SHAPE", "shared_lag", "unseen_lag",
             ),
             "spectrum": ("ComplexArray", "Line", "PeriodLines", "period_lines", "pooled_lines"),
         },

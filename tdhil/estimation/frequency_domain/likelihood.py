@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.shafts import Believing
@@ -68,6 +69,10 @@ class Likelihood:
         self._prior_index = np.array([prior.index for prior in known], dtype=np.intp)
         self._prior_mean = np.array([prior.mean for prior in known])
         self._prior_sd = np.array([prior.sd for prior in known])
+        stated = {prior.index for prior in priors}
+        lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
+        self._lags = lags if model.rigid and not stated & set(lags) else None
+        self._unseen_s = signal_filters.unseen_lag(float(np.max(np.abs(self.s))))
         slope = 0.0 if constraint is None else constraint.slope_per_inertia
         self._tie_row = model.viscous_row + slope * model.inertia_row
 
@@ -177,6 +182,8 @@ class Likelihood:
         known: FloatArray = (theta[self._prior_index] - self._prior_mean) / self._prior_sd
         if self._believing is not None:
             known = np.concatenate([known, self.beliefs(theta)[0]])
+        if self._lags is not None:
+            known = np.append(known, self._shared_lag(theta)[0])
         if self.constraint is None:
             return known
         z = self.tie_error(theta)
@@ -185,10 +192,22 @@ class Likelihood:
         found[:-1], found[-1] = known, math.copysign(math.sqrt((dof + 1.0) * float(np.log1p(z * z / dof))), z)
         return found
 
+    def _shared_lag(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """What the reports' common lag costs (`signal_filters.shared_lag`), and its slopes (P,)."""
+        assert self._lags is not None
+        row = np.zeros(self.model.size)
+        speed, torque = self._lags
+        value, row[speed], row[torque] = signal_filters.shared_lag(
+            float(theta[speed]), float(theta[torque]), self._unseen_s
+        )
+        return value, row
+
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
         rows = self._prior_rows
         if self._believing is not None:
             rows = np.concatenate([rows, self.beliefs(theta)[1]])
+        if self._lags is not None:
+            rows = np.concatenate([rows, self._shared_lag(theta)[1][None, :]])
         if self.constraint is None:
             return rows
         z, n = self.tie_error(theta), self.constraint.dof
@@ -220,6 +239,9 @@ class Likelihood:
             parts.append((part, 2.0 * float(self.nu[k])))
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
         parts += [(np.outer(row, row), np.inf) for row in self.beliefs(theta)[1]]
+        if self._lags is not None:
+            row = self._shared_lag(theta)[1]
+            parts.append((np.outer(row, row), np.inf))
         if self.constraint is not None:
             parts.append((np.outer(self._tie_row, self._tie_row) / self.constraint.sd**2, self.constraint.dof))
         return np.sum([part for part, _ in parts], axis=0), parts

@@ -36,6 +36,11 @@ class Model:
         """P."""
         return self.mechanical + signal_filters.COUNT
 
+    @property
+    def rigid(self) -> bool:
+        """Does nothing hang on a spring?"""
+        return "load_inertia" not in self.shaft.names
+
     def at(self, report: int) -> int:
         """Where a parameter of the reports stands in theta."""
         return self.mechanical + report

@@ -176,7 +176,8 @@ def wave_of(fit: PeriodLines, segment: Segment) -> Wave:
 _ROUNDS = 3
 _RIGID = len(RigidShaft.names)
 _HOPELESS = 40.0    # of −2 ln L behind the best with first-order lags: looked at no further
-_FINE = 0.003       # of a bell's width
+_FINE = 0.0005       # of a bell's width
+_SHORT_S = 0.02     # of a lag in common: it hardly changes the wave
 _SLOWEST = 0.1      # of the mean speed: what comes nearer to rest than that is another kind of friction
 
 
@@ -206,28 +207,45 @@ class BentFit:
 def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, rigid: RigidResult) -> list[BentFit]:
     """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``fixed``: as rigid."""
     # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
-    start = rigid.fitted.simple.theta
-    speeds = [wave.over_period(start[_RIGID:]) for wave in motion.waves]
-    ways = {float(np.sign(wave.mean)) for wave in motion.waves}
-    slowest = min(float(np.min(speed * np.sign(wave.mean))) for speed, wave in zip(speeds, motion.waves, strict=True))
-    if len(ways) != 1 or slowest <= _SLOWEST * min(abs(wave.mean) for wave in motion.waves):
+    starts = starts_of(motion, rigid.fitted.simple.theta)
+    if not starts or len({float(np.sign(wave.mean)) for wave in motion.waves}) != 1:
         return []
+    speeds = [wave.over_period(start[_RIGID:]) * np.sign(wave.mean) for start in starts for wave in motion.waves]
+    slowest = min(float(np.min(speed)) for speed in speeds)
     priors = tuple(replace(prior, index=prior.index + 1) for prior in priors)
     fixed = {index + 1: value for index, value in fixed.items()}
-    fastest = max(float(np.max(np.abs(speed))) for speed in speeds)
+    fastest = max(float(np.max(speed)) for speed in speeds)
 
-    def near(bend: Bend) -> _Near:
-        return _near(bend, motion, priors, fixed, np.insert(start, BEND, 0.0))
+    def near(bend: Bend, start: FloatArray) -> _Near:
+        return _near(bend, motion, priors, fixed, start)
 
-    tried = [near(bend) for bend in bends(slowest, fastest)]
+    tried = [near(bend, np.insert(starts[0], BEND, 0.0)) for bend in bends(slowest, fastest)]
     tried += _between(tried, near)
-    least = min(fit.objective for _, _, fit in tried)
+    tried = [one for one in tried if _keeps_turning(motion, one[2].theta[BEND + 1 :])]
+    least = min((fit.objective for _, _, fit in tried), default=0.0)
     found = [
         BentFit(bend, whole := fit_model(problem, fixed, [fit.theta]), residual_of(whole, 1))
         for bend, problem, fit in tried
         if fit.objective <= least + _HOPELESS
     ]
     return sorted(found, key=lambda one: one.objective)
+
+
+def starts_of(motion: Motion, straight: FloatArray) -> list[FloatArray]:
+    """Where the descents begin: the straight fit, and the same without the lag that both reports have in common.
+
+    A straight fit bends long lags that all but cancel to the friction's shape. They change its ratio little, but the
+    wave that is made of the reported one by taking such a lag off it swings far too wide. Only those count by whose
+    wave the shaft keeps turning.
+    """
+    apart = _apart(straight, _RIGID)
+    return [theta for theta in (straight, apart) if theta is not None and _keeps_turning(motion, theta[_RIGID:])]
+
+
+def _keeps_turning(motion: Motion, phi: FloatArray) -> bool:
+    """Does the shaft behind the reports ``phi`` (6,) stay away from rest?"""
+    least = _SLOWEST * min(abs(wave.mean) for wave in motion.waves)
+    return all(np.min(wave.over_period(phi) * np.sign(wave.mean)) > least for wave in motion.waves)
 
 
 def inertia_of(found: Sequence[BentFit], best: Estimate, confidence: float) -> Estimate:
@@ -246,16 +264,20 @@ def inertia_of(found: Sequence[BentFit], best: Estimate, confidence: float) -> E
 _Near = tuple[Bend, Likelihood, Fit]
 
 
-def _between(tried: list[_Near], near: Callable[[Bend], _Near]) -> list[_Near]:
-    """The best bell between the neighbours of the grid's best."""
-    bells = [(bend.width_rad_s, fit.objective) for bend, _, fit in tried if bend.width_rad_s is not None]
-    best = min(range(len(bells)), key=lambda number: bells[number][1])
+def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> list[_Near]:
+    """The best bell between the neighbours of the grid's best; each from where the best so far ended."""
+    bells = [(bend.width_rad_s, fit) for bend, _, fit in tried if bend.width_rad_s is not None]
+    best = min(range(len(bells)), key=lambda number: bells[number][1].objective)
     around = (math.log(bells[max(best - 1, 0)][0]), math.log(bells[min(best + 1, len(bells) - 1)][0]))
+    lowest = bells[best][1]
     seen: list[_Near] = []
 
     def objective(log_width: float) -> float:
-        seen.append(near(Bend(math.exp(log_width))))
-        return seen[-1][2].objective
+        nonlocal lowest
+        seen.append(near(Bend(math.exp(log_width)), lowest.theta))
+        fit = seen[-1][2]
+        lowest = fit if fit.objective < lowest.objective else lowest
+        return fit.objective
 
     from scipy.optimize import minimize_scalar
 
@@ -264,16 +286,26 @@ def _between(tried: list[_Near], near: Callable[[Bend], _Near]) -> list[_Near]:
 
 
 def _near(
-    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, start: FloatArray
+    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, theta: FloatArray
 ) -> _Near:
     """With first-order lags, one descent in each round, from where the last one ended."""
-    theta = start
     for _ in range(_ROUNDS):
         problem = _problem(bend, motion, priors, theta[BEND + 1 :])
         first_order = {**dict.fromkeys(problem.model.structure, 0.0), **fixed}
         fit = minimise(problem, box(problem, rough_inertia_of(problem)), theta, first_order)
         theta = fit.theta
     return bend, problem, fit
+
+
+def _apart(theta: FloatArray, mechanical: int) -> FloatArray | None:
+    """Theta without the lag that both reports have in common; None where that is hardly any."""
+    lags = [mechanical + signal_filters.SPEED_LAG, mechanical + signal_filters.TORQUE_LAG]
+    shared = float(np.min(theta[lags]))
+    if shared < _SHORT_S:
+        return None
+    found = theta.copy()
+    found[lags] -= shared
+    return found
 
 
 def _problem(bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], phi: FloatArray) -> Likelihood:

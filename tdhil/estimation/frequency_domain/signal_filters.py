@@ -24,6 +24,7 @@ filters' cumulants, (d, τ_w, τ_T) already carry any κ₁, κ₂, κ₃. A wro
 u carry from three sides. What lies beyond is below (ωτ)⁵ at the lines.
 """
 
+import math
 from typing import Final
 
 import numpy as np
@@ -86,6 +87,53 @@ def log_ratio_jacobian(phi: FloatArray, s: ComplexArray) -> ComplexArray:
         found[:, AVERAGE] = quarter * np.where(small, series, (y / np.tan(y) - 1.0) / (2.0 * y * y))
     found[:, SKEW] = -s
     return found
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What both reports share of their lags can hardly be seen; how plausible is it then?
+#
+# With equal lags on both, F_T/F_w = 1 however long they are; with τ_w = c + δ, τ_T = c and the delay δ taken back,
+#
+#     ln F_T/F_w = ln(1 + δ s/(1 + c s)) − δ s  ≈  −δ c s²/(1 + c s),
+#
+# a product: lines tell δ c, and c only as far as δ c (ω c)² stands out of the noise. Where nothing stands out, c runs
+# up to whatever bound there is, noise at the slowest lines picks δ/c there, and J follows, since far above 1/c the
+# ratio is the number 1 + δ/c. A flat prior calls that likely: of all lags up to a second, most are long. But a lag is a
+# scale, of which no size is likelier than another in the logarithm (the reference prior 1/c), where the lines can see
+# such a lag; below that it is flat. So
+#
+#     −2 ln p = ln(1 + (c/c₀)²),    c = √2 τ_w τ_T/√(τ_w² + τ_T²),    c₀ = 0.2/ω of the fastest line,
+#
+# goes with the likelihood: c is the shorter lag where they differ much, and either where they are alike. One long lag
+# costs nothing. Two long lags cost five or so, which their difference must explain: where it stands out of the lines'
+# noise it explains hundreds, and c moves by a fifth of its standard deviation. Where it doesn't, there is nothing that
+# tells them from none, and where they are equal, nothing to tell. In between, at lags that are long and unlike by less
+# than a few percent, the interval is as wide as it may be without them.
+
+
+_UNSEEN = 0.2          # rad at the fastest line
+_ROUND = 0.1           # of c₀: c is made smooth about zero
+
+
+def unseen_lag(fastest_rad_s: float) -> float:
+    """c₀, s."""
+    return _UNSEEN / fastest_rad_s
+
+
+def shared_lag(speed_lag_s: float, torque_lag_s: float, unseen_s: float) -> tuple[float, float, float]:
+    """The residual whose square is −2 ln p of two lags, and its slopes over either of them."""
+    a, b = speed_lag_s, torque_lag_s
+    square = a * a + b * b + (_ROUND * unseen_s) ** 2
+    root = math.sqrt(square)
+    x = math.sqrt(2.0) * a * b / root / unseen_s
+    by_a, by_b = (math.sqrt(2.0) * other * (square - own * own) / (square * root * unseen_s) for own, other in
+                  ((a, b), (b, a)))
+    if abs(x) < 1e-6:
+        value, slope = x, 1.0
+    else:
+        value = math.copysign(math.sqrt(math.log1p(x * x)), x)
+        slope = x / (1.0 + x * x) / value
+    return value, slope * by_a, slope * by_b
 
 
 def bounds(s: ComplexArray) -> tuple[FloatArray, FloatArray]:
