@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _TRACE_ONLY = (
     "columns", "excitation", "rated_torque", "torque_limit", "gear", "torque_scale_sd",
-    "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd",
+    "speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd", "skew_sd",
 )
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("--speed-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
         ("--torque-lag", TIME, "S", "time constant of the filter on the reported torque"),
         ("--torque-lag-sd", TIME, "S", "its standard deviation (default a tenth of it)"),
+        ("--skew-sd", TIME, "S", "to within what speed and torque are of one time, 1 sd (default a sample, or 10 ms)"),
     ):
         trace.add_argument(flag, type=float if unit is None else amount(unit), metavar=metavar, help=text)
     parser.set_defaults(run=run)
@@ -82,6 +83,7 @@ def run(namespace: argparse.Namespace) -> int:
                 namespace.speed_lag, namespace.speed_lag_sd, namespace.torque_lag, namespace.torque_lag_sd,
                 "the command line",
             ),
+            "skew_sd_s": namespace.skew_sd,
         }
     return _identify(namespace, read(path, **trace).with_said(_said(namespace)))
 
@@ -128,7 +130,7 @@ def _check(namespace: argparse.Namespace) -> None:
         ("gear", 1e-6, 1e6, "a positive number"),
         ("torque_scale_sd", 0.0, 1.0, "a share from 0 to below 1"),
         *((lag, 0.0, 1e6, "a time in s, not negative")
-          for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd")),
+          for lag in ("speed_lag", "speed_lag_sd", "torque_lag", "torque_lag_sd", "skew_sd")),
     ):
         value = getattr(namespace, name)
         if value is not None and not low <= value < high:      # NaN neither

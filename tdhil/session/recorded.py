@@ -120,12 +120,13 @@ def read(
     gear_ratio: float | None = None,
     torque_scale_rel_sd: float | None = None,
     lags: LagPrior | None = None,
+    skew_sd_s: float | None = None,
 ) -> RunRecord:
     """Read a run.mcap, whole or cut short, or a trace in CSV; the options are those of ``tdhil replay`` for a trace.
 
-    ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an excitation.yaml. A
-    log of ours brings all of it along. Raises LogError (nothing of ours in the file), DataFileError (with the line)
-    and UsageError.
+    ``columns``: such as ``["time=t_s", "speed=n_rpm:rpm", "torque=m_pct:%"]``; ``excitation``: an excitation.yaml;
+    ``skew_sd_s``: to within what speed and torque are of one time, s (1 sd). A log of ours brings all of it along.
+    Raises LogError (nothing of ours in the file), DataFileError (with the line) and UsageError.
     """
     path = Path(path)
     if not path.is_file():
@@ -135,13 +136,14 @@ def read(
         of_trace = {
             "columns": columns, "excitation": excitation, "rated_torque_nm": rated_torque_nm, "lags": lags,
             "torque_limit_nm": torque_limit_nm, "gear_ratio": gear_ratio, "torque_scale_rel_sd": torque_scale_rel_sd,
+            "skew_sd_s": skew_sd_s,
         }
         for name, value in of_trace.items():
             if value is not None:
                 raise UsageError("is for a trace in CSV; this log brings its own", where=name)
         return _read_log(path)
     return _read_trace(
-        path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags
+        path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags, skew_sd_s
     )
 
 
@@ -175,6 +177,7 @@ def _read_log(path: Path) -> RunRecord:
 def _read_trace(
     path: Path, columns: Sequence[str] | None, excitation: str | Path | None, rated_torque_nm: float | None,
     torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None, lags: LagPrior | None,
+    skew_sd_s: float | None,
 ) -> RunRecord:
     from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
     from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
@@ -185,6 +188,7 @@ def _read_trace(
         torque_scale_rel_sd=ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
         gear_ratio=1.0 if gear_ratio is None else gear_ratio,
         lag_prior=LagPrior() if lags is None else lags,
+        skew_sd_s=skew_sd_s,
     )
     choices = USUAL if columns is None else parse_columns(list(columns))
     recording, assumed = read_recording(path, choices, None if excitation is None else Path(excitation), bench)

@@ -42,4 +42,4 @@ def test_a_descent_that_begins_without_a_lag_finds_it(seed):
                          bounds=(limits.low, limits.high), x_scale=limits.scale, xtol=1e-12)
     without = minimise(problem, limits, truth, {AT(signal_filters.TORQUE_LAG): 0.0})
     found = minimise(problem, limits, without.theta, {})
-    assert found.objective <= 2.0 * best.cost + 0.05
+    assert found.objective <= 2.0 * best.cost + 0.1      # an interval ends where it has risen by four

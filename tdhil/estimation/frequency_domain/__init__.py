@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit
     from tdhil.estimation.frequency_domain.rigid import (
         fit_inertia as fit_inertia, known_of as known_of, lag_priors as lag_priors,
-        refuse_count as refuse_count,
+        refuse_count as refuse_count, simultaneous as simultaneous,
     )
     from tdhil.estimation.frequency_domain.shafts import VISCOUS as VISCOUS, shaft_model as shaft_model
     from tdhil.estimation.frequency_domain.signal_filters import (
@@ -46,7 +46,7 @@ else:
             ),
             "model": ("GaussianPrior", "Model"),
             "optimiser": ("Box", "Fit"),
-            "rigid": ("fit_inertia", "known_of", "lag_priors", "refuse_count"),
+            "rigid": ("fit_inertia", "known_of", "lag_priors", "refuse_count", "simultaneous"),
             "shafts": ("VISCOUS", "shaft_model"),
             "signal_filters": (
                 "AVERAGE", "LAG_BOUND_S", "SHAPE_BOUND", "SKEW", "SKEW_BOUND_S", "SPEED_LAG", "SPEED_SHAPE",

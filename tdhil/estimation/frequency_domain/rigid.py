@@ -318,8 +318,12 @@ def _words(result: RigidResult, as_paper: bool, what: str) -> Words:
 def _conditions(result: RigidResult, case: Case) -> tuple[str, ...]:
     problem = result.fitted.problem
     skew = problem.model.at(signal_filters.SKEW)
-    exact = [f"speed and torque simultaneous to {p.sd * 1e3:g} ms (1 sd)" for p in problem.priors if p.index == skew]
-    return (*of_reports(case.recording.lag_prior), *exact)
+    return (*of_reports(case.recording.lag_prior), *simultaneous(problem.priors, skew))
+
+
+def simultaneous(priors: tuple[GaussianPrior, ...], skew: int) -> tuple[str, ...]:
+    """What an inertia is conditional on where the skew, of this index, was taken as known."""
+    return tuple(f"speed and torque simultaneous to {p.sd * 1e3:.3g} ms (1 sd)" for p in priors if p.index == skew)
 
 
 def of_reports(prior: LagPrior) -> list[str]:

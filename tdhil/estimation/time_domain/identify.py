@@ -18,6 +18,7 @@ from tdhil.estimation.frequency_domain import (
     GaussianPrior,
     lag_priors,
     shaft_model,
+    simultaneous,
     torque_scale_line,
 )
 from tdhil.estimation.result import Estimate, Options, Refused
@@ -169,12 +170,13 @@ def identify_record(case: Case) -> Finding:
     check_signals(case.recording, case.samples)
     few = thinned(case.samples)
     found = _runs(few, case.recording)
-    solved = _solved(case.recording, few, found, case.options)
+    solved, conditions = _solved(case.recording, few, found, case.options)
     if solved is None or _is_open(solved.inertia):
         refuse_open(few, found)
     inside = sum(run.length_s for run in found) / float(few.time_s[-1] - few.time_s[0])
     used = min(case.samples_used, round(inside * case.samples_used))
-    return replace(_finding(solved, case), samples_used=used)
+    finding = _finding(solved, case)
+    return replace(finding, conditions=(*finding.conditions, *conditions), samples_used=used)
 
 
 def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
@@ -189,11 +191,14 @@ def _runs(samples: Samples, recording: Recording) -> tuple[OneWayStretch, ...]:
 
 
 def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, ...],
-    options: Options) -> Solved | None:
-    """With what is known of the lags; if both are and it doesn't do, with the signals taken as simultaneous."""
+    options: Options) -> tuple[Solved | None, tuple[str, ...]]:
+    """With what is known of the lags; if both are and it doesn't do, with the signals taken as simultaneous.
+
+    And what J is conditional on by that.
+    """
     placed = windows(found)
     if not placed:
-        return None
+        return None, ()
     bins = joined([measure(window) for window in placed])
     span = float(np.ptp(samples.torque_nm))
     known = lag_priors(recording.lag_prior, SPEED_LAG, TORQUE_LAG)
@@ -207,8 +212,8 @@ def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, 
         except (np.linalg.LinAlgError, FloatingPointError, ValueError, OverflowError):
             solved = None
         if solved is not None and not _is_open(solved.inertia):
-            return solved
-    return solved
+            return solved, simultaneous(priors, SKEW)
+    return solved, ()
 
 
 def _is_open(inertia: Estimate) -> bool:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -323,13 +323,18 @@ _ROUNDING = 1e-9         # of the largest value: differences below it are the ar
 
 @dataclass(frozen=True)
 class Bench:
-    """What a trace doesn't say: N·m and 1 at the motor shaft; None where nobody knows."""
+    """What a trace doesn't say: N·m and 1 at the motor shaft; None where nobody knows.
+
+    ``skew_sd_s``: to within what the tool read speed and torque at one time, 1 sd. None: to within a sample, for it may
+    read one after the other, and at no less than what is usual of a frame (`LagPrior`).
+    """
 
     rated_torque_nm: float | None = None
     torque_limit_nm: float | None = None
     torque_scale_rel_sd: float = 0.0
     gear_ratio: float = 1.0
     lag_prior: LagPrior = field(default_factory=LagPrior)
+    skew_sd_s: float | None = None
 
 
 def read_recording(
@@ -343,6 +348,10 @@ def read_recording(
     trace = read_trace(path, choices, bench.rated_torque_nm)
     known, levels = (None, ()) if excitation is None else load_excitation(excitation, trace.time_s)
     count = len(trace.time_s)
+    prior, skew_sd_s = bench.lag_prior, bench.skew_sd_s
+    if skew_sd_s is None:
+        usual_s = float(np.median(np.diff(trace.time_s))) if count > 1 else 0.0
+        skew_sd_s = max(prior.skew_sd_s, usual_s)
     return Recording(
         time_s=trace.time_s,
         speed_rad_s=trace.speed_rad_s,
@@ -351,7 +360,7 @@ def read_recording(
         limited=np.zeros(count, dtype=np.bool_),
         excitation=known,
         levels=levels,
-        lag_prior=bench.lag_prior,
+        lag_prior=replace(prior, skew_sd_s=skew_sd_s),
         speed_resolution_rad_s=resolution(trace.speed_rad_s),
         torque_resolution_nm=resolution(trace.torque_nm),
         torque_limit_nm=bench.torque_limit_nm,
