@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         MODBUS as MODBUS, SAMPLE as SAMPLE,
     )
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
+    from tdhil.recording.log_tail import LogNews as LogNews, LogTail as LogTail
     from tdhil.recording.log_writer import RunWriter as RunWriter
     from tdhil.recording.mcap_container import MAGIC as MAGIC
     from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
@@ -30,6 +31,7 @@ else:
             "csv": ("Bench", "USUAL", "parse_columns", "read_recording"),
             "log_format": ("CAN", "CHANNELS", "CLASSES", "COMMAND", "EXCITATION", "MODBUS", "SAMPLE"),
             "log_reader": ("read_cycles", "read_frames", "read_run"),
+            "log_tail": ("LogNews", "LogTail"),
             "log_writer": ("RunWriter",),
             "mcap_container": ("MAGIC",),
             "packed": ("pack_recording", "unpack_recording"),

@@ -1,0 +1,142 @@
+"""Reads a run.mcap that another process is still writing: each time what has come since the last time.
+
+The writer hands over whole chunks, so the end of the file may lie in the middle of one: it is left for the next time.
+Only our own files are read so, whose channels are known.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from struct import Struct
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+import zstandard
+from google.protobuf.message import DecodeError
+
+from tdhil.recording import log_format
+from tdhil.recording.builder import structure
+from tdhil.recording.chunk_table import ChunkTable
+from tdhil.recording.log_format import CHANNELS, CLASSES, Event
+from tdhil.recording.mcap_container import MAGIC
+from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, DATA_END, Contents, chunk_head, contents, read_at
+from tdhil.recording.recording import FloatArray, Stage
+
+_RECORD: Final = Struct("<BQ")
+_NUMBERS: Final = {number: number for number in CHANNELS}
+_SKIPPED: Final = frozenset({log_format.COMMAND, log_format.CAN, log_format.MODBUS, log_format.LOG})
+MOST: Final = 2**20
+"""Bytes of the file at a time, about: whoever comes late to a long run is not to hold everything up."""
+
+
+def _nothing() -> FloatArray:
+    return np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class LogNews:
+    """What came. ``samples`` (n, 3): control time in s, speed in rad/s, torque in N·m, in their order.
+
+    ``configuration`` and ``result``: the latest that came, None where none did. ``epoch_ns``: wall clock at control
+    time zero, 0 where no sample came. ``more``: there is more to read at once. ``closed``: that was all there will be.
+    """
+
+    samples: FloatArray = field(default_factory=_nothing)
+    events: tuple[Event, ...] = ()
+    stages: tuple[Stage, ...] = ()
+    configuration: dict[str, Any] | None = None
+    result: dict[str, Any] | None = None
+    epoch_ns: int = 0
+    more: bool = False
+    closed: bool = False
+
+
+class LogTail:
+    """One reader of one file. Costs next to nothing where nothing has come."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._offset = 0
+        self._zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
+        self.closed = False
+
+    def read(self) -> LogNews:
+        """What has come since the last time; nothing where the file isn't there yet, or can't be read now."""
+        with suppress(OSError):
+            size = self._path.stat().st_size
+            if size > self._offset and not self.closed:
+                with self._path.open("rb") as file:
+                    return self._news(file, size)
+        return LogNews(closed=self.closed)
+
+    def _news(self, file: BinaryIO, size: int) -> LogNews:
+        begin, found = self._offset, []
+        for content in self._contents(file, size):
+            found.append(content)
+            if self._offset - begin > MOST:
+                break
+        decoded = [self._decoded(one) for one in found]
+        samples = [one.samples for one in decoded if len(one.samples)]
+        return LogNews(
+            np.concatenate(samples) if samples else _nothing(),
+            tuple(event for one in decoded for event in one.events),
+            tuple(stage for one in decoded for stage in one.stages),
+            next((one.configuration for one in reversed(decoded) if one.configuration is not None), None),
+            next((one.result for one in reversed(decoded) if one.result is not None), None),
+            next((one.epoch_ns for one in decoded if one.epoch_ns), 0),
+            more=self._offset - begin > MOST,
+            closed=self.closed,
+        )
+
+    def _contents(self, file: BinaryIO, size: int) -> Iterator[bytes]:
+        """Whole chunks; the offset is behind each when it comes. Damage is stepped over where its length is known."""
+        if self._offset == 0:
+            if size < len(MAGIC):
+                return
+            self._offset = len(MAGIC)
+        while True:
+            head = read_at(file, self._offset, _RECORD.size)
+            if len(head) < _RECORD.size:
+                return
+            opcode, length = _RECORD.unpack(head)
+            end = self._offset + _RECORD.size + length
+            if opcode == DATA_END and length == 4:
+                self.closed = True
+                return
+            if end > size:
+                return
+            chunk = chunk_head(file, self._offset, size) if opcode == CHUNK else None
+            at, self._offset = self._offset, end
+            if chunk is not None and isinstance(inside := contents(file, at, chunk, self._zstd), Contents):
+                yield inside.data
+
+    @staticmethod
+    def _decoded(chunk: bytes) -> LogNews:
+        table = ChunkTable((chunk,))
+        found = table.messages(0, 1, _NUMBERS, log_format.SAMPLE, _SKIPPED)
+        if found is None:
+            return LogNews()           # samples of another layout: none of our writer's
+        block, messages, _ = found
+        events: list[Event] = []
+        stages: list[Stage] = []
+        texts: dict[int, dict[str, Any]] = {}
+        for message in messages:
+            with suppress(DecodeError, ValueError, TypeError, KeyError, RecursionError):
+                decoded = CLASSES[CHANNELS[message.number][1]].FromString(message.payload)
+                if message.number == log_format.EVENT:
+                    events.append(structure(Event, decoded))
+                elif message.number == log_format.STAGE:
+                    stages.append(structure(Stage, decoded))
+                elif message.number in (log_format.CONFIGURATION, log_format.RESULT):
+                    plain = json.loads(decoded.json)
+                    if isinstance(plain, dict):
+                        texts[message.number] = plain
+        epoch_ns = 0 if block is None else block.first_log_time_ns - round(float(block.values[0, 0]) * 1e9)
+        return LogNews(
+            _nothing() if block is None else block.values, tuple(events), tuple(stages),
+            texts.get(log_format.CONFIGURATION), texts.get(log_format.RESULT), max(0, epoch_ns),
+        )
