@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import math
 import sys
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from profiles.quantities import RPM
 from tdhil.config import Rig, RunOptions
-from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_dry
-from tdhil.version import __version__
+from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_document, plan_dry
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +28,7 @@ def dry_run(
     """
     planned, figures, limits = plan_dry(options, rig, simulated, can_torque, lets_go)
     if options.json:
-        plain = document(planned, figures, limits)
+        plain = plan_document(planned, figures, limits)
         plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
         json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
         sys.stdout.write("\n")
@@ -42,29 +40,6 @@ def dry_run(
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
     return 0
-
-
-def document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
-    """The plan as plain data."""
-    plan, stopping = planned.plan, planned.stopping
-    return {
-        "dry_run": True,
-        "excitation": plan.kind,
-        "mode": plan.mode,
-        **plan.plain(),
-        "duration_s": planned.duration_s,
-        "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
-        "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
-        "limits": {
-            "speed_min_rad_s": limits.speed_min_rad_s,
-            "speed_max_rad_s": limits.speed_max_rad_s,
-            "torque_nm": limits.torque_nm,
-        },
-        "rests_on": [asdict(figure) for figure in figures],
-        "expected_half_width": planned.half_width if math.isfinite(planned.half_width) else None,
-        "stopping": None if stopping is None else stopping.plain(),
-        "tdhil": __version__,
-    }
 
 
 def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, console: Console) -> None:

@@ -268,6 +268,14 @@ class RunSection(DataModel):
         return [("stepped", "and real_time exclude each other; keep one")] if both else []
 
 
+class Service(DataModel):
+    """What `tdhil serve` may do with this bench."""
+
+    motion: Literal["never", "attended", "watched"] = Field(
+        default="never", description="who may move it from afar: nobody, or with a code from whoever stands there"
+    )
+
+
 class Rig(DataModel):
     """Everything that a bench has; each key is optional until something needs it."""
 
@@ -293,6 +301,7 @@ class Rig(DataModel):
     expected: Expected = Expected()
     reference_inertia_kg_m2: Inertia | None = Field(default=None, description="kg·m² at the motor; shown beside J")
     run: RunSection = RunSection()
+    service: Service = Service()
 
     _file: str = PrivateAttr(default="")
     _lines: Mapping[tuple[str | int, ...], int] = PrivateAttr(default={})

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from tdhil.report.html import check_report_path as check_report_path, write_report as write_report
     from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console
     from tdhil.report.page import (
-        STYLE as STYLE, install_command as install_command, repeatable_figures as repeatable_figures,
-        require_extra as require_extra,
+        STYLE as STYLE, has_extra as has_extra, install_command as install_command,
+        repeatable_figures as repeatable_figures, require_extra as require_extra,
     )
     from tdhil.report.plots import draw_run as draw_run
     from tdhil.report.tuning import (
@@ -30,7 +30,7 @@ else:
             "document": ("SIMULATED", "result_document"),
             "html": ("check_report_path", "write_report"),
             "live": ("LiveDisplay", "stderr_console"),
-            "page": ("STYLE", "install_command", "repeatable_figures", "require_extra"),
+            "page": ("STYLE", "has_extra", "install_command", "repeatable_figures", "require_extra"),
             "plots": ("draw_run",),
             "tuning": ("TunedFor", "print_tuning", "showcase_of", "tuning_document", "write_tuning_report"),
         },

@@ -55,6 +55,11 @@ def install_command() -> str:
     return f"{python} -m pip install {' '.join(map(shlex.quote, wanted or NEEDED))}"
 
 
+def has_extra() -> bool:
+    """Are the packages for reports there?"""
+    return all(find_spec(name) is not None for name in NEEDED)
+
+
 def require_extra(where: str) -> None:
     """Raises UsageError, in one line, where the optional packages for a report are missing."""
     missing = [name for name in NEEDED if find_spec(name) is None]

@@ -6,7 +6,9 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.session.conclusion import conclude as conclude
-    from tdhil.session.confirm import AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant
+    from tdhil.session.confirm import (
+        AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant, motion_summary as motion_summary,
+    )
     from tdhil.session.connection import (
         Connection as Connection, PeerPlan as PeerPlan, bus_kind as bus_kind, bus_kinds as bus_kinds,
         connection_of as connection_of, simulated_connection as simulated_connection,
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     )
     from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
     from tdhil.session.plan_ahead import (
-        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_dry as plan_dry,
+        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.recorded import (
         RunRecord as RunRecord, is_log as is_log, read as read,
@@ -42,7 +44,7 @@ else:
         __name__,
         {
             "conclusion": ("conclude",),
-            "confirm": ("AskingAttendant", "TerminalAttendant"),
+            "confirm": ("AskingAttendant", "TerminalAttendant", "motion_summary"),
             "connection": (
                 "Connection", "PeerPlan", "bus_kind", "bus_kinds", "connection_of", "simulated_connection",
             ),
@@ -50,7 +52,7 @@ else:
             "holder": ("DriveHeld", "Holder", "address_of", "hold", "holder_of"),
             "log_place": ("check_different_files", "check_log_path", "is_live", "make_room"),
             "opening": ("open_drive", "plan_peer", "with_faults"),
-            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_dry"),
+            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_document", "plan_dry"),
             "recorded": ("RunRecord", "is_log", "read"),
             "run_session": ("Attendant", "Consent", "RunRequest", "RunSession"),
             "stop_signals": ("stop_on_signals",),

@@ -47,7 +47,7 @@ def confirm_motion(
     if preflight.identity.simulated:
         return
     pause_display()
-    console.print(summary(preflight, task.limits, task.request, unverified), markup=False)
+    console.print(motion_summary(preflight, task.limits, task.request, unverified), markup=False)
     if yes:
         console.print("Confirmed by --yes.")
         return
@@ -113,7 +113,7 @@ def turns_text(speed_rad_s: float) -> str:
     return f"{way} {10.0 / turn_s:.3g} times in 10 s"
 
 
-def summary(
+def motion_summary(
     preflight: Preflight, limits: MachineLimits, request: ExcitationRequest, unverified: Sequence[str] = ()
 ) -> str:
     """What will happen, and what the operator must have seen to. ``unverified``: what he took of the profile."""
@@ -222,6 +222,6 @@ class AskingAttendant(TerminalAttendant):
         if preflight.identity.simulated:
             return
         self._display.pause()
-        text = summary(preflight, task.limits, task.request, unverified)
+        text = motion_summary(preflight, task.limits, task.request, unverified)
         if _meanwhile(idle, partial(self._ask, text)) is not True:
             raise PreflightRefused("not confirmed", where="confirm", next_step="Nothing has moved")

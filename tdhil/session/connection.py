@@ -249,6 +249,7 @@ class PeerPlan:
     plant: Any
     faults: tuple[Any, ...] = ()       # scripted faults of the embedded simulator (`sim_bus.fault_script`)
     never_came: list[str] = field(default_factory=list)    # those of them whose moment the run did not reach
+    left_in: Path | None = None        # where it is written down what a run changes in a drive; None: beside the log
 
     @property
     def epoch_ns(self) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 from drivers import Identity, PreflightRefused
 from tdhil.config import Rig, RunOptions, simulated_default_rig
 from tdhil.session.task import bench_of, excitation_request, lag_prior, machine_limits
+from tdhil.version import __version__
 
 if TYPE_CHECKING:
 
@@ -56,6 +58,29 @@ def plan_dry(
             str(error), where="plan of stage 5", next_step=error.next_step
         ) from error
     return planned, figures, limits
+
+
+def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
+    """The plan as plain data."""
+    plan, stopping = planned.plan, planned.stopping
+    return {
+        "dry_run": True,
+        "excitation": plan.kind,
+        "mode": plan.mode,
+        **plan.plain(),
+        "duration_s": planned.duration_s,
+        "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
+        "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
+        "limits": {
+            "speed_min_rad_s": limits.speed_min_rad_s,
+            "speed_max_rad_s": limits.speed_max_rad_s,
+            "torque_nm": limits.torque_nm,
+        },
+        "rests_on": [asdict(figure) for figure in figures],
+        "expected_half_width": planned.half_width if math.isfinite(planned.half_width) else None,
+        "stopping": None if stopping is None else stopping.plain(),
+        "tdhil": __version__,
+    }
 
 
 def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> None:

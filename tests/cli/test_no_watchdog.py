@@ -12,7 +12,7 @@ from tdhil.config.rig import load_rig, simulated_default_rig
 from tdhil.errors import exit_code
 from tdhil.run import preconditions
 from tdhil.run.settings import ExcitationRequest, MachineLimits
-from tdhil.session.confirm import summary
+from tdhil.session.confirm import motion_summary
 from tdhil.session.task import machine_limits
 
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 900.0)
@@ -27,10 +27,10 @@ def preflight(watchdog_s: float) -> Preflight:
 
 
 def test_the_confirmation_says_it_and_asks_for_somebody_at_the_stop() -> None:
-    armed = summary(preflight(0.5), LIMITS, ExcitationRequest())
+    armed = motion_summary(preflight(0.5), LIMITS, ExcitationRequest())
     assert "watchdog        0.5 s in the drive, then quick stop" in armed
     assert "--accept" not in armed
-    unarmed = summary(preflight(0.0), LIMITS, ExcitationRequest())
+    unarmed = motion_summary(preflight(0.0), LIMITS, ExcitationRequest())
     assert "watchdog        NONE, accepted by --accept-no-watchdog: the drive will not stop by itself" in unarmed
     assert "[ ] somebody stands at that stop for the whole run" in unarmed
     assert unarmed.count("[ ]") == armed.count("[ ]") + 1

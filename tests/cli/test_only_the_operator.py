@@ -82,7 +82,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
     from tdhil.run.settings import ExcitationRequest, MachineLimits
 
     monkeypatch.setattr("sys.stdin", None)
-    monkeypatch.setattr("tdhil.session.confirm.summary", lambda *_: "")
+    monkeypatch.setattr("tdhil.session.confirm.motion_summary", lambda *_: "")
     task = SimpleNamespace(limits=MachineLimits, request=ExcitationRequest)
     preflight = SimpleNamespace(identity=Identity(1, 2, 3, 4, "drive", False))
     with pytest.raises(PreflightRefused, match="nobody is there"):

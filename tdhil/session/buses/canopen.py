@@ -84,7 +84,7 @@ class CanopenKind(BusKind):
                 rate_hz=options.rate_hz,
                 rated_torque_nm=rated_torque_nm(plan, profile, data),
                 tap=tap,
-                journal=None if plan.embedded else UndoJournal(Path(options.log).parent, f"node{node}"),
+                journal=None if plan.embedded else UndoJournal(plan.left_in or Path(options.log).parent, f"node{node}"),
             )
 
     @contextmanager
