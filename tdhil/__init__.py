@@ -26,17 +26,20 @@ if TYPE_CHECKING:
     from tdhil.api import run as run
     from tdhil.api import simulate as simulate
     from tdhil.errors import TdhilError as TdhilError
+    from tdhil.service import Client as Client
 
 _API = (
     "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "StopRequest",
     "identify", "open_drive", "read", "run", "simulate",
 )
-__all__ = ["TdhilError", "__version__", *_API]  # noqa: PLE0604 - strings, by the line above
+__all__ = ["Client", "TdhilError", "__version__", *_API]  # noqa: PLE0604 - strings, by the line above
 
 
 def __getattr__(name: str) -> Any:
     if name in _API:
         return getattr(import_module("tdhil.api"), name)
+    if name == "Client":
+        return import_module("tdhil.service").Client
     if name == "TdhilError":
         return import_module("tdhil.errors").TdhilError
     raise AttributeError(f"module 'tdhil' has no attribute {name!r}")

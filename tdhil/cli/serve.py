@@ -1,0 +1,36 @@
+"""`tdhil serve`: rigs, runs and live pages in a browser, on this computer."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of serve."""
+    from tdhil.service import HOST, PORT
+
+    parser.add_argument("--rigs", type=Path, metavar="DIR",
+                        help="a rig.yaml for each rig (default: two that are simulated)")
+    parser.add_argument("--data", type=Path, metavar="DIR", default=Path("tdhil-data"),
+                        help="where runs, audit and index go (default: tdhil-data)")
+    parser.add_argument("--host", default=HOST, metavar="ADDRESS",
+                        help=f"where to listen (default {HOST}; this computer only)")
+    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default {PORT}; 0: any that is free")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Until Ctrl-C or SIGTERM, which brake what moves."""
+    from tdhil.service import serve
+
+    if not 0 <= namespace.port <= 65535:
+        from tdhil.errors import UsageError
+
+        raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}")
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)  # noqa: T201
+
+    return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say)

@@ -1,0 +1,23 @@
+"""The rigs of a site as a service: runs as processes of their own, their memory on files, and a web before them.
+
+The web opens no drive's bus. A run is a process of its own, today's Runner with its guard and its stop; it writes
+run.mcap, and the web reads that as it grows.
+"""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.service.client import Client as Client, ServiceError as ServiceError
+    from tdhil.service.serving import HOST as HOST, PORT as PORT, serve as serve
+    from tdhil.service.states import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "client": ("Client", "ServiceError"),
+            "serving": ("HOST", "PORT", "serve"),
+            "states": ("Conflict", "NotAllowed", "NotThere"),
+        },
+    )

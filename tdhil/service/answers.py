@@ -1,0 +1,278 @@
+"""What the service answers, as types, and the document that describes them all (OpenAPI 3.1).
+
+One table of routes: the web serves what stands in it, and the document is made from it. `role` says who may: with users
+of its own the web will look at it; on loopback without any, everybody has every role.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Final, Literal
+
+from pydantic import TypeAdapter
+
+from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told
+from tdhil.service.store import Broken, Entry, Summary
+from tdhil.version import __version__
+
+# mypy takes these for plain dataclasses; pydantic makes the schemas from their annotations.
+
+
+@dataclass(frozen=True)
+class RigView:
+    """A rig. ``state``: may it be asked to move, and if not why; ``holder``: who has it, in words."""
+
+    id: str
+    name: str
+    state: Literal["free", "busy", "held", "blocked", "unusable"]
+    simulated: bool
+    motion: Literal["never", "attended", "watched"]
+    problem: str = ""
+    holder: str | None = None
+    run: str | None = None
+    blocked_by: str | None = None
+    drive: str | None = None
+    profile: str | None = None
+    limits: dict[str, float | None] | None = None
+    last: Summary | None = None
+
+
+@dataclass(frozen=True)
+class ReplayView:
+    """A replay: what it was asked for, and what came of it."""
+
+    name: str
+    asked: dict[str, Any]
+    at: str
+    by: str
+    state: Literal["waiting", "done", "failed"]
+    result: dict[str, Any] | None = None
+    error: Told | None = None
+
+
+@dataclass(frozen=True)
+class RunView:
+    """A run, with everything but its samples. ``result``: as of `tdhil identify --json`; ``files``: to download."""
+
+    id: str
+    rig: str
+    rig_name: str
+    state: State
+    stage: str | None
+    at: str
+    asked: str
+    asked_by: str
+    simulated: bool
+    options: dict[str, Any]
+    history: list[Entered]
+    expected_s: dict[str, float]
+    preflight: list[Check]
+    identity: str
+    safe_action: str
+    confirmation: Confirmation | None
+    stop: Stop
+    error: Told | None
+    exit_code: int | None
+    verdict: str | None
+    result: dict[str, Any] | None
+    files: list[str]
+    replays: list[ReplayView]
+    signed_off: dict[str, Any] | None
+    alive: bool
+
+
+@dataclass(frozen=True)
+class PlanView:
+    """What is planned, and what to expect of it: the document of `tdhil identify --dry-run --json`."""
+
+    rig: str
+    rig_sha256: str
+    plan: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class StoppedView:
+    """A stop of a rig: its runs, and where it has none, what `tdhil stop` saw (exit code 0: at rest)."""
+
+    rig: str
+    runs: list[str]
+    exit_code: int | None = None
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class AuditView:
+    """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold."""
+
+    entries: list[Entry]
+    broken: Broken | None
+
+
+@dataclass(frozen=True)
+class HealthView:
+    """Is it there, and what is it doing?"""
+
+    status: Literal["ok"]
+    version: str
+    live: list[str]
+    rigs: int
+
+
+@dataclass(frozen=True)
+class ErrorView:
+    """What went wrong, as the error tree says it."""
+
+    error: Told
+    holder: str | None = None
+
+
+# -- what is sent ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ConfirmBody:
+    """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it."""
+
+    code: str
+    binding: str | None = None
+
+
+@dataclass(frozen=True)
+class SignOffBody:
+    """Who saw the shaft at rest says so."""
+
+    note: str
+
+
+@dataclass(frozen=True)
+class ReplayBody:
+    """None: as the run had it."""
+
+    model: str | None = None
+    tolerance: float | None = None
+    confidence: float | None = None
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """An empty object will do."""
+
+
+Role = Literal["viewer", "operator", "engineer", "admin"]
+OPTIONS: Final = "Options"
+"""The body of a run that is asked for: an object with the command line's options."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """One road into the service. ``answers``: by HTTP status, a type of above, or a media type for a file."""
+
+    method: Literal["GET", "POST"]
+    path: str
+    name: str
+    summary: str
+    role: Role
+    answers: Mapping[int, Any]
+    body: Any = None
+    errors: tuple[int, ...] = ()
+    query: Mapping[str, str] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+ROUTES: Final = (
+    Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
+    Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
+    Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
+          OPTIONS, (403, 404, 409, 422)),
+    Route("POST", "/rigs/{rig}/runs", "start", "Ask for a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
+          (403, 404, 409, 422), headers={"Idempotency-Key": "the same key gives the same run, and no second one"}),
+    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without one, tdhil stop on its drive", "viewer",
+          {200: StoppedView}, Nothing, (403, 404, 503)),
+    Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
+          query={"rig": "of this rig only", "state": "in this state only", "limit": "at most so many (100)"}),
+    Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
+    Route("POST", "/runs/{run}/confirm", "confirm", "Let it move, with the code shown at the rig", "operator",
+          {200: RunView}, ConfirmBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/stop", "stop", "Have it brake. This is no emergency stop", "viewer", {200: RunView},
+          Nothing, (403, 404, 503)),
+    Route("POST", "/runs/{run}/sign-off", "sign_off", "Take a stop that wasn't confirmed upon oneself", "engineer",
+          {200: RunView}, SignOffBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result stays", "operator",
+          {202: ReplayView}, ReplayBody, (403, 404, 422)),
+    Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
+    Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
+          {200: "application/octet-stream", 206: "application/octet-stream"}, errors=(404,)),
+    Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", {200: "text/html", 206: "text/html"},
+          errors=(404,)),
+    Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made when it is first asked for", "viewer",
+          {200: "application/pdf", 206: "application/pdf"}, errors=(404, 422)),
+    Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
+          {200: "application/json", 206: "application/json"}, errors=(404,)),
+    Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
+          query={"limit": "at most so many lines (200)"}),
+    Route("GET", "/healthz", "health", "Is it there?", "viewer", {200: HealthView}),
+    Route("GET", "/metrics", "metrics", "For Prometheus", "viewer", {200: "text/plain"}),
+    Route("GET", "/openapi.json", "openapi", "This document", "viewer", {200: "application/json"}),
+)
+
+API: Final = "/api/v1"
+
+
+@cache
+def adapter(kind: Any) -> TypeAdapter[Any]:
+    """Pydantic's of a type of above."""
+    return TypeAdapter(kind)
+
+
+def plain(value: Any, kind: Any) -> Any:
+    """For JSON."""
+    return adapter(kind).dump_python(value, mode="json")
+
+
+@cache
+def document() -> dict[str, Any]:
+    """The OpenAPI document."""
+    schemas: dict[str, Any] = {}
+
+    def schema(kind: Any, mode: Literal["validation", "serialization"] = "serialization") -> dict[str, Any]:
+        if kind == OPTIONS:
+            return {"type": "object", "description": "the command line's options, such as "
+                    '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit'}
+        found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
+        schemas.update(found.pop("$defs", {}))
+        if isinstance(kind, type) and found.get("type") == "object":
+            schemas[kind.__name__] = found
+            return {"$ref": f"#/components/schemas/{kind.__name__}"}
+        return found
+
+    error = {"description": "refused", "content": {"application/json": {"schema": schema(ErrorView)}}}
+    paths: dict[str, Any] = {}
+    for route in ROUTES:
+        responses: dict[str, Any] = {}
+        for code, kind in route.answers.items():
+            media, inside = (kind, {}) if isinstance(kind, str) else ("application/json", {"schema": schema(kind)})
+            responses[str(code)] = {"description": route.summary, "content": {media: inside}}
+        responses |= {str(code): error for code in route.errors}
+        parameters = [
+            {"name": part[1:-1], "in": "path", "required": True, "schema": {"type": "string"}}
+            for part in route.path.split("/") if part.startswith("{")
+        ]
+        for where, named in (("query", route.query), ("header", route.headers)):
+            parameters += [{"name": name, "in": where, "description": text, "schema": {"type": "string"}}
+                           for name, text in named.items()]
+        described: dict[str, Any] = {
+            "operationId": route.name, "summary": route.summary, "parameters": parameters, "responses": responses,
+            "x-role": route.role,
+        }
+        if route.body is not None:
+            described["requestBody"] = {"content": {"application/json": {"schema": schema(route.body, "validation")}}}
+        paths.setdefault(f"{API}{route.path}", {})[route.method.lower()] = described
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "tdhil", "version": __version__,
+                 "description": "Runs that identify a moment of inertia. A stop over HTTP is no emergency stop."},
+        "paths": paths,
+        "components": {"schemas": schemas},
+    }

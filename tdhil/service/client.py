@@ -1,0 +1,154 @@
+"""Speaks to a service from Python: ``tdhil.Client("http://127.0.0.1:8420")``. Needs the standard library alone."""
+
+from __future__ import annotations
+
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote, urlencode
+
+from drivers import CommunicationLost
+from tdhil.errors import TdhilError
+
+_API: Final = "/api/v1"
+_ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"})
+
+
+class ServiceError(TdhilError):
+    """What the service said no to: ``kind`` and ``exit_code`` as of its error tree, ``status`` of HTTP.
+
+    ``holder``: who has the rig, where that is why.
+    """
+
+    def __init__(self, status: int, body: Mapping[str, Any]) -> None:
+        told = body.get("error") or {}
+        super().__init__(str(told.get("what", f"HTTP {status}")), where=str(told.get("where", "")),
+                         next_step=str(told.get("next_step", "")))
+        self.status = status
+        self.kind = str(told.get("kind", ""))
+        self.exit_code = told.get("exit_code", 1)
+        self.holder = body.get("holder")
+
+
+class Client:
+    """One service. Answers are the documents of its API (``/api/v1/openapi.json`` describes them).
+
+    Raises ServiceError for what it refuses, and CommunicationLost where it can't be reached.
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8420", *, timeout_s: float = 120.0) -> None:
+        self._url = url.rstrip("/")
+        self._timeout_s = timeout_s
+        # No proxy, and no answer that leads elsewhere: the service is where it is.
+        self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+
+    def rigs(self) -> list[dict[str, Any]]:
+        """The rigs, each with its ``id``, its state and who has it."""
+        found: list[dict[str, Any]] = self._json("GET", "/rigs")
+        return found
+
+    def rig(self, rig: str) -> dict[str, Any]:
+        return self._object("GET", f"/rigs/{quote(rig, safe='')}")
+
+    def plan(self, rig: str, **options: Any) -> dict[str, Any]:
+        """What a run with these options would do, and what to expect of it; nothing is connected to."""
+        return self._object("POST", f"/rigs/{quote(rig, safe='')}/plan", options)
+
+    def start(self, rig: str, *, key: str | None = None, **options: Any) -> dict[str, Any]:
+        """Ask for a run, with the command line's options. ``key``: the same one never begins a second run."""
+        headers = {} if key is None else {"Idempotency-Key": key}
+        return self._object("POST", f"/rigs/{quote(rig, safe='')}/runs", options, headers)
+
+    def runs(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[dict[str, Any]]:
+        """The runs, the newest first."""
+        asked = {name: value for name, value in (("rig", rig), ("state", state), ("limit", limit)) if value is not None}
+        found: list[dict[str, Any]] = self._json("GET", f"/runs?{urlencode(asked)}")
+        return found
+
+    def run(self, run: str) -> dict[str, Any]:
+        return self._object("GET", f"/runs/{quote(run, safe='')}")
+
+    def confirm(self, run: str, code: str, binding: str | None = None) -> dict[str, Any]:
+        """Let it move: with the six digits that are shown at the rig."""
+        return self._object("POST", f"/runs/{quote(run, safe='')}/confirm", {"code": code, "binding": binding})
+
+    def stop(self, run: str) -> dict[str, Any]:
+        """Have the run brake. This is no emergency stop: it needs network, computer, cable and drive."""
+        return self._object("POST", f"/runs/{quote(run, safe='')}/stop", {})
+
+    def stop_rig(self, rig: str) -> dict[str, Any]:
+        """The same for whatever moves the rig; where no run does, ``tdhil stop`` on its drive."""
+        return self._object("POST", f"/rigs/{quote(rig, safe='')}/stop", {})
+
+    def replay(self, run: str, **asked: Any) -> dict[str, Any]:
+        """Identify again with another ``model``, ``tolerance`` or ``confidence``; comes back when it is done."""
+        found = self._object("POST", f"/runs/{quote(run, safe='')}/replays", asked)
+        while found["state"] == "waiting":
+            time.sleep(0.2)
+            found = self._object("GET", f"/runs/{quote(run, safe='')}/replays/{found['name']}")
+        return found
+
+    def wait(
+        self, run: str, *, every_s: float = 0.2, timeout_s: float | None = None,
+        seen: Callable[[dict[str, Any]], None] = lambda run: None,
+    ) -> dict[str, Any]:
+        """The run once it has ended; ``seen`` gets it at every look. Raises TimeoutError; the run goes on then."""
+        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            found = self.run(run)
+            seen(found)
+            if found["state"] in _ENDED:
+                return found
+            if end_s is not None and time.monotonic() > end_s:
+                raise TimeoutError(f"run {run} is {found['state']}")
+            time.sleep(every_s)
+
+    def download(self, run: str, name: str, path: str | Path) -> Path:
+        """``log.mcap``, ``report.html``, ``report.pdf`` or ``result.json`` of a run, as a file that isn't there yet."""
+        target = Path(path)
+        with self._open("GET", f"/runs/{quote(run, safe='')}/{quote(name, safe='')}") as answer, \
+                target.open("xb") as file:
+            while piece := answer.read(2**16):
+                file.write(piece)
+        return target
+
+    def audit(self, limit: int = 200) -> dict[str, Any]:
+        return self._object("GET", f"/audit?limit={limit}")
+
+    def _object(
+        self, method: str, path: str, body: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+    ) -> dict[str, Any]:
+        found: dict[str, Any] = self._json(method, path, body, headers)
+        return found
+
+    def _json(
+        self, method: str, path: str, body: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+    ) -> Any:
+        with self._open(method, path, body, headers) as answer:
+            return json.loads(answer.read())
+
+    def _open(
+        self, method: str, path: str, body: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None
+    ) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(
+            f"{self._url}{_API}{path}", data, {"Content-Type": "application/json", **(headers or {})}, method=method
+        )
+        try:
+            return self._opener.open(request, timeout=self._timeout_s)
+        except urllib.error.HTTPError as error:
+            with error:
+                try:
+                    told = json.loads(error.read())
+                except ValueError:
+                    told = {}
+            raise ServiceError(error.code, told if isinstance(told, dict) else {}) from None
+        except (OSError, ValueError) as error:
+            raise CommunicationLost(
+                f"the service can't be reached ({getattr(error, 'reason', error)})", where=self._url,
+                next_step="Is tdhil serve running there? If a shaft turns, use the hard-wired stop",
+            ) from error

@@ -1,0 +1,196 @@
+"""The process of one run: today's Runner, its log, and a socket for those who confirm, stop or look.
+
+``python -m tdhil.service.run_process FOLDER`` with the run's folder, in which request.json stands. It is a session of
+its own: what becomes of the web doesn't touch it. SIGTERM is a stop here as for `tdhil identify`, the second road
+beside the socket. Nothing that the control loop does waits for a file or a socket: it leaves notes, and a thread
+writes them down.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers import Preflight, PreflightRefused
+from tdhil.service.asking import binding_of, plan_of, read_rig, refuse_changed, run_request
+from tdhil.service.attending import EXPECTED_S, Board, Confirming, ServiceAttendant, Watcher
+from tdhil.service.states import State, Status, Told, end_of, now, way_to
+from tdhil.service.store import Request, Store, read_json, write_json
+from tdhil.service.wire import STOP_FILE, Listener
+
+if TYPE_CHECKING:
+    from tdhil.run import RunOutcome, StopRequest
+
+NICE: Final = 5
+"""Of a simulated run in stepped time, which takes all the processor that it gets."""
+
+
+class RunProcess:
+    """One run from its request to its result; `serve` is the whole of it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder.resolve()
+        self.store = Store(self.folder.parent.parent)
+        self.request: Request = self.store.request(self.folder.name)
+        self.board = Board(self.store, replace(self.store.status(self.request.id), pid=os.getpid(),
+                                               expected_s=EXPECTED_S))
+        self.watcher = Watcher(self.board)
+        self.attendant = ServiceAttendant(self.board, self.watcher, self.folder, self._bind)
+        self._plan: dict[str, Any] = {}
+
+    def serve(self) -> int:
+        """Run it; the exit code, as of `tdhil identify`."""
+        from tdhil.run import StopRequest
+        from tdhil.session import stop_on_signals
+
+        stop = StopRequest()
+        with stop_on_signals(stop), Listener(self.folder, lambda asked: self.answer(asked, stop)):
+            try:
+                if (early := read_json(self.folder / STOP_FILE)) is not None:
+                    self.answer({"do": "stop", "by": early.get("by", "somebody")}, stop)
+                code = self._run(stop)
+            except BaseException as error:
+                code = self._failed(error)
+            self.board.close()
+        return code
+
+    # -- the socket ----------------------------------------------------------------------------------------------
+
+    def answer(self, asked: Mapping[str, Any], stop: StopRequest) -> dict[str, Any]:
+        """One request's. Called in a thread of the socket."""
+        what, who = asked.get("do"), str(asked.get("by", "somebody"))[:80]
+        if what == "stop":
+            stop.ask(signal.SIGTERM)           # first of all; the control loop sees it in its next cycle
+            self.watcher.look_for_the_stop()
+            at = now()
+            self.board.change(lambda one: self._asked_to_stop(one, at, who))
+            return {"status": self.board.status.plain()}
+        if what == "confirm":
+            confirming = self.attendant.confirming
+            if confirming is None:
+                raise PreflightRefused("there is nothing to confirm", where="run",
+                                       next_step="A simulated rig asks nobody; a real one asks after its preflight")
+            confirming.take(str(asked.get("code", "")), asked.get("binding"), who)
+            return {"status": self.board.status.plain()}
+        if what == "code":
+            confirming = self.attendant.confirming
+            waiting = confirming is not None and confirming.confirmed_by is None and confirming.void is None
+            if confirming is None or not waiting:
+                return {"code": None}
+            return {"code": confirming.code, "left_s": confirming.left_s, "binding": confirming.binding}
+        return {"status": self.board.status.plain()}
+
+    @staticmethod
+    def _asked_to_stop(status: Status, at: str, who: str) -> Status:
+        if status.stop.asked is None and not status.ended:
+            status = replace(status, stop=replace(status.stop, asked=at, by=who))
+        return status.to(State.STOPPING, at) if status.state is State.MOVING else status
+
+    # -- the run -------------------------------------------------------------------------------------------------
+
+    def _bind(self, preflight: Preflight) -> Confirming:
+        checks = [[one.name, one.wanted, one.found, one.outcome.value, one.where] for one in preflight.checks]
+        found = {"identity": asdict(preflight.identity), "checks": checks}
+        binding = binding_of(self._asked, self.request.rig_sha256, found, self._plan)
+        path = Path(self.request.rig_file)
+        return Confirming(binding, lambda: refuse_changed(path, self.request.rig_sha256))
+
+    def _run(self, stop: StopRequest) -> int:
+        from tdhil.errors import Interrupted
+        from tdhil.report import has_extra
+        from tdhil.session import RunSession
+
+        os.chdir(self.folder)
+        path = Path(self.request.rig_file)
+        refuse_changed(path, self.request.rig_sha256)
+        rig = read_rig(path)
+        if stop.signum is not None:
+            raise Interrupted(stop.signum, next_step="Nothing has moved")
+        self.board.to(State.PREFLIGHT)
+        self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
+        if asked.peer.stepped:
+            with suppress(OSError):
+                os.nice(NICE)
+        if not asked.peer.embedded:
+            self._plan = plan_of(rig, self.request.options)
+            write_json(self.folder / "plan.json", self._plan)
+        report = has_extra()
+        if stop.signum is not None:
+            raise Interrupted(stop.signum, next_step="Nothing has moved")
+        session = RunSession(asked, self.attendant, report=report)
+        try:
+            outcome = session.move(stop)
+            if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
+                session.abandon()
+                return self._ended(outcome)
+            self.board.to(State.IDENTIFYING)
+            found = session.conclude()
+        except BaseException:
+            session.abandon()
+            raise
+        session.close()
+        write_json(self.folder / "result.json", found.document)
+        if report:
+            self._report(found.document, session.log.recording(complete=True))
+        self._end(State.DONE, int(found.exit_code), verdict=found.document["verdict"])
+        return int(found.exit_code)
+
+    def _report(self, document: Mapping[str, Any], recording: Any) -> None:
+        from tdhil.errors import UsageError
+        from tdhil.report import write_report
+
+        try:
+            write_report(document, recording, Path("report.html"))
+        except (UsageError, OSError) as error:
+            print(f"the report can't be written: {error}", file=sys.stderr)  # noqa: T201
+
+    def _ended(self, outcome: RunOutcome) -> int:
+        from tdhil.errors import ExitCode, exit_code
+        from tdhil.run import not_confirmed
+
+        error: BaseException | None = outcome.cause
+        code = exit_code(error) if error is not None else ExitCode.OK
+        confirmed = None if outcome.stop is None else outcome.stop.confirmed
+        if outcome.stop is not None and not outcome.stop.confirmed:
+            error, code = not_confirmed(outcome.stop), ExitCode.STOP_NOT_CONFIRMED
+        self._end(end_of(code, stop_confirmed=confirmed), int(code), error=None if error is None else Told.of(error))
+        return int(code)
+
+    def _failed(self, error: BaseException) -> int:
+        """Something before or after the motion; the Runner itself never raises."""
+        import traceback
+
+        from tdhil.errors import TdhilError, exit_code
+
+        code = int(exit_code(error))
+        if not isinstance(error, TdhilError):
+            traceback.print_exception(error)
+        state = end_of(code, stop_confirmed=None)
+        self._end(state, code, error=Told.of(error))
+        return code
+
+    def _end(self, state: State, code: int, **known: Any) -> None:
+        at = now()
+
+        def step(status: Status) -> Status:
+            end = state
+            if status.state is State.IDENTIFYING and state in (State.REFUSED, State.STOPPED):
+                end = State.FAILED
+            return way_to(status, end, at, exit_code=code, confirmation=None, **known)
+
+        self.board.change(step)
+
+
+def main(arguments: list[str]) -> int:
+    """The exit code."""
+    return RunProcess(Path(arguments[0])).serve()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

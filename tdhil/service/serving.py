@@ -1,0 +1,156 @@
+"""`tdhil serve`: the web on one port, for as long as somebody lets it run."""
+
+from __future__ import annotations
+
+import ipaddress
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    import uvicorn
+
+NEEDED = ("starlette", "uvicorn", "websockets", "prometheus_client", "jinja2")
+HOST, PORT = "127.0.0.1", 8420
+Say = Callable[[str], None]
+
+
+def require_service() -> None:
+    """Raises UsageError where the extra isn't installed, or the system has no locks and sockets as they are needed."""
+    if sys.platform == "win32":
+        raise UsageError("tdhil serve needs Linux or another POSIX system", next_step="Use tdhil identify here")
+    missing = [name.replace("_", "-") for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise UsageError(f"the service needs {', '.join(missing)}, not installed here",
+                         next_step="Install: pip install 'tdhil[service]'")
+
+
+def require_loopback(host: str) -> None:
+    """Raises UsageError for any other host: there is neither login nor TLS yet."""
+    try:
+        loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = host.lower() == "localhost"
+    if not loopback:
+        raise UsageError(
+            "only this computer itself is served: whoever reaches another address could move a shaft, and there is no"
+            " login and no TLS yet", where=f"--host {host}",
+            next_step="Take 127.0.0.1; from elsewhere, tunnel: ssh -L 8420:127.0.0.1:8420 HOST",
+        )
+
+
+def serve(rigs: Path | None, data: Path, host: str, port: int, say: Say) -> int:
+    """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
+
+    Raises UsageError for what can't be served, and LogError for a folder that can't be written.
+    """
+    require_service()
+    require_loopback(host)
+    if rigs is not None and not rigs.is_dir():
+        raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
+
+    from tdhil.service.asking import Rigs
+    from tdhil.service.store import Audit, Index, Store
+    from tdhil.service.supervisor import Supervisor
+    from tdhil.service.web import LOOPBACK, Web
+
+    store = Store(data.resolve())
+    store.prepare()
+    alone = _alone(store.folder)
+    supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
+    web = Web(supervisor, hosts=LOOPBACK | {host.lower()})
+    listening = _listen(host, port)
+    at = listening.getsockname()[1]
+    shown = f"[{host}]" if ":" in host else host
+    say(f"tdhil serve: http://{shown}:{at}   (runs: {store.folder})")
+    if supervisor.rigs.built_in:
+        say("No rig file is there: two simulated rigs to play with. Nothing real moves.")
+    say("A stop over HTTP is no emergency stop: keep the hard-wired one within reach. Ctrl-C brakes what moves.")
+    try:
+        _uvicorn(web.asgi, listening, supervisor.brake, say)
+    finally:
+        listening.close()
+        alone.close()
+    left = supervisor.live()
+    if left:
+        say(f"NOT at rest, as far as is known: {', '.join(left)}. Use the hard-wired stop.")
+        return int(ExitCode.STOP_NOT_CONFIRMED)
+    return int(ExitCode.OK)
+
+
+def _uvicorn(app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say) -> None:
+    import uvicorn
+
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_ping_interval=10.0,
+        ws_ping_timeout=10.0, timeout_graceful_shutdown=2, lifespan="on", server_header=False, date_header=True,
+        h11_max_incomplete_event_size=32 * 1024,
+    )
+    server = uvicorn.Server(config)
+    former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}
+    object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM brakes before it ends anything
+    try:
+        server.run(sockets=[listening])
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+
+
+def _nothing_captured() -> Any:
+    from contextlib import nullcontext
+
+    return nullcontext()
+
+
+def _ender(server: uvicorn.Server, brake: Callable[[str], bool], say: Say) -> Callable[[int, Any], None]:
+    """Brakes first, in a thread, with the pages still there to show it; then ends."""
+    import threading
+
+    begun = threading.Event()
+
+    def end() -> None:
+        if not brake("service ending"):
+            say("not every run has come to its end in time")
+        server.should_exit = True
+
+    def handler(number: int, frame: Any) -> None:
+        if not begun.is_set():
+            begun.set()
+            threading.Thread(target=end, daemon=True).start()
+
+    return handler
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    found = socket.socket(family, socket.SOCK_STREAM)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((host, port))
+    except (OSError, OverflowError) as error:
+        found.close()
+        raise UsageError(f"can't be listened on ({getattr(error, 'strerror', None) or error})",
+                         where=f"{host}:{port}",
+                         next_step="Is tdhil serve running already? Name another --port") from error
+    found.listen(128)
+    return found
+
+
+def _alone(folder: Path) -> Any:
+    """One service a folder: held as long as it runs. Raises UsageError."""
+    import fcntl
+
+    file = (folder / "service.lock").open("a")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        raise UsageError("another tdhil serve has this folder", where=f"--data {folder}",
+                         next_step="Use that one, or name another folder") from None
+    return file

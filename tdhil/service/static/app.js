@@ -1,0 +1,482 @@
+// The pages of tdhil serve. Everything that comes from elsewhere goes into the page as text, never as markup.
+"use strict";
+(() => {
+  const API = "/api/v1";
+  const SILENT_MS = 2000;      // without an answer for so long a stop counts as not delivered, and values as old
+  const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
+  const STATES = {
+    requested: "asked for", preflight: "looking at the drive", awaiting_confirmation: "waits for the code",
+    moving: "moving", stopping: "stopping", identifying: "identifying", done: "done", refused: "refused",
+    stopped: "stopped, at rest", failed: "failed, at rest", stop_not_confirmed: "STOP NOT CONFIRMED",
+    interrupted: "interrupted",
+  };
+  const byId = (id) => document.getElementById(id);
+
+  /** An element with attributes, and with texts and elements in it. */
+  function el(tag, attributes = {}, ...inside) {
+    const found = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes)) {
+      if (name === "onclick") found.addEventListener("click", value);
+      else if (value === true) found.setAttribute(name, "");
+      else if (value !== null && value !== undefined && value !== false) found.setAttribute(name, value);
+    }
+    found.append(...inside.filter((one) => one !== null && one !== undefined));
+    return found;
+  }
+  const show = (where, ...inside) => where.replaceChildren(...inside.filter((one) => one !== null && one !== undefined));
+
+  class Refused extends Error {}
+
+  async function call(method, path, body, headers = {}, withinMs = 15000) {
+    const abort = new AbortController();
+    const timer = setTimeout(() => abort.abort(), withinMs);
+    try {
+      const answer = await fetch(API + path, {
+        method, signal: abort.signal, headers: body === undefined ? headers : { "Content-Type": "application/json", ...headers },
+        body: body === undefined ? undefined : JSON.stringify(body),
+      });
+      const found = await answer.json();
+      if (!answer.ok) throw new Refused(found.error ? found.error.message : `HTTP ${answer.status}`);
+      return found;
+    } finally {
+      clearTimeout(timer);
+    }
+  }
+
+  function away(text) {
+    const bar = byId("away");
+    bar.hidden = !text;
+    if (bar.textContent !== (text || "")) bar.textContent = text || "";
+  }
+
+  /** Again and again, and grey while nothing comes. */
+  function every(ms, look) {
+    let last = Date.now();
+    const go = async () => {
+      try {
+        await look();
+        last = Date.now();
+      } catch (error) {
+        if (error instanceof Refused) away(error.message);
+      }
+      setTimeout(go, ms);
+    };
+    go();
+    setInterval(() => {
+      const silent = Date.now() - last > ms + SILENT_MS;
+      document.body.classList.toggle("stale", silent);
+      if (silent) away("No answer from tdhil serve: what you see is old. A run that moves goes on, guarded; the hard-wired stop works.");
+      else if (byId("away").textContent.startsWith("No answer")) away("");
+    }, 500);
+  }
+
+  const number = (value, digits = 4) => (value === null || value === undefined ? "–" : Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m)));
+  function inertia(one) {
+    if (!one || one.inertia_kg_m2 === null || one.inertia_kg_m2 === undefined) return null;
+    return `${number(one.inertia_kg_m2)} (${number(one.low_kg_m2)} to ${number(one.high_kg_m2)}) kg·m²`;
+  }
+  function ofResult(result) {
+    const J = result && result.inertia_kg_m2;
+    return J ? `${number(J.value)} (${number(J.low_total)} to ${number(J.high_total)}) kg·m²` : null;
+  }
+  const percent = (share) => (share === null || share === undefined ? "" : `±${(100 * share).toPrecision(2)} %`);
+  const clock = (iso) => (iso ? new Date(iso).toLocaleTimeString(undefined, { hour12: false }) + "." + String(new Date(iso).getMilliseconds()).padStart(3, "0") : "");
+  const when = (iso) => (iso ? new Date(iso).toLocaleString(undefined, { hour12: false }) : "");
+  function span(seconds) {
+    const whole = Math.max(0, Math.round(seconds));
+    return whole < 90 ? `${whole} s` : `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s`;
+  }
+  const badge = (simulated) => (simulated ? el("span", { class: "badge" }, "SIMULATED") : null);
+
+  // -- rigs
+
+  function rigCard(rig) {
+    const said = {
+      free: rig.simulated || rig.motion === "attended" ? "free" : `free; not moved from here (service.motion: ${rig.motion})`,
+      busy: "a run has it", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
+    }[rig.state];
+    const mayStart = rig.state === "free" && (rig.simulated || rig.motion === "attended");
+    return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
+      el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
+      el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
+      rig.last ? el("p", {}, el("span", { class: "figure" }, inertia(rig.last)), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, "no result yet"),
+      el("p", { class: "row" },
+        mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
+        rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
+        rig.run ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
+        rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, "Sign off") : null));
+  }
+
+  async function stopRig(rig) {
+    const late = setTimeout(() => away(`Stop of ${rig.name} NOT DELIVERED: use the hard-wired stop`), SILENT_MS);
+    try {
+      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, 10000);
+      clearTimeout(late);
+      if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
+    } catch (error) {
+      clearTimeout(late);
+      away(`Stop of ${rig.name} NOT DELIVERED: use the hard-wired stop`);
+    }
+  }
+
+  function rigsPage() {
+    let shown = "";
+    every(2000, async () => {
+      const rigs = await call("GET", "/rigs");
+      const now = JSON.stringify(rigs);
+      if (now !== shown) show(byId("rigs"), ...rigs.map(rigCard));
+      shown = now;
+    });
+  }
+
+  // -- start
+
+  function asked(form) {
+    const found = {};
+    const text = (name) => (form.elements[name] ? form.elements[name].value.trim() : "");
+    if (text("tolerance")) found.tolerance = `${text("tolerance").replace(/\s*%$/, "")}%`;
+    if (text("max_time")) found.max_time = `${text("max_time").replace(/\s*min$/, "")}min`;
+    if (text("seed")) found.seed = Number(text("seed"));
+    for (const name of ["excitation", "operator", "note"]) if (text(name)) found[name] = text(name);
+    for (const name of ["fault", "accept_unverified"]) if (text(name)) found[name] = text(name).split(/[\s,]+/);
+    for (const name of ["real_time", "accept_speed_unit", "reset_fault"]) if (form.elements[name] && form.elements[name].checked) found[name] = true;
+    return found;
+  }
+
+  function planTable(plan) {
+    const half = plan.expected_half_width;
+    const rows = [
+      ["expected interval of J (repeatability)", half === null ? "not predicted" : percent(half)],
+      ["time", `${span(plan.duration_s + 90)}, of it ${span(plan.duration_s)} of the motion that counts`],
+      ["motion", `${plan.excitation} in ${plan.mode} mode`],
+      ["speed, rad/s", `${number(plan.speed_rad_s.min, 3)} to ${number(plan.speed_rad_s.max, 3)} (limits ${number(plan.limits.speed_min_rad_s, 3)} to ${number(plan.limits.speed_max_rad_s, 3)})`],
+      ["torque, N·m", `${number(plan.torque_nm.min, 3)} to ${number(plan.torque_nm.max, 3)} (limit ±${number(plan.limits.torque_nm, 3)})`],
+    ];
+    const advice = plan.stopping && !plan.stopping.reachable ? el("p", { class: "alarm" }, `±${number(100 * plan.stopping.tolerance, 3)} % is not to be expected: ${plan.stopping.advice}`) : null;
+    return [
+      el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text))))),
+      advice || "",
+      el("p", { class: "dim" }, "Assumed for now: a run measures friction, inertia and noise first, and plans again from that."),
+    ];
+  }
+
+  function startPage() {
+    const rig = document.body.dataset.rig;
+    const form = byId("ask");
+    if (!form) return;
+    let key = null, keyFor = "";
+    every(3000, async () => {
+      const found = await call("GET", `/rigs/${encodeURIComponent(rig)}`);
+      const why = { busy: "A run has this rig.", held: `Held by ${found.holder}.`, blocked: "Blocked until a stop that was not confirmed is signed off." }[found.state];
+      byId("rig-state").textContent = why || "";
+    });
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const wanted = event.submitter && event.submitter.value === "plan" ? "plan" : "start";
+      const buttons = [...form.querySelectorAll("button")];
+      const options = asked(form);
+      buttons.forEach((one) => { one.disabled = true; });
+      show(byId("said"), el("p", { class: "dim" }, wanted === "plan" ? "Planning …" : "Asking …"));
+      try {
+        if (wanted === "plan") {
+          const found = await call("POST", `/rigs/${encodeURIComponent(rig)}/plan`, options, {}, 60000);
+          show(byId("plan").lastElementChild, ...planTable(found.plan));
+          byId("plan").hidden = false;
+          show(byId("said"));
+        } else {
+          const text = JSON.stringify(options);         // the same question twice is the same run
+          if (key === null || keyFor !== text) { key = crypto.randomUUID(); keyFor = text; }
+          const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, options, { "Idempotency-Key": key });
+          location.assign(`/runs/${run.id}/live`);
+        }
+      } catch (error) {
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      } finally {
+        buttons.forEach((one) => { one.disabled = false; });
+      }
+    });
+  }
+
+  // -- live
+
+  function plotOf(where, colour, limitsOf) {
+    const style = () => getComputedStyle(document.documentElement);
+    let plot = null, limits = null, data = [[], []];
+    const draw = () => {
+      if (plot) plot.destroy();
+      const ink = style().getPropertyValue("--dim").trim(), line = style().getPropertyValue("--line").trim();
+      const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
+      plot = new uPlot({
+        width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
+        scales: { x: { time: false }, y: { range: (self, low, high) => {
+          const all = [low, high, ...(limits ? limitsOf(limits).filter((one) => one !== null) : [])].filter((one) => Number.isFinite(one));
+          const from = Math.min(0, ...all), to = Math.max(...all, from + 1e-3), pad = 0.06 * (to - from);
+          return [from - pad, to + pad];
+        } } },
+        axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
+        series: [{}, { stroke: style().getPropertyValue(colour).trim(), width: 1.5, points: { show: false } }],
+        hooks: { draw: [(self) => {
+          if (!limits) return;
+          const c = self.ctx;
+          c.save();
+          c.strokeStyle = style().getPropertyValue("--limit").trim();
+          c.lineWidth = 1.5 * devicePixelRatio;
+          c.setLineDash([6 * devicePixelRatio, 4 * devicePixelRatio]);
+          for (const value of limitsOf(limits)) {
+            if (value === null) continue;
+            const y = self.valToPos(value, "y", true);
+            c.beginPath(); c.moveTo(self.bbox.left, y); c.lineTo(self.bbox.left + self.bbox.width, y); c.stroke();
+          }
+          c.restore();
+        }] },
+      }, data, where);
+    };
+    draw();
+    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 190 })).observe(where);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+    return { set: (t, y) => { data = [t, y]; plot.setData(data); }, limit: (found) => { limits = found; plot.redraw(); } };
+  }
+
+  function livePage() {
+    const run = document.body.dataset.run;
+    const samples = [[], [], []];
+    let status = null, limits = null, message = 0, age = null, timeS = null, dirty = false, asking = null, stopAnswered = null;
+    const speed = plotOf(byId("plot-speed"), "--speed", (one) => [one.speed_min_rad_s, one.speed_max_rad_s]);
+    const torque = plotOf(byId("plot-torque"), "--torque", (one) => [-one.torque_nm, one.torque_nm]);
+
+    function take(found) {
+      message = Date.now();
+      age = found.age_s;
+      timeS = found.time_s;
+      if (found.type === "hello") samples.forEach((one) => { one.length = 0; });
+      if (found.type === "hello") { byId("events").replaceChildren(); byId("stages").dataset.done = ""; done = {}; }
+      if (found.samples) { found.samples.forEach((column, k) => { for (const one of column) samples[k].push(one); }); dirty = true; }
+      for (const one of found.events || []) event(one);
+      for (const one of found.stages || []) done[one.name] = one;
+      if (found.limits) { limits = found.limits; speed.limit(limits); torque.limit(limits); }
+      if (found.status) { status = found.status; state(); }
+      if (found.stages || found.status) stages();
+    }
+    let done = {};
+
+    function event(one) {
+      const list = byId("events");
+      if (one.kind === "preflight") return;
+      list.prepend(el("li", {}, `${one.time_s === null ? "" : one.time_s.toFixed(1) + " s "}${one.kind}: ${one.text}`));
+      while (list.children.length > 200) list.lastElementChild.remove();
+    }
+
+    function stages() {
+      if (!status) return;
+      const names = Object.keys((status && status.expected_s) || {});
+      show(byId("stages"), ...names.map((name) => {
+        const one = done[name];
+        const current = status.state === "moving" && status.stage === name;
+        const text = one ? `${{ ok: "✓", skipped: "–", aborted: "✗" }[one.outcome] || "~"} ${name}, ${span(one.end_s - one.start_s)}${one.outcome === "ok" ? "" : `, ${one.outcome}`}` : `${current ? "▸" : "·"} ${name}, about ${span(status.expected_s[name])}`;
+        return el("li", current ? { "aria-current": "step" } : {}, text);
+      }));
+    }
+
+    function leftS() {
+      if (!status || status.state !== "moving") return null;
+      const began = Math.max(0, ...Object.values(done).map((one) => one.end_s));
+      let left = 0, after = false;
+      for (const [name, expected] of Object.entries(status.expected_s)) {
+        if (name === status.stage) { after = true; left += Math.max(0, expected - Math.max(0, (timeS ?? began) - began)); }
+        else if (after && !done[name]) left += expected;
+      }
+      return left;
+    }
+
+    function state() {
+      const error = status.error ? `: ${status.error.message}` : "";
+      byId("state").textContent = `${STATES[status.state] || status.state}${status.stage ? `: ${status.stage}` : ""}${error}`;
+      byId("state").className = status.state === "stop_not_confirmed" ? "alarm" : "";
+      const over = ENDED.includes(status.state);
+      byId("ended").hidden = !over;
+      byId("stop").disabled = over;
+      const confirm = status.state === "awaiting_confirmation" && status.confirmation;
+      byId("confirm").hidden = !confirm;
+      if (confirm) byId("confirm-text").textContent = status.confirmation.text;
+      stopTimes();
+    }
+
+    function stopTimes() {
+      const stop = (status && status.stop) || {};
+      const steps = [];
+      if (asking && !stop.asked) steps.push(el("li", {}, "asking …"));
+      if (stop.asked) steps.push(el("li", {}, `asked ${clock(stop.asked)}`));
+      if (stop.asked && stop.seen) steps.push(el("li", {}, `→ seen by the drive ${clock(stop.seen)}`));
+      if (stop.at_rest) steps.push(el("li", {}, `${stop.asked ? "→ " : ""}at rest ${clock(stop.at_rest)}`));
+      if (stop.confirmed === false) steps.push(el("li", { class: "alarm" }, "NOT seen at rest: use the hard-wired stop"));
+      show(byId("stop-times"), ...steps);
+    }
+
+    byId("stop").addEventListener("click", async () => {
+      asking = Date.now();
+      stopAnswered = false;
+      byId("undelivered").hidden = true;
+      stopTimes();
+      const late = setTimeout(() => { if (!stopAnswered) byId("undelivered").hidden = false; }, SILENT_MS);
+      try {
+        const found = await call("POST", `/runs/${run}/stop`, {}, {}, 10000);
+        stopAnswered = true;
+        byId("undelivered").hidden = true;
+        if (status) { status = { ...status, stop: found.stop, state: found.state, stage: found.stage }; state(); }
+      } catch (error) {
+        byId("undelivered").hidden = false;
+      } finally {
+        clearTimeout(late);
+        asking = null;
+      }
+    });
+
+    byId("confirm-form").addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const field = event.target.elements.code, said = byId("confirm-said");
+      said.hidden = true;
+      try {
+        await call("POST", `/runs/${run}/confirm`, { code: field.value.replace(/\s/g, ""), binding: status.confirmation.binding });
+      } catch (error) {
+        said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+        said.hidden = false;
+      }
+      field.value = "";
+    });
+
+    function connect() {
+      const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${API}/live/${run}`);
+      socket.addEventListener("message", (event) => take(JSON.parse(event.data)));
+      socket.addEventListener("close", () => setTimeout(connect, 700));
+    }
+    connect();
+
+    setInterval(() => {
+      const now = Date.now(), silent = message === 0 || now - message > SILENT_MS;
+      const running = status && !ENDED.includes(status.state);
+      const real = age === null ? null : age + (now - message) / 1000;
+      const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
+      document.body.classList.toggle("stale", Boolean(old && (running || silent)));
+      if (silent && message) away("No connection to tdhil serve: what you see is old. The run goes on, guarded; the hard-wired stop works.");
+      else if (!silent) away("");
+      byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${real.toFixed(1)} s` : span(real)) : "ended";
+      const left = leftS();
+      byId("left").textContent = left === null ? "" : `· about ${span(left)} left`;
+      if (status && status.confirmation && !byId("confirm").hidden) {
+        const leftMs = new Date(status.confirmation.expires) - now;
+        byId("confirm-left").textContent = leftMs > 0 ? `${Math.ceil(leftMs / 1000)} s left` : "the code is void";
+      }
+      if (dirty) {
+        dirty = false;
+        speed.set(samples[0], samples[1]);
+        torque.set(samples[0], samples[2]);
+        const last = samples[0].length - 1;
+        byId("speed").textContent = last < 0 || samples[1][last] === null ? "–" : samples[1][last].toFixed(2);
+        byId("torque").textContent = last < 0 || samples[2][last] === null ? "–" : samples[2][last].toFixed(0);
+      }
+    }, 150);
+  }
+
+  // -- one run
+
+  function resultOf(run) {
+    const result = run.result;
+    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
+    if (run.error) parts.push(el("p", { class: "alarm" }, run.error.message));
+    if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
+    if (!result) return parts;
+    const rows = [["verdict", result.verdict]];
+    const J = result.inertia_kg_m2;
+    const estimate = (one, unit) => (one ? `${number(one.value)} (${number(one.low)} to ${number(one.high)}) ${unit}` : null);
+    if (J) rows.push(["J, 95 % interval to quote", `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${number(J.value)} (${number(J.low)} to ${number(J.high)}) kg·m²  ${percent(J.repeatability_rel)}`]);
+    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of speed", "speed_lag_s", "s"], ["lag of torque", "torque_lag_s", "s"]]) {
+      const text = estimate(result[key], unit);
+      if (text) rows.push([name, text]);
+    }
+    if (result.model) rows.push(["model", result.model]);
+    for (const one of result.second_opinions || []) {
+      const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
+      rows.push([`second opinion, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
+    }
+    const card = el("div", { class: "card" },
+      J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),
+      el("div", { class: "scroll" }, el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
+      el("p", {}, result.reason || ""), result.advice ? el("p", {}, result.advice) : null);
+    parts.push(card);
+    for (const one of result.warnings || []) parts.push(el("p", { class: "alarm" }, one));
+    if ((result.budget || []).length) {
+      parts.push(el("h2", {}, "What makes it unsure"), el("div", { class: "scroll" }, el("table", {},
+        el("tbody", {}, ...result.budget.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source), el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`), el("td", { class: "dim" }, one.note)))))));
+    }
+    return parts;
+  }
+
+  function runPage() {
+    const id = document.body.dataset.run;
+    let shown = "", files = null;
+    every(1500, async () => {
+      const run = await call("GET", `/runs/${id}`);
+      if (files !== null && files !== run.files.join() + run.state) location.reload();
+      files = run.files.join() + run.state;
+      const now = JSON.stringify(run);
+      if (now === shown) return;
+      shown = now;
+      show(byId("result"), ...resultOf(run));
+      byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
+      const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
+      show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
+        el("th", { scope: "row" }, one.first ? "the run itself" : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || "as the run"),
+        el("td", {}, one.state === "waiting" ? "…" : one.error ? one.error.message : one.result.verdict),
+        el("td", {}, ofResult(one.result) || "–"),
+        el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
+    });
+    const replay = byId("replay");
+    replay.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const said = byId("replay-said"), body = {};
+      said.hidden = true;
+      if (replay.elements.model.value) body.model = replay.elements.model.value;
+      if (replay.elements.tolerance.value.trim()) body.tolerance = Number(replay.elements.tolerance.value) / 100;
+      try {
+        await call("POST", `/runs/${id}/replays`, body);
+      } catch (error) {
+        said.textContent = error.message;
+        said.hidden = false;
+      }
+    });
+    const sign = byId("sign");
+    if (sign) sign.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      try {
+        await call("POST", `/runs/${id}/sign-off`, { note: sign.elements.note.value });
+        location.reload();
+      } catch (error) {
+        away(error.message);
+      }
+    });
+  }
+
+  // -- lists
+
+  function runsPage() {
+    every(3000, async () => {
+      const runs = await call("GET", "/runs");
+      show(byId("runs"), ...(runs.length ? runs.map((one) => el("tr", {},
+        el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || ""),
+        el("td", {}, STATES[one.state] || one.state), el("td", {}, inertia(one) || "–"), el("td", {}, one.verdict || ""))) : [el("tr", {}, el("td", { colspan: 5, class: "dim" }, "no run yet"))]));
+    });
+  }
+
+  function auditPage() {
+    every(5000, async () => {
+      const found = await call("GET", "/audit");
+      byId("chain").className = found.broken ? "alarm" : "dim";
+      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : "The chain of all lines holds.";
+      show(byId("entries"), ...found.entries.map((one) => el("tr", {}, el("th", { scope: "row" }, when(one.at)), el("td", {}, one.who), el("td", {}, one.what), el("td", {}, one.rig || ""),
+        el("td", {}, one.run ? el("a", { href: `/runs/${one.run}` }, one.run) : ""), el("td", {}, Object.keys(one.details).length ? JSON.stringify(one.details) : ""))));
+    });
+  }
+
+  const pages = { rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, audit: auditPage };
+  (pages[document.body.dataset.page] || (() => {}))();
+})();

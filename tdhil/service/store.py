@@ -1,0 +1,395 @@
+"""The service's memory, on files: they are the truth. The index beside them can be deleted, and is made again.
+
+::
+
+    runs/<id>/request.json, state.json, confirm.json, signed_off.json, result.json, run.mcap, report.html, replays/
+    audit/<year>-<month>.jsonl, audit/head.json
+    index.sqlite
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import secrets
+import sqlite3
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from tdhil.errors import LogError
+from tdhil.service.states import NotThere, State, Status, now
+
+ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
+"""Of a run: date, time (UTC), and what keeps two of one second apart."""
+_FILE_LIMIT: Final = 16 * 2**20
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """The file has its old content or the new, also after a loss of power. Raises OSError."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
+    try:
+        with beside.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def write_json(path: Path, plain: Mapping[str, Any]) -> None:
+    """The same, of a JSON object."""
+    write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The object in the file; None where there is none that can be read."""
+    with suppress(OSError, ValueError, RecursionError):
+        if path.stat().st_size <= _FILE_LIMIT:
+            found = json.loads(path.read_bytes())
+            return found if isinstance(found, dict) else None
+    return None
+
+
+def _sync_folder(folder: Path) -> None:
+    with suppress(OSError):                # not every file system takes it
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for; request.json. ``options`` as they came, ``motion`` as the rig has it."""
+
+    id: str
+    rig: str
+    rig_file: str
+    rig_sha256: str
+    options: Mapping[str, Any]
+    asked_by: str
+    asked: str
+    simulated: bool
+    motion: str
+    idempotency_key: str | None = None
+
+    @staticmethod
+    def of_plain(plain: Mapping[str, Any]) -> Request:
+        return Request(**plain)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A line of the list of runs."""
+
+    id: str
+    rig: str
+    state: str
+    asked: str
+    asked_by: str
+    ended: str | None = None
+    simulated: bool = True
+    verdict: str | None = None
+    inertia_kg_m2: float | None = None
+    low_kg_m2: float | None = None         # the interval to quote, torque scale included
+    high_kg_m2: float | None = None
+    repeatability_rel: float | None = None
+    exit_code: int | None = None
+
+
+def summary_of(request: Request, status: Status, result: Mapping[str, Any] | None) -> Summary:
+    """Of what the files say."""
+    inertia = (result or {}).get("inertia_kg_m2") or {}
+    return Summary(
+        request.id, request.rig, status.state.value, request.asked, request.asked_by,
+        status.at if status.ended else None,
+        request.simulated if status.simulated is None else status.simulated,
+        (result or {}).get("verdict"), inertia.get("value"), inertia.get("low_total"), inertia.get("high_total"),
+        inertia.get("repeatability_rel"), status.exit_code,
+    )
+
+
+class Store:
+    """The folder of one service. Its methods are for any thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.runs = folder / "runs"
+        self._lock = threading.Lock()
+
+    def prepare(self) -> None:
+        """Make the folders. Raises LogError where they can't be written."""
+        try:
+            for path in (self.runs, self.folder / "audit"):
+                path.mkdir(parents=True, exist_ok=True, mode=0o750)
+        except OSError as error:
+            raise LogError(f"can't be made ({error.strerror or error})", where=str(self.folder),
+                           next_step="Name a folder for the runs with --data") from error
+
+    def new_id(self) -> str:
+        """An id, and its folder."""
+        while True:
+            found = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
+            with suppress(FileExistsError):
+                (self.runs / found).mkdir(mode=0o750)
+                return found
+
+    def place(self, run: str) -> Path:
+        """The run's folder. Raises NotThere; a name that is no id names no folder."""
+        path = self.runs / run if ID.fullmatch(run) else None
+        if path is None or not path.is_dir():
+            raise NotThere("there is no such run", where=f"run {run[:40]}", next_step="See the list of runs")
+        return path
+
+    def ids(self) -> list[str]:
+        """All runs, the newest first."""
+        with suppress(OSError):
+            return sorted((one.name for one in self.runs.iterdir() if ID.fullmatch(one.name)), reverse=True)
+        return []
+
+    def request(self, run: str) -> Request:
+        """Raises NotThere where the run never got as far."""
+        plain = read_json(self.place(run) / "request.json")
+        try:
+            return Request.of_plain(plain or {})
+        except TypeError:
+            raise NotThere("the run has no request", where=f"run {run}") from None
+
+    def status(self, run: str) -> Status:
+        """As its file has it; that of a file that can't be read is `interrupted`."""
+        plain = read_json(self.place(run) / "state.json")
+        try:
+            return Status.of_plain(plain or {})
+        except (TypeError, ValueError, KeyError):
+            request = self.request(run)
+            return Status.begun(run, request.rig, request.asked).to(State.INTERRUPTED, request.asked)
+
+    def result(self, run: str) -> dict[str, Any] | None:
+        return read_json(self.place(run) / "result.json")
+
+    def summary(self, run: str) -> Summary:
+        return summary_of(self.request(run), self.status(run), self.result(run))
+
+    def summaries(self) -> Iterator[Summary]:
+        """Of every run that has a request, from the files."""
+        for run in self.ids():
+            with suppress(NotThere):
+                yield self.summary(run)
+
+    def begin(self, request: Request) -> Status:
+        """Write down what was asked for. Raises OSError."""
+        status = Status.begun(request.id, request.rig, request.asked)
+        write_json(self.runs / request.id / "request.json", asdict(request))
+        self.save(status)
+        return status
+
+    def save(self, status: Status) -> None:
+        """Raises OSError."""
+        write_json(self.runs / status.id / "state.json", status.plain())
+
+    def signed_off(self, run: str) -> dict[str, Any] | None:
+        """Who took a stop that wasn't confirmed upon himself."""
+        return read_json(self.place(run) / "signed_off.json")
+
+    def sign_off(self, run: str, who: str, note: str) -> None:
+        write_json(self.place(run) / "signed_off.json", {"by": who, "at": now(), "note": note})
+
+    def replays(self, run: str) -> list[tuple[str, dict[str, Any]]]:
+        """(name, document) of each, in the order in which they were made."""
+        folder = self.place(run) / "replays"
+        found = [(path.stem, read_json(path)) for path in sorted(folder.glob("[0-9]*.json"))]
+        return [(name, plain) for name, plain in found if plain is not None]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Who asked, confirmed, stopped, downloaded, when. Each line bears the hash of the one before, and its own.
+
+
+FIRST: Final = "0" * 64
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line. ``details`` is plain data."""
+
+    number: int
+    at: str
+    who: str
+    what: str
+    run: str | None
+    rig: str | None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    before: str = FIRST
+    hash: str = ""
+
+    def hashed(self) -> Entry:
+        plain = {name: value for name, value in asdict(self).items() if name != "hash"}
+        found = hashlib.sha256(json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()).hexdigest()
+        return Entry(**{**plain, "hash": found})
+
+
+@dataclass(frozen=True)
+class Broken:
+    """Where the chain doesn't hold: the file, its line (from 1), and why."""
+
+    file: str
+    line: int
+    why: str
+
+
+class Audit:
+    """The chain of one service. Only one process writes it: the web."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._last: tuple[int, str] | None = None
+
+    def note(
+        self, who: str, what: str, *, run: str | None = None, rig: str | None = None, **details: Any
+    ) -> None:
+        """Add a line, on the disk when this returns. Raises OSError."""
+        with self._lock:
+            number, before = self._last or self._end()
+            at = now()
+            entry = Entry(number + 1, at, who[:80], what, run, rig, details, before).hashed()
+            path = self._folder / f"{at[:7]}.jsonl"
+            with path.open("ab") as file:
+                file.write(json.dumps(asdict(entry), ensure_ascii=False).encode() + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+            self._last = (entry.number, entry.hash)
+            write_json(self._folder / "head.json", {"number": entry.number, "hash": entry.hash})
+
+    def entries(self) -> Iterator[Entry]:
+        """All that can be read, in order."""
+        for _, _, entry in self._lines():
+            if isinstance(entry, Entry):
+                yield entry
+
+    def verify(self) -> Broken | None:
+        """The first place where a line was changed, taken out or put in; None where the chain holds."""
+        number, before, at = 0, FIRST, ("", 0)
+        for file, line, entry in self._lines():
+            if isinstance(entry, str):
+                return Broken(file, line, entry)
+            if entry.number != number + 1 or entry.before != before:
+                return Broken(file, line, "it doesn't follow the line before")
+            if entry.hashed().hash != entry.hash:
+                return Broken(file, line, "it was changed after it was written")
+            number, before, at = entry.number, entry.hash, (file, line)
+        head = read_json(self._folder / "head.json")
+        told = (head or {}).get("number", 0)
+        if told == number - 1 or (told, (head or {}).get("hash", FIRST)) == (number, before):
+            return None        # a killed process may leave a line whose head wasn't written; never a head without it
+        return Broken(*at, f"the chain ends with line {number}, and its head says {told}")
+
+    def _end(self) -> tuple[int, str]:
+        last = (0, FIRST)
+        for entry in self.entries():
+            last = (entry.number, entry.hash)
+        return last
+
+    def _lines(self) -> Iterator[tuple[str, int, Entry | str]]:
+        for path in sorted(self._folder.glob("????-??.jsonl")):
+            with path.open("rb") as file:
+                for line, text in enumerate(file, start=1):
+                    yield path.name, line, _entry(text)
+
+
+def _entry(text: bytes) -> Entry | str:
+    try:
+        plain = json.loads(text)
+        if text != json.dumps(plain, ensure_ascii=False).encode() + b"\n":
+            return "it was changed after it was written"
+        return Entry(**plain)
+    except (ValueError, TypeError, RecursionError):
+        return "it can't be read"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The index: for lists and filters, over thousands of runs. Nothing waits for it that has to do with a shaft.
+
+
+_COLUMNS: Final = tuple(Summary.__dataclass_fields__)
+_VERSION: Final = 1
+
+
+class Index:
+    """index.sqlite; with a rollback journal, since files beside it may be lost when it is copied. For any thread."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._path = store.folder / "index.sqlite"
+        self._lock = threading.Lock()
+
+    def put(self, summary: Summary) -> None:
+        """Raises sqlite3.Error where it is locked or the disk is full: the files have it all the same."""
+        with self._lock, closing(self._open()) as base, base:
+            self._put(base, summary)
+
+    def find(self, *, rig: str | None = None, state: str | None = None, limit: int = 100) -> list[Summary]:
+        """The newest first. Raises sqlite3.Error."""
+        where = [f"{name} = ?" for name, value in (("rig", rig), ("state", state)) if value is not None]
+        values = [value for value in (rig, state) if value is not None]
+        clause = f"where {' and '.join(where)}" if where else ""
+        with self._lock, closing(self._open()) as base:
+            rows = base.execute(
+                f"select {', '.join(_COLUMNS)} from runs {clause} order by id desc limit ?", (*values, limit)
+            ).fetchall()
+        return [Summary(**{**dict(zip(_COLUMNS, row, strict=True)), "simulated": bool(row[6])}) for row in rows]
+
+    def rebuild(self) -> int:
+        """Make it again from the files; how many runs are in it."""
+        with self._lock:
+            self._path.unlink(missing_ok=True)
+            with closing(self._open(filled=False)) as base, base:
+                return self._fill(base)
+
+    def _open(self, *, filled: bool = True) -> sqlite3.Connection:
+        new = not self._path.exists()
+        base = sqlite3.connect(self._path, timeout=2.0)
+        try:
+            base.execute("pragma journal_mode = delete")
+            base.execute("pragma synchronous = full")
+            (version,) = base.execute("pragma user_version").fetchone()
+            if new or version != _VERSION:
+                with base:
+                    base.execute("drop table if exists runs")
+                    base.execute(f"create table runs (id text primary key, {', '.join(_COLUMNS[1:])})")
+                    base.execute("create index by_rig on runs (rig, id)")
+                    base.execute(f"pragma user_version = {_VERSION}")
+                    if filled:
+                        self._fill(base)
+        except BaseException:
+            base.close()
+            raise
+        return base
+
+    def _fill(self, base: sqlite3.Connection) -> int:
+        found = list(self._store.summaries())
+        for summary in found:
+            self._put(base, summary)
+        return len(found)
+
+    @staticmethod
+    def _put(base: sqlite3.Connection, summary: Summary) -> None:
+        plain = asdict(summary)
+        base.execute(
+            f"insert or replace into runs ({', '.join(_COLUMNS)}) values ({', '.join('?' * len(_COLUMNS))})",
+            tuple(plain[name] for name in _COLUMNS),
+        )

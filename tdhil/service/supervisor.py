@@ -1,0 +1,379 @@
+"""Holds the runs of one service: begins each as a process, finds them again, and sees to those that died.
+
+It opens no drive's bus. What it knows of a run stands in the run's folder; whether one lives, its lock says. So a web
+that was killed finds everything again, and nothing moves by that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from drivers import CommunicationLost
+from tdhil.errors import ExitCode
+from tdhil.service.asking import RigFile, Rigs, options_of, require_motion
+from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, blocking, now, way_to
+from tdhil.service.store import Audit, Index, Request, Store, write_json
+from tdhil.service.wire import STOP_FILE, Refused, ask, lives, signal_stop, take_life
+from tdhil.session import Holder, holder_of
+
+LOOK_S: Final = 0.2
+"""So often it is looked whether a run still lives."""
+STOP_S: Final = 60.0
+"""What `tdhil stop` may take for a shaft that turns on."""
+KEYS: Final = 500
+"""So many runs back an Idempotency-Key is known."""
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A run that was asked for. ``new``: it was not asked for before with the same key."""
+
+    request: Request
+    new: bool
+
+
+class Supervisor:
+    """For any thread. ``say``: a line on the terminal of `tdhil serve`."""
+
+    def __init__(
+        self, store: Store, rigs: Rigs, audit: Audit, index: Index, *, say: Say = lambda text: None,
+        command: Callable[[Path], list[str]] | None = None,
+    ) -> None:
+        self.store, self.rigs, self.audit, self.index = store, rigs, audit, index
+        self._say = say
+        self._command = command or (lambda folder: [sys.executable, "-m", "tdhil.service.run_process", str(folder)])
+        self._asking = threading.Lock()
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._live: dict[str, str | None] = {}         # run: the code that was shown
+        self._lost: set[str] = set()
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._notes: list[threading.Thread] = []
+
+    # -- begin and end of the service ----------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Find the runs that live, see to those that don't any more, and go on looking."""
+        for run in self.store.ids():
+            with suppress(Exception):
+                if not self.store.status(run).ended:
+                    self._live[run] = None
+        self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Look no more. Runs go on."""
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join(5.0)
+        for thread in self._notes:
+            thread.join(5.0)
+
+    def brake(self, who: str, within_s: float = STOP_S) -> bool:
+        """Ask all runs to stop, and wait until they have ended; have they?"""
+        for run in self.live():
+            with suppress(Exception):
+                self.stop(run, who)
+        end_s = time.monotonic() + within_s
+        while self.live() and time.monotonic() < end_s:
+            time.sleep(LOOK_S)
+        return not self.live()
+
+    # -- what is asked for ---------------------------------------------------------------------------------------
+
+    def live(self) -> list[str]:
+        """The runs that haven't ended."""
+        return list(self._live)
+
+    def run_of(self, rig_id: str) -> str | None:
+        """The run that has the rig."""
+        for run in self.live():
+            with suppress(NotThere):
+                if self.store.request(run).rig == rig_id and not self.store.status(run).ended:
+                    return run
+        return None
+
+    def start_run(self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None) -> Asked:
+        """Begin a run. Raises NotThere, NotAllowed, UsageError, DataFileError, and Conflict, naming the holder."""
+        options = options_of(asked)
+        rig = self.rigs.get(rig_id)
+        require_motion(rig)
+        rig.way(options)               # what the options contradict is said now, not by the run
+        with self._asking:
+            if key is not None and (before := self._by_key(rig_id, key)) is not None:
+                if dict(before.options) != options:
+                    raise Conflict("this key was used for another request", where="Idempotency-Key",
+                                   next_step="Take a new key")
+                return Asked(before, new=False)
+            self.refuse_busy(rig)
+            run = self.store.new_id()
+            request = Request(run, rig.id, str(rig.path.resolve()), rig.sha256, options, who, now(), rig.simulated,
+                              rig.motion, key)
+            self.store.begin(request)
+            try:
+                self._begin(run)
+            except OSError as error:
+                told = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
+                self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=told, exit_code=1))
+                raise Conflict(told.what, where=told.where) from error
+        self.note(who, "asked", run, rig.id, options=options)
+        return Asked(request, new=True)
+
+    def refuse_busy(self, rig: RigFile) -> None:
+        """Raises Conflict where the rig has a run, is held by another program, or waits for a signature."""
+        run = self.run_of(rig.id)
+        if run is not None:
+            raise Conflict(f"run {run} has this rig", where=f"rig {rig.id}", holder=f"run {run}",
+                           next_step="Wait until it has ended, or stop it")
+        holder = self.holder(rig)
+        if holder is not None:
+            raise Conflict(f"the drive is held by {holder}", where=f"rig {rig.id}", holder=str(holder),
+                           next_step="Wait until that run has ended, or end it there")
+        bad = self.blocked(rig.id)
+        if bad is not None:
+            raise Conflict(
+                f"the stop of run {bad} was not confirmed, and nobody has signed it off", where=f"rig {rig.id}",
+                holder=f"run {bad}", next_step="See that the shaft is at rest and the drive is well, then sign it off",
+            )
+
+    @staticmethod
+    def holder(rig: RigFile) -> Holder | None:
+        """Who holds the rig's drive by the lock."""
+        return holder_of(rig.address)
+
+    def blocked(self, rig_id: str) -> str | None:
+        """The run that blocks the rig until it is signed off."""
+        statuses, signed = [], []
+        for run in self.store.ids():
+            with suppress(Exception):
+                status = self.store.status(run)
+                if status.rig == rig_id and status.state is State.STOP_NOT_CONFIRMED:
+                    statuses.append(status)
+                    if self.store.signed_off(run) is not None:
+                        signed.append(run)
+        found = blocking(statuses, signed)
+        return None if found is None else found.id
+
+    def confirm(self, run: str, code: str, binding: str | None, who: str) -> Status:
+        """Hand the code on. Raises NotThere, Conflict (there is nothing to confirm; it isn't the code; it is void)."""
+        status = self.store.status(run)
+        if status.ended or self.store.request(run).simulated:
+            raise Conflict(f"there is nothing to confirm: the run is {status.state}", where=f"run {run}",
+                           next_step="A simulated rig asks for no confirmation")
+        try:
+            found = ask(self.store.place(run), {"do": "confirm", "code": code, "binding": binding, "by": who})
+        except (Refused, CommunicationLost) as error:
+            self.note(who, "confirmation refused", run, status.rig, why=str(error))
+            raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
+        self.note(who, "confirmed", run, status.rig, binding=binding)
+        return Status.of_plain(found["status"])
+
+    def stop(self, run: str, who: str) -> Status:
+        """Have the run brake. By the socket; where that doesn't answer, by SIGTERM; both return at once.
+
+        Raises NotThere, and CommunicationLost where neither reached it.
+        """
+        folder = self.store.place(run)
+        wish = {"do": "stop", "by": who}
+        try:
+            try:
+                found = ask(folder, wish, timeout_s=1.0)
+            except (Refused, CommunicationLost):
+                # Its process may be about to begin. It looks for this file once it listens: one of us sees the other.
+                write_json(folder / STOP_FILE, {"by": who, "at": now()})
+                found = ask(folder, wish, timeout_s=1.0)
+            status = Status.of_plain(found["status"])
+        except (Refused, CommunicationLost, OSError) as error:
+            status = self.store.status(run)
+            begins = status.state is State.REQUESTED and (folder / STOP_FILE).exists()
+            reached = begins or (status.pid is not None and signal_stop(status.pid, folder))
+            if not status.ended and not reached and lives(folder):
+                raise CommunicationLost(str(error), where=f"run {run}", next_step="Use the hard-wired stop") from error
+        self.note(who, "stop asked", run, status.rig)
+        return status
+
+    def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
+        """`tdhil stop` on a rig that has no run of this service: its exit code, and what was seen."""
+        self.note(who, "stop asked", None, rig.id)
+        if rig.simulated:
+            return int(ExitCode.OK), "nothing turns: the rig is simulated, and has no run"
+        return _tdhil_stop(rig.path)
+
+    def sign_off(self, run: str, who: str, note: str) -> None:
+        """Take a stop that wasn't confirmed upon oneself. Raises NotThere and Conflict."""
+        status = self.store.status(run)
+        if status.state is not State.STOP_NOT_CONFIRMED:
+            raise Conflict(f"there is nothing to sign off: the run is {status.state}", where=f"run {run}")
+        self.store.sign_off(run, who, note)
+        self.note(who, "signed off", run, status.rig, note=note)
+
+    # -- looking after them ----------------------------------------------------------------------------------------
+
+    def _by_key(self, rig: str, key: str) -> Request | None:
+        for run in self.store.ids()[:KEYS]:
+            with suppress(Exception):
+                request = self.store.request(run)
+                if request.rig == rig and request.idempotency_key == key:
+                    return request
+        return None
+
+    def _begin(self, run: str) -> None:
+        folder = self.store.place(run)
+        life = take_life(folder)
+        try:
+            with (folder / "process.log").open("ab") as said:
+                self._children[run] = subprocess.Popen(
+                    self._command(folder), stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+                    start_new_session=True, pass_fds=(life,),
+                )
+        finally:
+            os.close(life)
+        self._live[run] = None
+
+    def _look(self) -> None:
+        while not self._end.wait(LOOK_S):
+            for run in self.live():
+                try:
+                    self._look_at(run)
+                except Exception as error:     # of one run: the others are looked after all the same
+                    self._say(f"run {run}: {type(error).__name__}: {error}")
+
+    def _look_at(self, run: str) -> None:
+        folder = self.store.place(run)
+        alive = lives(folder)
+        status = self.store.status(run)
+        if status.ended:
+            if alive and run in self._children and self._children[run].poll() is None:
+                return                         # it has said how it ended, and is about to end
+            self._settle(run, status)
+        elif not alive:
+            status = self.store.status(run)    # it may have ended between the two looks
+            if status.ended:
+                self._settle(run, status)
+            elif run not in self._lost:        # in a thread: a drive that doesn't answer keeps nobody else waiting
+                self._lost.add(run)
+                self._in_background(lambda: self._settle(run, self._died(run, status)))
+        elif status.state is State.AWAITING:
+            self._show_code(run, status)
+
+    def _show_code(self, run: str, status: Status) -> None:
+        with suppress(Refused, CommunicationLost):
+            found = ask(self.store.place(run), {"do": "code"})
+            code = found.get("code")
+            if code and self._live.get(run) != code:
+                self._live[run] = code
+                text = status.confirmation.text if status.confirmation is not None else ""
+                self._say(f"{text}\nTo let it move, type this code into the page within {found['left_s']:.0f} s"
+                          f" (run {run}):   {code[:3]} {code[3:]}\n")
+
+    def _settle(self, run: str, status: Status) -> None:
+        child = self._children.pop(run, None)
+        if child is not None:
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(0.05)
+        self._live.pop(run, None)
+        self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code)
+
+    def _died(self, run: str, status: Status) -> Status:
+        """The run's process is gone. First the shaft, then the rest."""
+        request = self.store.request(run)
+        self._say(f"run {run}: its process is gone; stopping the drive")
+        code, said = self._stop_drive(request)
+        seen = code == ExitCode.OK
+        state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
+        what = f"the process of the run was lost while it was {status.state}; {said}"
+        told = Told("CommunicationLost", what, what, f"run {run}",
+                    "" if seen else "Use the hard-wired stop, then sign it off", int(ExitCode.COMMUNICATION))
+        stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None)
+        status = way_to(status, state, now(), error=told, exit_code=int(told.exit_code), stop=stop, confirmation=None)
+        with suppress(OSError):
+            self.store.save(status)
+        self._say(f"run {run}: {what}")
+        self._in_background(lambda: self._recover(run))
+        return status
+
+    def _stop_drive(self, request: Request) -> tuple[int, str]:
+        """`tdhil stop` on the rig's drive, in a process of its own; a simulated drive has ended with its process."""
+        if request.simulated:
+            return int(ExitCode.OK), "the simulated drive ended with it"
+        return _tdhil_stop(Path(request.rig_file))
+
+    def _recover(self, run: str) -> None:
+        """What the log of a lost run still holds, as a clean copy and as a result."""
+        found = self.work("recover", run, {})
+        if found.get("document"):
+            with suppress(OSError):
+                write_json(self.store.place(run) / "result.json", found["document"])
+        self._index(run)
+
+    def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """A piece of arithmetic in a process of its own, nicer than all that moves. Raises Refused."""
+        command = [sys.executable, "-m", "tdhil.service.work", what]
+        question = {"folder": None if run is None else str(self.store.place(run)), **asked}
+        done = subprocess.run(command, input=json.dumps(question).encode(), capture_output=True, check=False,
+                              start_new_session=True)
+        try:
+            found: dict[str, Any] = json.loads(done.stdout)
+        except ValueError:
+            text = done.stderr.decode("utf-8", "replace").strip().splitlines()
+            found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1).__dict__}
+        if found.get("error"):
+            raise Refused(Told(**found["error"]))
+        return found
+
+    # -- what is written down of it: nothing that has to do with a shaft waits for it ----------------------------------
+
+    def note(self, who: str, what: str, run: str | None, rig: str, **details: Any) -> None:
+        """Into the audit, in time; nothing waits for it."""
+        def write() -> None:
+            try:
+                self.audit.note(who, what, run=run, rig=rig, **details)
+            except OSError as error:
+                self._say(f"the audit can't be written: {error}")
+            if run is not None:
+                self._index(run)
+
+        self._in_background(write)
+
+    def _index(self, run: str) -> None:
+        try:
+            self.index.put(self.store.summary(run))
+        except Exception as error:             # locked, or a full disk: the files have it
+            self._say(f"the index has to wait: {error}")
+
+    def _in_background(self, work: Callable[[], None]) -> None:
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        self._notes = [one for one in self._notes if one.is_alive()] + [thread]
+
+    def turning(self) -> bool:
+        """May a real shaft of this service be turning now?"""
+        for run in self.live():
+            with suppress(Exception):
+                if not self.store.request(run).simulated and self.store.status(run).state in MAY_TURN:
+                    return True
+        return False
+
+
+def _tdhil_stop(rig_file: Path) -> tuple[int, str]:
+    """In a process of its own, since the web opens no bus."""
+    command = [sys.executable, "-m", "tdhil", "stop", "--rig", str(rig_file), "--json"]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=STOP_S, check=False,
+                              stdin=subprocess.DEVNULL, start_new_session=True)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return int(ExitCode.STOP_NOT_CONFIRMED), f"tdhil stop: {error}"
+    if done.returncode == ExitCode.OK:
+        return int(ExitCode.OK), "tdhil stop saw the shaft at rest"
+    return int(ExitCode.STOP_NOT_CONFIRMED), "tdhil stop did NOT see the shaft at rest"

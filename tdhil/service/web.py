@@ -1,0 +1,586 @@
+"""The web: the API, the live sockets and the pages, on one port. It opens no drive's bus and moves nothing itself.
+
+A stop never waits for arithmetic, a download or the index: it has threads of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sqlite3
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final, Literal, TypeVar
+from urllib.parse import urlsplit
+
+import anyio
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
+from pydantic import ValidationError
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Mount, WebSocketRoute
+from starlette.routing import Route as Way
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from drivers import CommunicationLost, DataFileError, PreflightRefused
+from tdhil.errors import ExitCode, TdhilError, UsageError
+from tdhil.service.answers import (
+    API,
+    OPTIONS,
+    ROUTES,
+    AuditView,
+    ErrorView,
+    HealthView,
+    PlanView,
+    ReplayView,
+    RigView,
+    Route,
+    RunView,
+    StoppedView,
+    adapter,
+    document,
+    plain,
+)
+from tdhil.service.asking import RigFile, options_of
+from tdhil.service.feed import Feed, Feeds
+from tdhil.service.states import Conflict, NotAllowed, NotThere, State, Told, now
+from tdhil.service.store import read_json, write_json
+from tdhil.service.supervisor import Supervisor
+from tdhil.service.wire import Refused, lives
+from tdhil.version import __version__
+
+T = TypeVar("T")
+HERE: Final = Path(str(files("tdhil.service")))
+LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+BODY_LIMIT: Final = 64 * 1024
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Of every page: nothing from elsewhere, and no script or style in the page itself."""
+_REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
+_BROKEN_HINT: Final = "The terminal of tdhil serve says more"
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who asks. On loopback without users: whoever sits at this computer, with every role."""
+
+    name: str = "local"
+    roles: frozenset[str] = frozenset({"viewer", "operator", "engineer", "admin"})
+
+
+class Guard:
+    """Before everything: a known host, no other site's page, and the headers of every answer."""
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
+        self._app, self._hosts = app, hosts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        connection = HTTPConnection(scope)
+        why = self._wrong(connection, changes=scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD"))
+        if why is None:
+            await self._app(scope, receive, partial(_with_headers, send))
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 4403, "reason": why.what[:100]})
+        else:
+            await _error_response(why)(scope, receive, partial(_with_headers, send))
+
+    def _wrong(self, connection: HTTPConnection, *, changes: bool) -> NotAllowed | None:
+        host = connection.headers.get("host", "")
+        if _name_of(host) not in self._hosts:
+            return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
+                              next_step=f"Open it as {', '.join(sorted(self._hosts))}")
+        origin = connection.headers.get("origin")
+        elsewhere = origin is not None and (
+            urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
+        )
+        if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
+            return NotAllowed("a page of another site asked for this", where=f"origin {(origin or '?')[:100]}")
+        return None
+
+
+def _name_of(host: str) -> str:
+    with suppress(ValueError):
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    return ""
+
+
+async def _with_headers(send: Send, message: Message) -> None:
+    if message["type"] == "http.response.start":
+        headers = list(message.get("headers", ()))
+        named = {name.lower() for name, _ in headers}
+        for name, value in (
+            (b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"), (b"x-frame-options", b"DENY"), (b"cache-control", b"no-store"),
+            (b"cross-origin-resource-policy", b"same-origin"), (b"cross-origin-opener-policy", b"same-origin"),
+        ):
+            if name not in named:
+                headers.append((name, value))
+        message = {**message, "headers": headers}
+    await send(message)
+
+
+def status_of(error: BaseException) -> int:
+    """The HTTP status of an error of the tree."""
+    if isinstance(error, HTTPException):
+        return int(error.status_code)
+    for kind, status in (
+        (NotThere, 404), (NotAllowed, 403), (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422),
+        (CommunicationLost, 503),
+    ):
+        if isinstance(error, kind):
+            return status
+    if isinstance(error, Refused):
+        return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.told.exit_code), 500)
+    return 500
+
+
+def told_of(error: BaseException) -> ErrorView:
+    """The body of an error."""
+    if isinstance(error, Refused):
+        return ErrorView(error.told)
+    if isinstance(error, HTTPException):
+        return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE)))
+    if not isinstance(error, TdhilError):
+        return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1))
+    return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
+
+
+def _error_response(error: BaseException) -> Response:
+    return JSONResponse(plain(told_of(error), ErrorView), status_of(error))
+
+
+class Web:
+    """The application around one supervisor. ``hosts``: by which names it may be reached."""
+
+    def __init__(self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK) -> None:
+        self.supervisor, self.store = supervisor, supervisor.store
+        self.feeds = Feeds()
+        self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
+        self._works = anyio.CapacityLimiter(1)         # arithmetic, one piece at a time
+        self._waiting: dict[tuple[str, str], ReplayView] = {}
+        self._made = threading.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._registry = CollectorRegistry()
+        self._asked = Counter("tdhil_runs_asked", "Runs that were asked for", registry=self._registry)
+        self._stopped = Counter("tdhil_stops_asked", "Stops that were asked for", registry=self._registry)
+        self._live = Gauge("tdhil_runs_live", "Runs that have not ended", registry=self._registry)
+        self._viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self._registry)
+        self._unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop nobody has signed off",
+                               registry=self._registry)
+        self._pages = Environment(
+            loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._pages.globals["version"] = __version__
+        self.app = Starlette(routes=self._routes(), lifespan=self._lifespan,
+                             exception_handlers={Exception: self._failed, HTTPException: self._failed})
+        self.asgi: ASGIApp = Guard(self.app, hosts)
+
+    def _routes(self) -> list[BaseRoute]:
+        api = [Way(f"{API}{route.path}", self._endpoint(route), methods=[route.method]) for route in ROUTES]
+        at_the_root = [Way(route.path, self._endpoint(route), methods=["GET"]) for route in ROUTES
+                       if route.name in ("health", "metrics")]
+        pages = [
+            Way("/", self._page("rigs.html", "rigs")),
+            Way("/start/{rig}", self._page("start.html", "rigs")),
+            Way("/runs", self._page("runs.html", "runs")),
+            Way("/runs/{run}", self._page("run.html", "runs")),
+            Way("/runs/{run}/live", self._page("live.html", "runs")),
+            Way("/audit", self._page("audit.html", "audit")),
+            Way("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
+        ]
+        sockets = [WebSocketRoute(f"{base}/live/{{run}}", self._watch) for base in (API, "")]
+        return [*api, *at_the_root, *sockets, *pages, Mount("/static", StaticFiles(directory=HERE / "static"))]
+
+    @asynccontextmanager
+    async def _lifespan(self, app: Starlette) -> Any:
+        await anyio.to_thread.run_sync(self.supervisor.start)
+        try:
+            yield
+        finally:
+            await anyio.to_thread.run_sync(self.supervisor.close)
+
+    async def _failed(self, request: Request, error: Exception) -> Response:
+        if not isinstance(error, TdhilError | HTTPException):
+            import traceback
+
+            traceback.print_exception(error, file=sys.stderr)
+        if request.url.path.startswith(API) or request.method != "GET":
+            return _error_response(error)
+        told = told_of(error).error
+        return self._render("error.html", "", status_of(error), told=told)
+
+    # -- the API -----------------------------------------------------------------------------------------------------
+
+    def _endpoint(self, route: Route) -> Callable[[Request], Awaitable[Response]]:
+        answer: Callable[[Request, Any], Awaitable[Any]] = getattr(self, f"_{route.name}")
+        first = next(iter(route.answers))
+
+        async def serve(request: Request) -> Response:
+            try:
+                self._require(route, request)
+                found = await answer(request, await _body(request, route))
+            except TdhilError as error:
+                return _error_response(error)
+            if isinstance(found, Response):
+                return found
+            code, value = found if isinstance(found, tuple) else (first, found)
+            return JSONResponse(plain(value, route.answers[code]), code)
+
+        return serve
+
+    @staticmethod
+    def _require(route: Route, request: Request) -> None:
+        who = principal(request)
+        if route.role not in who.roles:
+            raise NotAllowed(f"{who.name} is no {route.role}", where=route.name)
+
+    async def _rigs(self, request: Request, body: Any) -> list[RigView]:
+        return await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
+
+    async def _rig(self, request: Request, body: Any) -> RigView:
+        return await self._off(lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
+
+    async def _plan(self, request: Request, body: dict[str, Any]) -> PlanView:
+        rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
+        options = options_of(body)
+        await self._off(lambda: rig.way(options))
+        asked = {"rig_file": str(rig.path.resolve()), "options": options}
+        found = await anyio.to_thread.run_sync(partial(self.supervisor.work, "plan", None, asked), limiter=self._works)
+        return PlanView(rig.id, rig.sha256, found["document"])
+
+    async def _start(self, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
+        key = request.headers.get("idempotency-key")
+        if key is not None and not 1 <= len(key) <= 200:
+            raise UsageError("must have 1 to 200 characters", where="Idempotency-Key")
+        rig, who = request.path_params["rig"], principal(request).name
+        asked = await self._off(lambda: self.supervisor.start_run(rig, body, who, key))
+        if asked.new:
+            self._asked.inc()
+        return 201 if asked.new else 200, await self._off(lambda: self.run_view(asked.request.id))
+
+    async def _stop_rig(self, request: Request, body: Any) -> StoppedView:
+        rig_id, who = request.path_params["rig"], principal(request).name
+        self._stopped.inc()
+
+        def stop() -> StoppedView:
+            rig = self.supervisor.rigs.get(rig_id)
+            if (run := self.supervisor.run_of(rig_id)) is not None:
+                self.supervisor.stop(run, who)
+                return StoppedView(rig_id, [run])
+            code, said = self.supervisor.stop_drive(rig, who)
+            return StoppedView(rig_id, [], code, said)
+
+        found: StoppedView = await anyio.to_thread.run_sync(stop, limiter=self._stops)
+        return found
+
+    async def _runs(self, request: Request, body: Any) -> Any:
+        query = request.query_params
+        limit = query.get("limit", "100")
+        if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
+            raise UsageError("must be 1 to 1000", where="limit")
+        if (state := query.get("state")) is not None and state not in set(State):
+            raise UsageError(f"there is no state {state[:40]!r}", where="state",
+                             next_step=f"There are {', '.join(State)}")
+        return await self._off(lambda: self.list_runs(query.get("rig"), state, int(limit)))
+
+    async def _run(self, request: Request, body: Any) -> RunView:
+        return await self._off(lambda: self.run_view(request.path_params["run"]))
+
+    async def _confirm(self, request: Request, body: Any) -> RunView:
+        run, who = request.path_params["run"], principal(request).name
+        code = body.code.replace(" ", "")
+        await self._off(lambda: self.supervisor.confirm(run, code, body.binding, who))
+        return await self._off(lambda: self.run_view(run))
+
+    async def _stop(self, request: Request, body: Any) -> RunView:
+        run, who = request.path_params["run"], principal(request).name
+        self._stopped.inc()
+        await anyio.to_thread.run_sync(self.supervisor.stop, run, who, limiter=self._stops)
+        found: RunView = await anyio.to_thread.run_sync(self.run_view, run, limiter=self._stops)
+        return found
+
+    async def _sign_off(self, request: Request, body: Any) -> RunView:
+        run, who = request.path_params["run"], principal(request).name
+        if not body.note.strip() or len(body.note) > 500:
+            raise UsageError("say in 1 to 500 characters what you saw", where="note")
+        await self._off(lambda: self.supervisor.sign_off(run, who, body.note))
+        return await self._off(lambda: self.run_view(run))
+
+    async def _ask_replay(self, request: Request, body: Any) -> tuple[int, ReplayView]:
+        run, who = request.path_params["run"], principal(request).name
+        asked = {name: value for name, value in asdict(body).items() if value is not None}
+        view = await self._off(lambda: self._new_replay(run, asked, who))
+        task = asyncio.get_running_loop().create_task(self._replay_later(run, view))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return 202, view
+
+    def _new_replay(self, run: str, asked: dict[str, Any], who: str) -> ReplayView:
+        folder = self.store.place(run)
+        if not self.store.status(run).ended or not (folder / "run.mcap").is_file():
+            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended")
+        with self._made:
+            (folder / "replays").mkdir(exist_ok=True)
+            taken = [int(name) for name, _ in self.store.replays(run)] + [
+                int(name) for at, name in self._waiting if at == run]
+            view = ReplayView(f"{max(taken, default=0) + 1:03d}", asked, now(), who, "waiting")
+            self._waiting[run, view.name] = view
+        return view
+
+    async def _replay_later(self, run: str, view: ReplayView) -> None:
+        """A replay has time: it waits as long as a shaft of this service may turn."""
+        while self.supervisor.turning():
+            await anyio.sleep(0.5)
+        try:
+            found = await anyio.to_thread.run_sync(
+                partial(self.supervisor.work, "replay", run, view.asked), limiter=self._works)
+            done = ReplayView(view.name, view.asked, view.at, view.by, "done", found["document"])
+        except TdhilError as error:
+            done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
+        path = self.store.place(run) / "replays" / f"{view.name}.json"
+        try:
+            await self._off(lambda: write_json(path, plain(done, ReplayView)))
+        finally:
+            self._waiting.pop((run, view.name), None)
+
+    async def _replay(self, request: Request, body: Any) -> ReplayView:
+        run, name = request.path_params["run"], request.path_params["replay"]
+        found = next((one for one in await self._off(lambda: self.replays(run)) if one.name == name), None)
+        if found is None:
+            raise NotThere("there is no such replay", where=f"run {run[:40]}")
+        return found
+
+    async def _log(self, request: Request, body: Any) -> Response:
+        return await self._file(request, "run.mcap", "application/octet-stream")
+
+    async def _report(self, request: Request, body: Any) -> Response:
+        response = await self._file(request, "report.html", "text/html", shown=True)
+        response.headers["content-security-policy"] = _REPORT_POLICY
+        return response
+
+    async def _report_pdf(self, request: Request, body: Any) -> Response:
+        run = request.path_params["run"]
+        folder = await self._off(lambda: self.store.place(run))
+        if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
+            await anyio.to_thread.run_sync(
+                partial(self.supervisor.work, "report", run, {"name": "report.pdf"}), limiter=self._works)
+        return await self._file(request, "report.pdf", "application/pdf")
+
+    async def _result(self, request: Request, body: Any) -> Response:
+        return await self._file(request, "result.json", "application/json")
+
+    async def _file(self, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
+        run, who = request.path_params["run"], principal(request).name
+        path = (await self._off(lambda: self.store.place(run))) / name
+        if not path.is_file():
+            raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="It may come when it has ended")
+        rig = (await self._off(lambda: self.store.request(run))).rig
+        self.supervisor.note(who, f"downloaded {name}", run, rig)
+        called = f"{rig}-{run}-{name}"
+        if name == "run.mcap" and not (await self._off(lambda: self.store.status(run))).ended:
+            said = {"content-disposition": f'attachment; filename="{called}"'}
+            return StreamingResponse(_as_it_is(path), media_type=media, headers=said)
+        return FileResponse(path, media_type=media, filename=None if shown else called)
+
+    async def _audit(self, request: Request, body: Any) -> AuditView:
+        limit = request.query_params.get("limit", "200")
+        if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
+            raise UsageError("must be 1 to 5000", where="limit")
+
+        def look() -> AuditView:
+            entries = list(self.supervisor.audit.entries())
+            return AuditView(entries[-int(limit):][::-1], self.supervisor.audit.verify())
+
+        return await self._off(look)
+
+    async def _health(self, request: Request, body: Any) -> HealthView:
+        rigs = await self._off(self.supervisor.rigs.all)
+        return HealthView("ok", __version__, self.supervisor.live(), len(rigs))
+
+    async def _metrics(self, request: Request, body: Any) -> Response:
+        self._live.set(len(self.supervisor.live()))
+        self._viewers.set(self.feeds.viewers)
+        views = await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
+        self._unsigned.set(sum(one.state == "blocked" for one in views))
+        return Response(generate_latest(self._registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def _openapi(self, request: Request, body: Any) -> Response:
+        return JSONResponse(document())
+
+    # -- what is shown of it -----------------------------------------------------------------------------------------
+
+    def rig_view(self, rig: RigFile) -> RigView:
+        """A rig, with who has it and its last run."""
+        if rig.rig is None:
+            return RigView(rig.id, rig.id, "unusable", False, "never", rig.problem)
+        try:
+            options, connection = rig.way()
+            simulated = options.simulate or not connection.configured
+            drive, profile, problem = connection.drive, connection.profile.name, ""
+        except TdhilError as error:
+            return RigView(rig.id, rig.name, "unusable", False, rig.rig.service.motion, str(error))
+        run = self.supervisor.run_of(rig.id)
+        holder = self.supervisor.holder(rig)
+        blocked = self.supervisor.blocked(rig.id)
+        state: Literal["free", "busy", "held", "blocked"]
+        state = "busy" if run else "held" if holder else "blocked" if blocked else "free"
+        last = self.list_runs(rig.id, None, 10)
+        from tdhil.config import simulated_default_rig
+
+        bench = simulated_default_rig(rig.rig) if simulated else rig.rig
+        limits = None if bench.limits is None else bench.limits.model_dump()
+        return RigView(
+            rig.id, rig.name, state, simulated, rig.motion, problem, None if holder is None else str(holder), run,
+            blocked, drive, profile, limits, next((one for one in last if one.inertia_kg_m2 is not None), None),
+        )
+
+    def list_runs(self, rig: str | None, state: str | None, limit: int) -> Any:
+        """From the index; from the files where that can't be had."""
+        with suppress(sqlite3.Error, OSError):
+            return self.supervisor.index.find(rig=rig, state=state, limit=limit)
+        found = [one for one in self.store.summaries() if rig in (None, one.rig) and state in (None, one.state)]
+        return found[:limit]
+
+    def replays(self, run: str) -> list[ReplayView]:
+        """Those that are made, and those that wait."""
+        made = {name: adapter(ReplayView).validate_python(one) for name, one in self.store.replays(run)}
+        waiting = {name: one for (at, name), one in tuple(self._waiting.items()) if at == run and name not in made}
+        return [one for _, one in sorted((made | waiting).items())]
+
+    def run_view(self, run: str) -> RunView:
+        """Everything but the samples. Raises NotThere."""
+        request, folder = self.store.request(run), self.store.place(run)
+        status = self.store.status(run)
+        rig_name = request.rig
+        with suppress(TdhilError):
+            rig_name = self.supervisor.rigs.get(request.rig).name
+        found = [name for name in ("run.mcap", "recovered.mcap", "report.html", "result.json", "report.pdf")
+                 if (folder / name).is_file()]
+        return RunView(
+            request.id, request.rig, rig_name, status.state, status.stage, status.at,
+            request.asked, request.asked_by, request.simulated if status.simulated is None else status.simulated,
+            dict(request.options), list(status.history), dict(status.expected_s), list(status.preflight),
+            status.identity, status.safe_action, status.confirmation, status.stop, status.error, status.exit_code,
+            status.verdict, self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
+            lives(folder),
+        )
+
+    # -- live --------------------------------------------------------------------------------------------------------
+
+    async def _watch(self, socket: WebSocket) -> None:
+        run = socket.path_params["run"]
+        try:
+            folder = await self._off(lambda: self.store.place(run))
+        except NotThere:
+            await socket.close(4404, "there is no such run")
+            return
+        await socket.accept()
+        feed = self.feeds.of(run, lambda: Feed(folder / "run.mcap", lambda: self.store.status(run)))
+        queue = feed.watch()
+        try:
+            async with anyio.create_task_group() as both:
+                both.start_soon(self._listen, socket, both.cancel_scope)
+                while (message := await queue.get()) is not None:
+                    await socket.send_text(json.dumps(message, allow_nan=False))
+                await socket.close(1013, "too slow: come again")
+                both.cancel_scope.cancel()
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            feed.leave(queue)
+
+    @staticmethod
+    async def _listen(socket: WebSocket, scope: anyio.CancelScope) -> None:
+        """Nothing that a viewer sends is heard; only that it has gone."""
+        with suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+        scope.cancel()
+
+    # -- pages -------------------------------------------------------------------------------------------------------
+
+    def _page(self, template: str, here: str) -> Callable[[Request], Awaitable[Response]]:
+        async def serve(request: Request) -> Response:
+            known: dict[str, Any] = {}
+            if "rig" in request.path_params:
+                known["rig"] = await self._off(
+                    lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
+            if "run" in request.path_params:
+                known["run"] = await self._off(lambda: self.run_view(request.path_params["run"]))
+            return self._render(template, here, **known)
+
+        return serve
+
+    def _render(self, template: str, here: str, status: int = 200, **known: Any) -> Response:
+        return HTMLResponse(self._pages.get_template(template).render(here=here, **known), status)
+
+    @staticmethod
+    async def _off(work: Callable[[], T]) -> T:
+        """In a thread: files may be slow."""
+        found: T = await anyio.to_thread.run_sync(work)
+        return found
+
+
+def principal(request: HTTPConnection) -> Principal:
+    """Who asks: as long as there are no users, whoever sits at this computer."""
+    return Principal()
+
+
+def _as_it_is(path: Path) -> Iterator[bytes]:
+    """A file that grows, up to where it ends now."""
+    left = path.stat().st_size
+    with path.open("rb") as file:
+        while left > 0 and (piece := file.read(min(left, 2**16))):
+            left -= len(piece)
+            yield piece
+
+
+async def _body(request: Request, route: Route) -> Any:
+    """What was sent, checked. Raises UsageError."""
+    if route.method == "GET":
+        return None
+    data = b""
+    async for piece in request.stream():
+        data += piece
+        if len(data) > BODY_LIMIT:
+            raise UsageError(f"more than {BODY_LIMIT} bytes", where="body")
+    media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
+    if media != "application/json":
+        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Say application/json")
+    try:
+        sent = json.loads(data or b"{}", parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"no JSON ({str(error)[:100]})", where="body") from None
+    if not isinstance(sent, dict):
+        raise UsageError("must be an object", where="body", next_step='Such as {"seed": 7}')
+    if route.body == OPTIONS:
+        return sent
+    try:
+        return adapter(route.body).validate_json(json.dumps(sent), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise UsageError(first["msg"], where=".".join(map(str, first["loc"])) or "body") from None
+
+
+def _no_number(name: str) -> Any:
+    raise ValueError(f"{name} is no number in JSON")

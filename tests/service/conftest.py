@@ -1,0 +1,76 @@
+"""A service on a folder of its own, whose runs are played by `fake_run`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tdhil.service.asking import Rigs
+from tdhil.service.store import Audit, Index, Store
+from tdhil.service.supervisor import Supervisor
+from tdhil.service.web import Web
+
+FAKE = Path(__file__).with_name("fake_run.py")
+URL = "http://127.0.0.1:8420"
+HANGS_S = 60.0
+
+
+def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -> Any:
+    """It only bounds what would otherwise hang."""
+    end_s = time.monotonic() + within_s
+    while not (found := happens()):
+        assert time.monotonic() < end_s, f"never came: {what}"
+        time.sleep(0.02)
+    return found
+
+
+class Service:
+    """One service without its web: the parts, and what it said on its terminal."""
+
+    def __init__(self, folder: Path, rigs: Path | None, fake: bool = True) -> None:
+        self.said: list[str] = []
+        self.store = Store(folder)
+        self.store.prepare()
+        self.audit, self.index = Audit(folder / "audit"), Index(self.store)
+        command = (lambda run: [sys.executable, str(FAKE), str(run)]) if fake else None
+        self.supervisor = Supervisor(self.store, Rigs(rigs), self.audit, self.index, say=self.said.append,
+                                     command=command)
+        self.web = Web(self.supervisor)
+
+    def wait(self, run: str, *states: str) -> str:
+        def there() -> str | None:
+            state = self.store.status(run).state
+            return state if state in states else None
+
+        return str(wait_for(f"{run} {states}", there))
+
+
+@pytest.fixture
+def rigs(tmp_path: Path) -> Path:
+    """Two simulated ones, a real one that may be moved, one that may not, one that can't be read."""
+    folder = tmp_path / "rigs"
+    folder.mkdir()
+    for name in ("a", "b"):
+        (folder / f"{name}.yaml").write_text(f"name: Rig {name}\nrun: {{simulate: true}}\n")
+    limits = ("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
+              " quick_stop_rad_s2: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n")
+    real = f"modbus: {{host: 127.0.0.1, port: 1}}\n{limits}"
+    (folder / "real.yaml").write_text(real + "service: {motion: attended}\n")
+    (folder / "never.yaml").write_text(real)
+    (folder / "watched.yaml").write_text(real + "service: {motion: watched}\n")
+    (folder / "broken.yaml").write_text("speed: <script>alert(1)</script>\n")
+    return folder
+
+
+@pytest.fixture
+def service(tmp_path: Path, rigs: Path) -> Iterator[Service]:
+    found = Service(tmp_path / "data", rigs)
+    yield found
+    for run in found.supervisor.live():
+        found.supervisor.stop(run, "end of the test")
+    found.supervisor.close()

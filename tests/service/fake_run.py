@@ -1,0 +1,83 @@
+"""A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
+
+``done`` | ``hold`` (moves until it is stopped) | ``ask`` (wants the code first) | ``die`` (killed while it moves)
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+from tdhil.service.attending import Board, Confirming
+from tdhil.service.states import Confirmation, State, Stop, now, way_to
+from tdhil.service.store import Store, write_json
+from tdhil.service.wire import STOP_FILE, Listener
+
+RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100.0, "high_total": 108.0,
+                                                 "repeatability_rel": 0.005}}
+
+
+def main(folder: Path) -> None:
+    store = Store(folder.parent.parent)
+    request = store.request(folder.name)
+    what = str(request.options.get("note", "done"))
+    board = Board(store, replace(store.status(request.id), pid=os.getpid(), simulated=request.simulated))
+    stop = SimpleNamespace(asked=False)
+    confirming = Confirming("b" * 64, lambda: None)
+    confirming.code = "123456"
+
+    def answer(asked):
+        if asked.get("do") == "stop":
+            stop.asked = True
+            at = now()
+            board.know(stop=Stop(asked=at, by=asked["by"], seen=at))
+        elif asked.get("do") == "confirm":
+            confirming.take(asked["code"], asked["binding"], asked["by"])
+        elif asked.get("do") == "code":
+            return {"code": confirming.code, "left_s": confirming.left_s}
+        return {"status": board.status.plain()}
+
+    signal.signal(signal.SIGTERM, lambda number, frame: setattr(stop, "asked", True))
+    listener = Listener(folder, answer)
+    with listener:
+        if (folder / STOP_FILE).exists():
+            answer({"do": "stop", "by": "local"})
+        board.to(State.PREFLIGHT)
+        if what == "deaf":
+            (folder / "control.sock").unlink()
+        if what == "ask":
+            board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()))
+            while not stop.asked and confirming.confirmed_by is None:
+                if confirming.void is not None:
+                    end(board, State.REFUSED, 4)
+                    return
+                time.sleep(0.01)
+        if not stop.asked:
+            board.to(State.MOVING, "setup")
+            (folder / "run.mcap").write_bytes(b"0123456789" * 10)
+        if what == "die":
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGKILL)
+        while what in ("hold", "deaf") and not stop.asked:
+            time.sleep(0.01)
+        if stop.asked:
+            end(board, State.STOPPED, 143)
+        elif what == "unseen":
+            end(board, State.STOP_NOT_CONFIRMED, 8)
+        else:
+            write_json(folder / "result.json", RESULT)
+            end(board, State.DONE, 0)
+
+
+def end(board: Board, state: State, code: int) -> None:
+    board.change(lambda status: way_to(status, state, now(), exit_code=code, confirmation=None))
+    board.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

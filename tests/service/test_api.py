@@ -1,0 +1,438 @@
+"""The API over HTTP, with runs that are played: what it gives, refuses and does; each answer as the document says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import jsonschema
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from tdhil.service.answers import API, ROUTES, document
+from tdhil.service.states import State
+from tests.service.conftest import URL, Service, wait_for
+
+
+class Checked:
+    """A client that holds every answer of the API against the document."""
+
+    def __init__(self, client: TestClient) -> None:
+        self._client = client
+        self.document = client.get(f"{API}/openapi.json").json()
+
+    def __call__(self, method: str, path: str, expect: int, **sent: Any) -> Any:
+        answer = self._client.request(method, f"{API}{path}", **sent)
+        assert answer.status_code == expect, answer.text
+        self.check(method, f"{API}{path.split('?', maxsplit=1)[0]}", answer)
+        return answer.json() if "json" in answer.headers["content-type"] else answer
+
+    def check(self, method: str, path: str, answer: Any) -> None:
+        template = next(
+            one for one in self.document["paths"]
+            if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path) and method.lower() in self.document["paths"][one]
+        )
+        described = self.document["paths"][template][method.lower()]["responses"][str(answer.status_code)]["content"]
+        media = answer.headers["content-type"].split(";")[0]
+        assert media in described, (path, media)
+        if "schema" in described[media]:
+            schema = {**described[media]["schema"], "components": self.document["components"]}
+            jsonschema.validate(answer.json(), schema, cls=jsonschema.Draft202012Validator)
+
+    def start(self, rig: str = "a", what: str = "done", expect: int = 201, **more: Any) -> dict[str, Any]:
+        found = self("POST", f"/rigs/{rig}/runs", expect, json={"note": what, "seed": 7}, **more)
+        assert isinstance(found, dict)
+        return found
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[TestClient]:
+    with TestClient(service.web.asgi, base_url=URL) as found:
+        yield found
+
+
+@pytest.fixture
+def call(client: TestClient) -> Checked:
+    return Checked(client)
+
+
+# -- what there is
+
+
+def test_the_document_is_one(call):
+    jsonschema.Draft202012Validator.check_schema({"$defs": call.document["components"]["schemas"]})
+    assert call.document == document()
+    names = [one["operationId"] for path in call.document["paths"].values() for one in path.values()]
+    assert sorted(names) == sorted(route.name for route in ROUTES)
+    assert all(one["x-role"] for path in call.document["paths"].values() for one in path.values())
+
+
+def test_rigs_say_what_they_are(call):
+    found = {one["id"]: one for one in call("GET", "/rigs", 200)}
+    assert {name: one["state"] for name, one in found.items()} == {
+        "a": "free", "b": "free", "real": "free", "never": "free", "watched": "free", "broken": "unusable"}
+    assert [found[name]["simulated"] for name in ("a", "real")] == [True, False]
+    assert found["a"]["limits"]["torque_nm"] == 400.0
+    assert "broken.yaml:1" in found["broken"]["problem"]
+    assert call("GET", "/rigs/a", 200) == found["a"]
+
+
+def test_a_run_from_its_request_to_its_result(call, service):
+    run = call.start()
+    assert (run["rig"], run["rig_name"], run["options"]) == ("a", "Rig a", {"note": "done", "seed": 7})
+    service.wait(run["id"], "done")
+    wait_for("the index", lambda: call("GET", "/runs?state=done", 200))
+    run = call("GET", f"/runs/{run['id']}", 200)
+    assert [one["state"] for one in run["history"]] == [
+        "requested", "preflight", "moving", "stopping", "identifying", "done"]
+    assert run["result"]["inertia_kg_m2"]["value"] == 104.0
+    (summary,) = call("GET", "/runs?rig=a", 200)
+    assert (summary["id"], summary["inertia_kg_m2"]) == (run["id"], 104.0)
+    assert call("GET", "/runs?rig=b", 200) == []
+    assert call("GET", "/rigs/a", 200)["last"]["id"] == run["id"]
+    assert call("GET", f"/runs/{run['id']}/result.json", 200)["verdict"] == "valid"
+    assert call("GET", f"/runs/{run['id']}/log.mcap", 200).content == b"0123456789" * 10
+
+
+def test_downloads_come_in_pieces(client, call, service):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    answer = client.get(f"{API}/runs/{run}/log.mcap", headers={"Range": "bytes=5-8"})
+    assert (answer.status_code, answer.content) == (206, b"5678")
+    assert answer.headers["content-range"] == "bytes 5-8/100"
+    call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
+    call("GET", f"/runs/{run}/report.html", 404)
+
+
+def test_health_and_metrics(client, call, service):
+    assert call("GET", "/healthz", 200)["status"] == "ok"
+    assert client.get("/healthz").json()["rigs"] == 6
+    run = call.start(what="hold")
+    service.wait(run["id"], "moving")
+    assert "tdhil_runs_live 1.0" in client.get("/metrics").text
+    assert "tdhil_runs_asked_total 1.0" in call("GET", "/metrics", 200).text
+
+
+# -- one run
+
+
+def test_a_run_is_stopped_and_says_when(call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    call("POST", f"/runs/{run}/stop", 200)
+    service.wait(run, "stopped")
+    found = call("GET", f"/runs/{run}", 200)
+    assert found["stop"]["by"] == "local"
+    assert found["stop"]["asked"] <= found["stop"]["seen"]
+    call("POST", f"/runs/{run}/stop", 200)         # once more does no harm
+
+
+def test_a_rig_is_stopped_whatever_its_run_is_called(call, service):
+    run = call.start(what="hold")["id"]
+    assert call("POST", "/rigs/a/stop", 200)["runs"] == [run]
+    service.wait(run, "stopped")
+    assert call("POST", "/rigs/b/stop", 200)["exit_code"] == 0
+
+
+def test_a_run_that_hears_no_socket_is_stopped_by_signal(call, service):
+    run = call.start(what="deaf")["id"]
+    service.wait(run, "moving")
+    call("POST", f"/runs/{run}/stop", 200)
+    service.wait(run, "stopped")
+
+
+def test_a_second_run_of_a_rig_is_refused_and_told_who_has_it(call, service):
+    run = call.start(what="hold")["id"]
+    refused = call.start(expect=409)
+    assert refused["holder"] == f"run {run}"
+    assert refused["error"]["exit_code"] == 4
+    other = call.start("b", what="hold")["id"]      # another rig is another rig
+    assert sorted(service.supervisor.live()) == sorted([run, other])
+
+
+def test_a_drive_that_a_terminal_has_is_refused_and_named(call, service):
+    from tdhil.session import hold
+
+    address = service.supervisor.rigs.get("real").address
+    with hold(address):
+        refused = call.start("real", what="ask", expect=409)
+        assert call("GET", "/rigs/real", 200)["state"] == "held"
+    assert f"process {os.getpid()} (" in refused["holder"]
+
+
+def test_twenty_posts_at_once_are_one_run(client, call, service):
+    answers: list[int] = []
+    send = [threading.Thread(target=lambda: answers.append(
+        client.post(f"{API}/rigs/a/runs", json={"note": "hold"}).status_code)) for _ in range(12)]
+    for one in send:
+        one.start()
+    for one in send:
+        one.join()
+    assert sorted(answers) == [201] + [409] * 11
+    assert len(service.store.ids()) == 1
+
+
+def test_the_same_key_gives_the_same_run(call, service):
+    key = {"Idempotency-Key": "abc"}
+    run = call.start(what="hold", headers=key)["id"]
+    assert call.start(what="hold", expect=200, headers=key)["id"] == run
+    call.start(what="done", expect=409, headers=key)
+    call("POST", f"/runs/{run}/stop", 200)
+    service.wait(run, "stopped")
+    assert call.start(what="hold", expect=200, headers=key)["id"] == run       # also when it has ended
+    assert len(service.store.ids()) == 1
+
+
+# -- the code
+
+
+def test_a_real_rig_moves_with_the_code_from_the_terminal_alone(call, service):
+    run = call.start("real", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    shown = wait_for("the code", lambda: next((one for one in service.said if "123 456" in one), None))
+    assert "this moves" in shown
+    binding = call("GET", f"/runs/{run}", 200)["confirmation"]["binding"]
+    assert "123456" not in json.dumps(call("GET", f"/runs/{run}", 200))
+    assert "that isn't the code" in call("POST", f"/runs/{run}/confirm", 409, json={"code": "000000"})["error"]["what"]
+    call("POST", f"/runs/{run}/confirm", 200, json={"code": "123 456", "binding": binding})
+    service.wait(run, "done")
+    call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456"})          # once
+    who = [(one["what"], one["run"]) for one in call("GET", "/audit", 200)["entries"]]
+    assert ("confirmed", run) in who
+    assert ("confirmation refused", run) in who
+
+
+@pytest.mark.parametrize("sent", [{"code": "123456", "binding": "c" * 64}, {"code": "999999"}])
+def test_another_plan_or_three_wrong_codes_void_it(call, service, sent):
+    run = call.start("real", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    for _ in range(1 if "binding" in sent else 3):
+        call("POST", f"/runs/{run}/confirm", 409, json=sent)
+    service.wait(run, "refused")
+    call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456", "binding": "b" * 64})
+
+
+def test_a_code_of_one_run_is_no_code_of_another(call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    assert "nothing to confirm" in call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456"})["error"]["what"]
+
+
+# -- what may not be
+
+
+@pytest.mark.parametrize(("rig", "words"), [
+    ("never", "never moved from afar"), ("watched", "isn't there yet")])
+def test_a_rig_that_may_not_move_from_here(call, rig, words):
+    refused = call.start(rig, expect=403)["error"]
+    assert words in refused["what"]
+    assert f"{rig}.yaml" in refused["where"]
+
+
+@pytest.mark.parametrize(("options", "status", "words"), [
+    ({"accept_no_watchdog": True}, 403, "never taken over HTTP"),
+    ({"accept-no-watchdog": True}, 403, "never taken over HTTP"),
+    ({"accept_shared_watchdog": True}, 403, "never taken over HTTP"),
+    ({"yes": True}, 403, "nothing replaces it"),
+    ({"log": "/etc/passwd"}, 422, "is no option"),
+    ({"profile": "../../x.yaml"}, 422, "is no option"),
+    ({"interface": "socketcan"}, 422, "is no option"),
+    ({"host": "192.0.2.1"}, 422, "is no option"),
+    ({"plant": "x"}, 422, "is no option"),
+    ({"tolerance": "a lot"}, 422, "tolerance"),
+    ({"tolerance": True}, 422, "must be a number"),
+    ({"tolerance": 7}, 422, "--tolerance"),
+    ({"excitation": "<script>"}, 422, "--excitation"),
+    ({"accept_wider_limit": "all"}, 422, "knows torque"),
+    ({"note": 7}, 422, "must be a text"),
+    ({"fault": {"a": 1}}, 422, "must be a text"),
+    ({"seed": -1}, 422, "--seed"),
+])
+def test_options_that_are_refused_begin_nothing(call, service, options, status, words):
+    refused = call("POST", "/rigs/a/runs", status, json=options)["error"]
+    assert words in refused["message"]
+    assert service.store.ids() == []
+
+
+@pytest.mark.parametrize(("sent", "words"), [
+    (b"{", "no JSON"), (b"[]", "must be an object"), (b'{"seed": NaN}', "no number"), (b"\xff", "no JSON"),
+    (b"[" * 60000, "no JSON"), (b"1" * 70000, "more than"),
+])
+def test_what_is_no_request_is_refused(call, sent, words):
+    refused = call("POST", "/rigs/a/runs", 422, content=sent, headers={"content-type": "application/json"})
+    assert words in refused["error"]["message"]
+
+
+def test_a_form_of_another_site_is_no_request(call):
+    call("POST", "/rigs/a/runs", 422, content=b"{}", headers={"content-type": "text/plain"})
+
+
+def test_units_are_taken_as_the_command_line_takes_them(call, service):
+    run = call("POST", "/rigs/a/runs", 201, json={"tolerance": "1%", "max-time": "5min", "--frequency": 0.2})
+    assert run["options"] == {"tolerance": 0.01, "max_time_s": 300.0, "frequency_hz": 0.2}
+
+
+@pytest.mark.parametrize("path", [
+    "/rigs/nobody", "/rigs/..", "/rigs/%2e%2e%2frigs%2fa", "/rigs/a.yaml", "/rigs/<script>", "/runs/1", "/runs/..%2f..",
+    "/runs/20260101-000000-000000", "/runs/..%2f..%2fetc/log.mcap", "/runs/20260101-000000-000000/log.mcap",
+    "/runs/20260101-000000-000000/replays/1",
+])
+def test_what_is_not_there_is_not_there(client, path):
+    answer = client.get(f"{API}{path}")
+    assert answer.status_code == 404
+    assert answer.json()["error"]["exit_code"] == 2
+
+
+def test_nothing_but_its_own_files_is_served(client, service):
+    (service.store.folder / "secret").write_text("s3cret")
+    for path in ("/static/../web.py", "/static/..%2fweb.py", "/static/%2e%2e/web.py", "/static//etc/passwd",
+                 "/static/..%5cweb.py", "/runs/..%2fsecret", "/..%2fsecret"):
+        answer = client.get(path)
+        assert answer.status_code in (404, 400), path
+        assert "s3cret" not in answer.text
+        assert "import" not in answer.text
+
+
+# -- whence
+
+
+def refused_socket(client: TestClient, headers: dict[str, str]) -> int:
+    """The code with which a live socket is closed before it is open."""
+    address = f"{URL.replace('http', 'ws')}{API}/live/20260101-000000-000000"
+    with pytest.raises(WebSocketDisconnect) as closed, client.websocket_connect(address, headers=headers):
+        pass
+    return closed.value.code
+
+
+def test_a_socket_from_its_own_page_gets_as_far_as_the_run(client):
+    assert refused_socket(client, {"Origin": URL}) == 4404
+    assert refused_socket(client, {}) == 4404
+
+
+@pytest.mark.parametrize("host", [
+    "evil.example", "evil.example:8420", "127.0.0.1.evil.example", "[::2]", "192.0.2.7", ""])
+def test_by_another_name_it_is_not_reached(client, host):
+    for path in ("/", f"{API}/rigs", "/static/app.js"):
+        assert client.get(path, headers={"Host": host}).status_code == 403
+    with pytest.raises(Exception), client.websocket_connect(f"{API}/live/x", headers={"Host": host}):  # noqa: B017
+        pass
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost:8420", "LOCALHOST", "[::1]:8420"])
+def test_by_its_own_names_it_is(client, host):
+    assert client.get(f"{API}/rigs", headers={"Host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("headers", [
+    {"Origin": "http://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
+    {"Origin": "file://127.0.0.1:8420"}, {"Sec-Fetch-Site": "cross-site"}, {"Sec-Fetch-Site": "same-site"},
+])
+def test_a_page_of_another_site_moves_and_stops_nothing(client, service, headers):
+    answer = client.post(f"{API}/rigs/a/runs", json={}, headers=headers)
+    assert answer.status_code == 403
+    assert service.store.ids() == []
+    with pytest.raises(Exception), client.websocket_connect(f"{API}/live/x", headers=headers):  # noqa: B017
+        pass
+
+
+def test_every_answer_says_what_a_page_may_do(client):
+    for path in ("/", f"{API}/rigs", "/static/app.js", "/nothing", f"{API}/nothing"):
+        headers = client.get(path).headers
+        assert "default-src 'none'" in headers["content-security-policy"], path
+        assert headers["x-content-type-options"] == "nosniff"
+        assert "access-control-allow-origin" not in headers
+
+
+# -- what dies
+
+
+def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, service):
+    run = call.start(what="die")["id"]
+    service.wait(run, "interrupted")
+    found = call("GET", f"/runs/{run}", 200)
+    assert "lost while it was moving" in found["error"]["what"]
+    assert found["stop"]["confirmed"] is True          # simulated: it ended with its process
+    assert call("GET", "/rigs/a", 200)["state"] == "free"
+
+
+def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(call, service):
+    run = call.start("real", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    service.wait(run, "stop_not_confirmed")
+    assert "hard-wired stop" in call("GET", f"/runs/{run}", 200)["error"]["next_step"]
+    wait_for("nobody live", lambda: not service.supervisor.live())
+    refused = call.start("real", expect=409)
+    assert "nobody has signed it off" in refused["error"]["what"]
+    assert call("GET", "/rigs/real", 200)["state"] == "blocked"
+    call("POST", f"/runs/{run}/sign-off", 422, json={"note": " "})
+    call("POST", f"/runs/{run}/sign-off", 200, json={"note": "seen at rest, key out"})
+    again = call.start("real", what="ask")["id"]
+    call("POST", f"/runs/{again}/stop", 200)
+    service.wait(again, "stopped")
+    call("POST", f"/runs/{again}/sign-off", 409, json={"note": "x"})
+
+
+def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    service.supervisor.close()                         # as dead as it gets: it looks no more
+    after = Service(tmp_path / "data", rigs)
+    with TestClient(after.web.asgi, base_url=URL) as client:
+        assert client.get(f"{API}/runs/{run}").json()["state"] == "moving"
+        assert after.supervisor.live() == [run]
+        assert client.post(f"{API}/rigs/a/runs", json={}).status_code == 409
+        assert client.post(f"{API}/runs/{run}/stop", json={}).status_code == 200
+        after.wait(run, "stopped")
+    assert len(after.store.ids()) == 1
+
+
+def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
+    run = call.start("real", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    service.supervisor.close()
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    after = Service(tmp_path / "data", rigs)
+    after.supervisor.start()
+    after.wait(run, "stop_not_confirmed")
+    after.supervisor.close()
+    assert State.MOVING not in [one.state for one in after.store.status(run).history]
+
+
+def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypatch):
+    import sqlite3
+
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    wait_for("the index", lambda: call("GET", "/runs", 200))
+
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(service.audit, "note", full)
+    with sqlite3.connect(service.store.folder / "index.sqlite", isolation_level=None) as base:
+        base.execute("begin exclusive")
+        call("POST", f"/runs/{run}/stop", 200)
+        service.wait(run, "stopped")
+        assert service.web.list_runs(None, None, 10)[0].id == run      # from the files
+    base.close()
+
+
+def test_the_audit_says_who_did_what_and_that_it_holds(call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    call("POST", f"/runs/{run}/stop", 200)
+    service.wait(run, "stopped")
+    call("GET", f"/runs/{run}/log.mcap", 200)
+    wanted = {"asked", "stop asked", "ended: stopped", "downloaded run.mcap"}
+    wait_for("the audit", lambda: wanted <= {one["what"] for one in call("GET", "/audit", 200)["entries"]})
+    assert call("GET", "/audit", 200)["broken"] is None
+    path = next((service.store.folder / "audit").glob("*.jsonl"))
+    path.write_bytes(path.read_bytes().replace(b'"asked"', b'"Asked"', 1))
+    assert call("GET", "/audit", 200)["broken"]["line"] >= 1

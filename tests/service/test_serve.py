@@ -1,0 +1,142 @@
+"""`tdhil serve` as a process, with real simulated runs in stepped time: asked for, watched, killed, stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import tdhil
+from drivers import CommunicationLost
+from tdhil.cli.main import main
+from tdhil.errors import ExitCode, UsageError
+from tdhil.recording import read_run
+from tdhil.service.client import ServiceError
+from tdhil.service.serving import require_loopback
+from tests.service.conftest import HANGS_S, wait_for
+
+QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
+
+
+class Server:
+    def __init__(self, data: Path, *more: str) -> None:
+        self.log = (data.parent / "serve.txt").open("a+")
+        start = self.log.seek(0, os.SEEK_END)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "tdhil", "serve", "--data", str(data), "--port", "0", *more], stderr=self.log)
+        address = wait_for("the address", lambda: re.search(r"http://\S+", self.said(start)))
+        self.url = address.group(0)
+        self.client = tdhil.Client(self.url)
+        wait_for("an answer", self.answers)
+
+    def said(self, start: int = 0) -> str:
+        self.log.seek(start)
+        return self.log.read()
+
+    def answers(self) -> bool:
+        with contextlib.suppress(CommunicationLost):
+            return bool(self.client.rigs())
+        return False
+
+
+@contextlib.contextmanager
+def served(data: Path, *more: str) -> Iterator[Server]:
+    server = Server(data, *more)
+    try:
+        yield server
+    finally:
+        server.process.kill()
+        server.process.wait()
+        server.log.close()
+
+
+@pytest.mark.heavy
+def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
+    """The web is killed while the shaft moves: nothing of the run is missing, and the next web finds it."""
+    data = tmp_path / "data"
+    with served(data) as first:
+        assert [rig["id"] for rig in first.client.rigs()] == ["simulated-canopen", "simulated-modbus"]
+        plan = first.client.plan("simulated-canopen", excitation="sine", frequency=0.2, amplitude="10rpm")["plan"]
+        assert plan["excitation"] == "sine"
+        run = first.client.start("simulated-canopen", key="once", **QUICK)["id"]
+        wait_for("motion", lambda: first.client.run(run)["stage"] in ("speed", "torque"))
+        with pytest.raises(ServiceError) as refused:
+            first.client.start("simulated-canopen")
+        assert (refused.value.status, refused.value.holder) == (409, f"run {run}")
+        first.process.kill()
+        first.process.wait()
+    with pytest.raises(CommunicationLost, match="hard-wired stop"):
+        first.client.rigs()
+    with served(data) as second:
+        assert second.client.start("simulated-canopen", key="once", **QUICK)["id"] == run
+        found = second.client.wait(run, timeout_s=HANGS_S)
+        assert (found["state"], found["exit_code"], found["verdict"]) == ("done", 0, "valid")
+        folder = data / "runs" / run
+        logged = read_run(folder / "run.mcap")
+        assert logged.complete
+        assert logged.result == found["result"]
+        replay = second.client.replay(run, tolerance=0.001)
+        assert replay["result"]["verdict"] == "valid_wide"
+        assert replay["result"]["inertia_kg_m2"]["value"] == found["result"]["inertia_kg_m2"]["value"]
+        assert second.client.run(run)["result"] == found["result"]             # never overwritten
+        assert second.client.download(run, "report.html", tmp_path / "report.html").read_bytes().startswith(b"<!")
+        assert second.client.download(run, "log.mcap", tmp_path / "copy.mcap").read_bytes() == (
+            folder / "run.mcap").read_bytes()
+        assert len(second.client.runs()) == 1
+        assert second.client.audit()["broken"] is None
+        assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(104.0, rel=0.02)
+    one = json.loads((folder / "result.json").read_bytes())
+    assert one == found["result"]
+
+
+def test_its_end_brakes_what_moves(tmp_path):
+    """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
+    same."""
+    with served(tmp_path / "data") as server:
+        run = server.client.start("simulated-modbus", real_time=True)["id"]
+        wait_for("motion", lambda: server.client.run(run)["state"] == "moving")
+        server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(HANGS_S) == ExitCode.OK
+    status = json.loads((tmp_path / "data" / "runs" / run / "state.json").read_bytes())
+    assert (status["state"], status["exit_code"]) == ("stopped", ExitCode.TERMINATED)
+    stop = status["stop"]
+    assert stop["asked"] <= stop["seen"] <= stop["at_rest"]
+    assert stop["confirmed"] is True
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "rig.example", ""])
+def test_another_host_is_refused_in_words(host, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["serve", "--host", host]) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert "no login and no TLS yet" in said
+    assert "ssh -L" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
+def test_this_computer_is_not(host):
+    require_loopback(host)
+
+
+def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):
+    from tdhil.service.serving import _alone
+
+    with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve has this folder"):
+        _alone(tmp_path)
+    assert main(["serve", "--rigs", str(tmp_path / "missing"), "--data", str(tmp_path)]) == ExitCode.USAGE
+    assert "no such folder" in capsys.readouterr().err
+    assert main(["serve", "--port", "99999", "--data", str(tmp_path)]) == ExitCode.USAGE
+
+
+def test_a_client_says_what_the_service_says():
+    with pytest.raises(CommunicationLost, match="Is tdhil serve running"):
+        tdhil.Client("http://127.0.0.1:1").rigs()
