@@ -169,7 +169,7 @@ class _Progress:
 # ---------------------------------------------------------------------------------------------------------------------
 
 LIST, ALL = "list", "paper"
-OURS = ("coverage",)
+OURS = ("coverage", "soft-torque")
 """Studies that are no experiment of the paper's, and take long."""
 
 
@@ -198,10 +198,11 @@ def run(namespace: argparse.Namespace) -> int:
 
 def all_studies() -> dict[str, Study]:
     """Every study by its name, tables first, figures in the paper's order; ours last."""
-    from tdhil.studies import COVERAGE, field_studies, simulated_studies
+    from tdhil.studies import COVERAGE, SOFT_TORQUE, field_studies, simulated_studies
 
     known = {study.name: study for study in (*simulated_studies(), *field_studies(SimulatedFieldBench()))}
-    return {name: known[name] for name in sorted(known, key=_order)} | {COVERAGE.name: COVERAGE}
+    return {name: known[name] for name in sorted(known, key=_order)} | {
+        COVERAGE.name: COVERAGE, SOFT_TORQUE.name: SOFT_TORQUE}
 
 
 def chosen(namespace: argparse.Namespace, studies: Mapping[str, Study]) -> list[tuple[Study, Any]]:

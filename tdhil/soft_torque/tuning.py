@@ -327,21 +327,29 @@ def _best_softness(case: TuneCase, held: Sequence[float], share: float, most: fl
     return round(0.5 * (low + high), 3)
 
 
-def largest_stable_share(case: TuneCase, softness: float, held_hz: Sequence[float]) -> float:
-    """The largest share of the believed J that is stable for every J of the interval, to 0.01; 0: none."""
+def largest_stable_share(
+    case: TuneCase, softness: float, held_hz: Sequence[float], believed_upper: bool = True
+) -> float:
+    """The largest share of the believed J that is stable for every J of the interval, to 0.01; 0: none.
+
+    ``believed_upper``: also if J's upper end were believed.
+    """
     low, high = 0.0, 1.0
     while high - low > 0.01:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _stable_everywhere(case, softness, middle, held_hz) else (low, middle)
+        stable = _stable_everywhere(case, softness, middle, held_hz, believed_upper)
+        low, high = (middle, high) if stable else (low, middle)
     return low
 
 
-def _stable_everywhere(case: TuneCase, softness: float, share: float, held: Sequence[float]) -> bool:
+def _stable_everywhere(
+    case: TuneCase, softness: float, share: float, held: Sequence[float], believed_upper: bool = True
+) -> bool:
     """Stable at both ends of J's interval, with the believed J's gains; and if its upper end is believed."""
     inertia = case.inertia_kg_m2
     law = tuned_controller(case.string, inertia.value, softness, held[0], share)
     upper = tuned_controller(case.string, inertia.high, softness, held[0], share)
-    wanted = [(inertia.low, law), (inertia.high, law), (inertia.value, upper)]
+    wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
     return all(_is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted)
 
 

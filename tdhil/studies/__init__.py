@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         write_study as write_study,
     )
     from tdhil.studies.registry import simulated_studies as simulated_studies
+    from tdhil.studies.soft_torque import SOFT_TORQUE as SOFT_TORQUE
     from tdhil.studies.settings_files import load_study_file as load_study_file, with_assignments as with_assignments
     from tdhil.studies.study import Study as Study, StudyOutcome as StudyOutcome
 else:
@@ -26,6 +27,7 @@ else:
                 "write_report", "write_study",
             ),
             "registry": ("simulated_studies",),
+            "soft_torque": ("SOFT_TORQUE",),
             "settings_files": ("load_study_file", "with_assignments"),
             "study": ("Study", "StudyOutcome"),
         },
