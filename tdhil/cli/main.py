@@ -16,6 +16,8 @@ _COMMANDS = {
     "identify": "put a drive into motion and identify its moment of inertia",
     "replay": "identify again from a log, or from a trace that a drive's own tool exported",
     "fleet": "identify many logs again, into one table: by processes here, or on a Dask cluster",
+    "trend": "did a rig change over time? From the table of a fleet",
+    "compare": "two runs or more side by side: settings, inertias, whether they differ",
     "watch": "identify new logs in a folder as they come",
     "tune": "from J to a speed controller that damps the drill string; nothing moves",
     "export": "a log's CAN frames or samples in another program's format",
@@ -99,6 +101,10 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.cli.fleet import add_watch_arguments as add_arguments
     elif name == "tune":
         from tdhil.cli.tune import add_arguments
+    elif name == "trend":
+        from tdhil.cli.trend import add_arguments
+    elif name == "compare":
+        from tdhil.cli.trend import add_compare_arguments as add_arguments
     elif name == "stop":
         from tdhil.cli.stop import add_arguments
     elif name == "study":

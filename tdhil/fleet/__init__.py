@@ -5,6 +5,10 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from tdhil.fleet.changes import (
+        Difference as Difference, History as History, Measured as Measured, difference as difference,
+        history as history,
+    )
     from tdhil.fleet.fleet import (
         FleetRequest as FleetRequest, FleetSummary as FleetSummary, Progress as Progress, find_logs as find_logs,
         run_fleet as run_fleet,
@@ -13,14 +17,20 @@ if TYPE_CHECKING:
     from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings
     from tdhil.fleet.table import read_table as read_table
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
+    from tdhil.fleet.trend import (
+        Compared as Compared, compare_document as compare_document, identified as identified,
+        trend_document as trend_document,
+    )
 else:
     __getattr__, __dir__ = lazy_face(
         __name__,
         {
+            "changes": ("Difference", "History", "Measured", "difference", "history"),
             "fleet": ("FleetRequest", "FleetSummary", "Progress", "find_logs", "run_fleet"),
             "pool": ("TaskLimits",),
             "rows": ("FleetRow", "Settings"),
             "table": ("read_table",),
             "task": ("Done", "LogTask", "identify_log"),
+            "trend": ("Compared", "compare_document", "identified", "trend_document"),
         },
     )

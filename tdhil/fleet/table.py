@@ -211,7 +211,7 @@ def _cell(value: Any) -> str:
     """Numbers as Python writes them: read back, they are the same to the last bit."""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return "" if value is None else repr(value) if isinstance(value, float) else str(value)
+    return "" if value is None else repr(float(value)) if isinstance(value, float) else str(value)
 
 
 def _read_csv(path: Path) -> list[dict[str, Any]]:

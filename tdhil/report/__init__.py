@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from tdhil.report.html import check_report_path as check_report_path, write_report as write_report
     from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console
     from tdhil.report.page import (
-        STYLE as STYLE, has_extra as has_extra, install_command as install_command,
+        STYLE as STYLE, has_extra as has_extra, inline_svg as inline_svg,
+        install_command as install_command,
         repeatable_figures as repeatable_figures, require_extra as require_extra,
     )
     from tdhil.report.plots import draw_run as draw_run
@@ -30,7 +31,7 @@ else:
             "document": ("SIMULATED", "result_document"),
             "html": ("check_report_path", "write_report"),
             "live": ("LiveDisplay", "stderr_console"),
-            "page": ("STYLE", "has_extra", "install_command", "repeatable_figures", "require_extra"),
+            "page": ("STYLE", "has_extra", "inline_svg", "install_command", "repeatable_figures", "require_extra"),
             "plots": ("draw_run",),
             "tuning": ("TunedFor", "print_tuning", "showcase_of", "tuning_document", "write_tuning_report"),
         },

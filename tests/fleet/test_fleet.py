@@ -16,25 +16,8 @@ from tdhil.errors import UsageError
 from tdhil.fleet import FleetRequest, LogTask, Settings, TaskLimits, find_logs, identify_log, read_table, run_fleet
 from tdhil.fleet import cluster as cluster_module
 from tests.fleet import poison
-from tests.fleet.simulated_logs import rig_plants, write_rig
 
 pytestmark = pytest.mark.one_worker("fleet")
-
-
-@pytest.fixture(scope="module")
-def few(tmp_path_factory):
-    """Three runs of one rig, and what a folder may hold besides."""
-    folder = tmp_path_factory.mktemp("fleet") / "logs"
-    folder.mkdir()
-    logs = list(write_rig(folder, rig_plants(1)[0], 3, 5, periods=2))
-    (folder / "below").mkdir()
-    whole = logs[0].read_bytes()
-    (folder / "below" / "cut.mcap").write_bytes(whole[:len(whole) * 3 // 4])
-    (folder / "empty.mcap").touch()
-    (folder / "corrupt.mcap").write_bytes(whole[:8] + random.Random(1).randbytes(5000))
-    (folder / "other.mcap").write_bytes(b"not a log")
-    (folder / "shaft.csv").write_text("time_s,speed_rad_s,torque_nm\n0,1,2\n")
-    return folder
 
 
 @pytest.fixture

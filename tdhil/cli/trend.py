@@ -1,0 +1,229 @@
+"""`tdhil trend` and `tdhil compare`: did this rig change, and do these runs differ?"""
+
+from __future__ import annotations
+
+import argparse
+import html
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tdhil.cli.arguments import share
+from tdhil.config import MODELS
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
+_COLOURS = ("#0b5cad", "#c2410c", "#15803d", "#7e22ce", "#525252", "#b45309", "#0e7490", "#be123c")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of trend."""
+    parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
+    parser.add_argument("--rig", required=True, metavar="NAME", help="whose results, by its name in rig.yaml")
+    _add_output(parser)
+    parser.set_defaults(run=run)
+
+
+def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of compare."""
+    parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
+                        help="two or more; each is held beside the first")
+    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: each run's, or auto)")
+    parser.add_argument("--confidence", type=share, metavar="P", help="of the intervals (default: each run's, or 0.95)")
+    _add_output(parser)
+    parser.set_defaults(run=run_compare)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    parser.add_argument("--report", type=Path, metavar="FILE.html", help="with a picture, in one file (extra `report`)")
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read the table, say what changed."""
+    from tdhil.fleet import read_table, trend_document
+
+    _check_report(namespace.report, (namespace.table,))
+    document = trend_document(read_table(namespace.table), namespace.rig)
+    if namespace.json:
+        _print_json(document)
+    else:
+        _print_trend(document)
+    if namespace.report is not None:
+        title = f"{document['rig']} over time"
+        lines = [f"{one['name']}: {one['text']}" for one in document["quantities"]] + list(document["notes"])
+        _write(namespace.report, title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
+    return 0
+
+
+def run_compare(namespace: argparse.Namespace) -> int:
+    """Identify each, hold them beside the first."""
+    from tdhil.fleet import Settings, compare_document, identified
+
+    if len(namespace.logs) < 2:
+        raise UsageError("one log has nothing to be compared with", next_step="Name two or more")
+    for log in namespace.logs:
+        if not log.is_file():
+            raise UsageError("there is no such log", where=str(log), next_step="Name a run.mcap of this tool")
+    if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
+        raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
+    _check_report(namespace.report, namespace.logs)
+    settings = Settings(namespace.model, namespace.confidence)
+    document = compare_document([identified(log, settings) for log in namespace.logs])
+    if namespace.json:
+        _print_json(document)
+    else:
+        _print_compared(document)
+    if namespace.report is not None:
+        lines = [f"{one['to']}: {one['text']}" for one in document["differences"]]
+        _write(namespace.report, "Runs compared", lines, _settings_html(document),
+               lambda figure: _draw_curves(figure, document), (7.2, 3.4))
+    return 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# On the terminal
+
+
+def _print_json(document: Mapping[str, Any]) -> None:
+    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def _print_trend(document: Mapping[str, Any]) -> None:
+    from tdhil.report import PlainConsole
+
+    console = PlainConsole()
+    console.print(f"rig {document['rig']}: {document['results']} results that stand, of {document['logs']} logs")
+    for one in document["quantities"]:
+        console.print(f"{one['name']}: {one['text']}", soft_wrap=True)
+    for note in document["notes"]:
+        console.print(f"note: {note}", soft_wrap=True)
+
+
+def _print_compared(document: Mapping[str, Any]) -> None:
+    from rich.table import Table
+
+    from tdhil.report import PlainConsole
+
+    console = PlainConsole()
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    table.add_column("setting")
+    for log in document["logs"]:
+        table.add_column(Path(log).name, overflow="fold")
+    for one in document["settings"]:
+        table.add_row("≠" if one["differs"] else "", one["name"], *one["values"])
+    table.add_section()
+    table.add_row("", "verdict", *(one["verdict"] for one in document["results"]))
+    table.add_row("", "J, kg·m²", *(_inertia_text(one) for one in document["results"]))
+    for hertz, values in _by_line(document).items():
+        table.add_row("", f"apparent J, {hertz:.4g} Hz", *("–" if one is None else f"{one:.4g}" for one in values))
+    console.print(table)
+    for one in document["differences"]:
+        console.print(f"{one['from']} and {one['to']}: {one['text']}", soft_wrap=True)
+        rest = [f"{other['name']} {'differs' if other['differs'] else 'no difference seen'}"
+                for other in one["quantities"] if other["column"] != "inertia_kg_m2"]
+        if rest:
+            console.print("  " + ", ".join(rest), soft_wrap=True)
+
+
+def _inertia_text(row: Mapping[str, Any]) -> str:
+    value, low, high = (row[f"inertia{part}_kg_m2"] for part in ("", "_low", "_high"))
+    return "–" if value is None else f"{value:.5g} ({low:.5g} to {high:.5g})"
+
+
+def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:
+    """Apparent inertia by frequency, a column a log; the mean where a frequency stands there for more mean speeds."""
+    found: dict[float, list[float | None]] = {}
+    for number, lines in enumerate(document["apparent_inertia"]):
+        by_hertz: dict[float, list[float]] = {}
+        for line in lines:
+            if line["value"] is not None:
+                by_hertz.setdefault(round(line["hertz"], 6), []).append(line["value"])
+        for hertz, values in by_hertz.items():
+            row = found.setdefault(hertz, [None] * len(document["logs"]))
+            row[number] = sum(values) / len(values)
+    return dict(sorted(found.items()))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# In one file, with a picture
+
+
+def _check_report(path: Path | None, inputs: Sequence[Path]) -> None:
+    if path is None:
+        return
+    from tdhil.report import require_extra
+
+    if path.suffix != ".html":
+        raise UsageError("must end in .html", where=f"--report {path}")
+    if path.exists() or any(path.resolve() == one.resolve() for one in inputs):
+        raise UsageError("is there already; it is left as it is", where=f"--report {path}", next_step="Name another")
+    require_extra("--report")
+
+
+def _write(
+    path: Path, title: str, lines: Sequence[str], table: str, draw: Any, size_in: tuple[float, float]
+) -> None:
+    from tdhil.report import STYLE, inline_svg
+
+    said = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    page = (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f"<style>{STYLE}</style><h1>{html.escape(title)}</h1><ul>{said}</ul>{inline_svg(draw, size_in)}{table}</html>\n"
+    )
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(page)
+    except OSError as error:
+        raise UsageError(f"can't be written: {error.strerror or error}", where=f"--report {path}") from error
+
+
+def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
+    shown = [one for one in document["quantities"] if one["points"]]
+    axes: Any = figure.subplots(max(1, len(shown)), 1, squeeze=False)[:, 0]
+    for one, axis in zip(shown, axes, strict=False):
+        points = one["points"]
+        places = range(len(points))
+        values = [point["value"] for point in points]
+        axis.errorbar(
+            places, values, fmt="o", ms=3, lw=1, color=_COLOURS[0],
+            yerr=[[max(0.0, point["value"] - point["low"]) for point in points],
+                  [max(0.0, point["high"] - point["value"]) for point in points]])
+        logs = [point["log"] for point in points]
+        for change in one["changes"]:
+            axis.axvline(logs.index(change["after"]) - 0.5, color=_COLOURS[1], lw=1)
+        axis.set_ylabel(f"{one['name']}\n{one['unit']}")
+        axis.grid(alpha=0.3)
+        step = max(1, len(points) // 8)
+        axis.set_xticks([*places][::step], [str(point["date"] or "")[:10] for point in points][::step])
+
+
+def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
+    axis: Any = figure.subplots()
+    for number, (log, lines) in enumerate(zip(document["logs"], document["apparent_inertia"], strict=True)):
+        known = [line for line in lines if None not in (line["value"], line["low"], line["high"])]
+        axis.errorbar(
+            [line["hertz"] for line in known], [line["value"] for line in known],
+            yerr=[[max(0.0, line["value"] - line["low"]) for line in known],
+                  [max(0.0, line["high"] - line["value"]) for line in known]],
+            fmt="o", ms=3, lw=1, color=_COLOURS[number % len(_COLOURS)], label=Path(log).name)
+    axis.set_xlabel("Hz")
+    axis.set_ylabel("apparent inertia, kg·m²")
+    axis.grid(alpha=0.3)
+    axis.legend(frameon=False)
+
+
+def _settings_html(document: Mapping[str, Any]) -> str:
+    head = "".join(f"<th>{html.escape(Path(log).name)}</th>" for log in document["logs"])
+    rows = "".join(
+        f"<tr><td>{'≠' if one['differs'] else ''}</td><td>{html.escape(one['name'])}</td>"
+        + "".join(f"<td>{html.escape(value)}</td>" for value in one["values"]) + "</tr>"
+        for one in document["settings"]
+    )
+    return f'<table class="claims"><tr><th></th><th>setting</th>{head}</tr>{rows}</table>'

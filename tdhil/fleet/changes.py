@@ -1,0 +1,262 @@
+"""Did it change? Differences of two results, and changes in a history of them, with the shared torque scale taken out.
+
+Pure: numbers in, numbers out. The terminal, a page and a web service use these same functions.
+
+**What a result is.** An inverter's torque is right but for a factor, which is the same in every run on that drive, and
+goes straight into J, into viscous and into Coulomb friction. With the true value θ,
+
+    ln x_k = ln θ_k + s_d(k) + e_k,    s_d ~ N(0, σ_s²) once for each drive d,    e_k ~ N(0, σ_k²) for each run.
+
+The interval ``low`` to ``high`` (repeatability) is that of e_k alone; σ_k is half its width in ln x over the normal
+quantile of its confidence. A part of it (filters that nobody stated, say) is alike in runs on one rig; it is taken for
+independent here, which makes differences wider than they are, not narrower. Quantities that torque doesn't scale (lags)
+or that may be zero (skew) go the same way without logarithm, with s = 0.
+
+**A difference** of two results on one drive has s in both: it cancels, and the variance is σ_a² + σ_b². On two drives
+it is σ_a² + σ_b² + σ_s,a² + σ_s,b².
+
+**A history.** x = ln x_k is normal about μ·1 + δ·h, where h is 0 before a step and 1 from it on, or rises evenly with
+time from 0 to 1 (drift); μ is anything (flat). Its covariance is Σ = κ² diag(σ_k²) + Σ_d σ_s² 1_d 1_dᵀ. κ says that
+intervals may be too narrow or too wide for what happens from run to run: it is averaged over, as is the size of the
+change, δ ~ N(0, τ²). With P = Σ⁻¹ − Σ⁻¹1(1ᵀΣ⁻¹1)⁻¹1ᵀΣ⁻¹, which takes μ out, a = hᵀPh and b = hᵀPx,
+
+    ln p(x | κ, none) = −½ (ln|Σ| + ln 1ᵀΣ⁻¹1 + xᵀPx) + const
+    p(x | κ, h, τ) / p(x | κ, none) = (1 + τ²a)^−½ exp(½ τ²b² / (1 + τ²a)),
+
+since the change adds τ²hhᵀ to the covariance (Sherman and Morrison, and the matrix determinant lemma). Bayes' rule over
+none (½), a step (¼, evenly over its places) and drift (¼) gives the probabilities. If the prior is right, "no change"
+has less than 10 % in at most 1 of 9 histories without one (Markov's inequality); what happens is measured in
+``benchmarks/trend_power.py``: 0 to 1.5 %.
+
+Only ever one step or drift is asked for at a time. Where there is a step, either side of it is asked again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+ALARM: Final = 0.1
+"""A change is named where "no change" has less than this."""
+LEAST: Final = 4
+"""Results that a history must have; fewer can be compared in pairs."""
+
+_SPREAD: Final = ((0.5, 0.10), (0.7, 0.20), (1.0, 0.40), (1.4, 0.15), (2.0, 0.10), (2.8, 0.05))     # κ, its prior
+_SIZES: Final = (2.0, 4.0, 8.0, 16.0, 32.0)            # τ in units of the median σ_k, each as likely
+_PRIOR: Final = {"none": 0.5, "step": 0.25, "drift": 0.25}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One result: ``low`` to ``high`` at ``confidence``, repeatability alone.
+
+    ``scale_rel_sd``: how right the torque scale is, 1 sd, 0 for what torque doesn't scale; ``drive``: whose scale it
+    is, None where that isn't known, and then it is nobody else's. ``time``: any measure of when, rising.
+    """
+
+    value: float
+    low: float
+    high: float
+    confidence: float = 0.95
+    scale_rel_sd: float = 0.0
+    drive: str | None = None
+    time: float = 0.0
+
+
+@dataclass(frozen=True)
+class Difference:
+    """From one result to another. ``change`` with its interval is a share of the first where ``relative``, else
+    absolute. ``probability``: that the true change has the sign that was found. ``shared_scale``: the torque scale is
+    the same in both and has cancelled.
+    """
+
+    change: float
+    low: float
+    high: float
+    confidence: float
+    relative: bool
+    shared_scale: bool
+    probability: float
+
+    @property
+    def differs(self) -> bool:
+        """Does the interval leave out zero?"""
+        return self.low > 0.0 or self.high < 0.0
+
+
+def difference(before: Measured, after: Measured, confidence: float = 0.95) -> Difference:
+    """What changed from one result to another, and how sure that is. Raises ValueError for intervals that are none."""
+    relative = all(min(one.value, one.low) > 0.0 for one in (before, after))
+    shared = before.drive is not None and before.drive == after.drive
+    (x_a, sd_a), (x_b, sd_b) = (_on_scale(one, relative) for one in (before, after))
+    variance = sd_a**2 + sd_b**2
+    if not shared:
+        variance += sum((one.scale_rel_sd * (1.0 if relative else abs(one.value))) ** 2 for one in (before, after))
+    sd = math.sqrt(variance)
+    found, half = x_b - x_a, NormalDist().inv_cdf(0.5 + 0.5 * confidence) * sd
+    out = math.expm1 if relative else float
+    probability = 0.5 if sd == 0.0 and found == 0.0 else 1.0 if sd == 0.0 else NormalDist().cdf(abs(found) / sd)
+    return Difference(out(found), out(found - half), out(found + half), confidence, relative, shared, probability)
+
+
+@dataclass(frozen=True)
+class ChangePoint:
+    """A step between result ``at - 1`` and result ``at``. ``probability``: that there is a step at all in the stretch
+    that was looked at; ``here``: that it is at this place, if there is one. ``change`` as in `Difference`.
+    """
+
+    at: int
+    probability: float
+    here: float
+    change: Difference
+
+
+@dataclass(frozen=True)
+class History:
+    """What a history says. ``none``, ``step`` and ``drift`` add up to one; of ``changes`` and ``drift_change`` there is
+    nothing where "no change" isn't ruled out. ``drift_change``: from the first result to the last.
+    """
+
+    none: float
+    step: float
+    drift: float
+    changes: tuple[ChangePoint, ...]
+    drift_change: Difference | None
+    relative: bool
+
+    @property
+    def changed(self) -> bool:
+        """Is "no change" ruled out?"""
+        return self.none < ALARM
+
+
+def history(results: Sequence[Measured], confidence: float = 0.95) -> History:
+    """Look for a step or a drift. Raises ValueError for fewer than `LEAST` results, or times that fall."""
+    if len(results) < LEAST:
+        raise ValueError(f"{len(results)} results: a history needs {LEAST}")
+    time = np.array([one.time for one in results])
+    if np.any(np.diff(time) < 0.0):
+        raise ValueError("results must be in the order of their times")
+    relative = all(min(one.value, one.low) > 0.0 for one in results)
+    x, sd = (np.array(column) for column in zip(*(_on_scale(one, relative) for one in results), strict=True))
+    if not np.all(sd > 0.0):
+        raise ValueError("an interval of no width")
+    shared = _shared(results, relative)
+    whole = _evidence(x, sd, shared, time)
+    drifts = whole.none < ALARM and whole.drift > whole.step
+    changes = () if drifts or whole.none >= ALARM else tuple(_steps(x, sd, shared, time, 0, confidence, relative))
+    return History(
+        whole.none, whole.step, whole.drift, changes,
+        _size(whole.drift_size, whole.drift_sd, confidence, relative) if drifts else None, relative,
+    )
+
+
+def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
+    """Logarithm of the value with its sd, or the value itself with its."""
+    if not one.low <= one.high or not 0.0 < one.confidence < 1.0:
+        raise ValueError(f"no interval: {one.low:g} to {one.high:g} at {one.confidence:g}")
+    quantile = NormalDist().inv_cdf(0.5 + 0.5 * one.confidence)
+    if relative:
+        return math.log(one.value), (math.log(one.high) - math.log(one.low)) / (2.0 * quantile)
+    return one.value, (one.high - one.low) / (2.0 * quantile)
+
+
+def _shared(results: Sequence[Measured], relative: bool) -> FloatArray:
+    """Covariance of what drives' torque scales do."""
+    found = np.zeros((len(results), len(results)))
+    for i, one in enumerate(results):
+        for j, other in enumerate(results):
+            if i == j or (one.drive is not None and one.drive == other.drive):
+                size = 1.0 if relative else one.value * other.value
+                found[i, j] = one.scale_rel_sd * other.scale_rel_sd * size
+    return found
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    none: float
+    step: float
+    drift: float
+    places: FloatArray          # of a step, if there is one: before result 1, 2, …
+    step_size: FloatArray
+    step_sd: FloatArray
+    drift_size: float
+    drift_sd: float
+
+
+def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray) -> _Evidence:
+    n = len(x)
+    steps = np.tri(n, n - 1, -1)                               # column c: 0 up to result c, then 1
+    span = time[-1] - time[0]
+    rise = (time - time[0]) / span if span > 0.0 else np.arange(n) / (n - 1.0)
+    shapes = np.column_stack((steps, rise))
+    sizes = np.median(sd) * np.array(_SIZES)
+    weights, ratios, means, variances = [], [], [], []
+    for spread, prior in _SPREAD:
+        inverse = np.linalg.inv(spread**2 * np.diag(sd**2) + shared)
+        ones = inverse.sum(axis=1)
+        total = float(ones.sum())
+        projected = inverse - np.outer(ones, ones) / total
+        _, log_det = np.linalg.slogdet(inverse)
+        weights.append(math.log(prior) + 0.5 * (log_det - math.log(total) - float(x @ projected @ x)))
+        a = np.einsum("ij,ij->j", shapes, projected @ shapes)
+        b = shapes.T @ (projected @ x)
+        gain = 1.0 + np.outer(sizes**2, a)
+        log_ratio = -0.5 * np.log(gain) + 0.5 * np.outer(sizes**2, b**2) / gain
+        top = log_ratio.max(axis=0)
+        ratios.append(top + np.log(np.exp(log_ratio - top).mean(axis=0)))
+        means.append(b / a)
+        variances.append(1.0 / a)
+    # p(x | model), κ averaged over; all of them by the same factor
+    base = max(weights)
+    none = sum(math.exp(one - base) for one in weights)
+    by_spread = np.array([weight - base + ratio for weight, ratio in zip(weights, ratios, strict=True)])
+    top = by_spread.max(axis=0)
+    log_each = top + np.log(np.exp(by_spread - top).sum(axis=0))
+    highest = max(math.log(none), float(log_each.max()))
+    each = np.exp(log_each - highest)
+    p_none = _PRIOR["none"] * math.exp(math.log(none) - highest)
+    p_steps = _PRIOR["step"] * each[:-1] / (n - 1.0)
+    p_drift = _PRIOR["drift"] * float(each[-1])
+    whole = p_none + float(p_steps.sum()) + p_drift
+    posterior = np.exp(by_spread - log_each)                   # of κ, for each shape
+    mean = np.sum(posterior * np.array(means), axis=0)
+    second = np.sum(posterior * (np.array(variances) + np.array(means) ** 2), axis=0)
+    deviation = np.sqrt(np.maximum(second - mean**2, 0.0))
+    places = p_steps / max(float(p_steps.sum()), 1e-300)
+    return _Evidence(
+        p_none / whole, float(p_steps.sum()) / whole, p_drift / whole, places, mean[:-1], deviation[:-1],
+        float(mean[-1]), float(deviation[-1]),
+    )
+
+
+def _steps(
+    x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray, first: int, confidence: float, relative: bool
+) -> list[ChangePoint]:
+    """The steps of one stretch, in their order; ``first``: number of its first result."""
+    if len(x) < LEAST:
+        return []
+    found = _evidence(x, sd, shared, time)
+    if found.none >= ALARM or found.step <= found.drift:
+        return []
+    at = int(np.argmax(found.places)) + 1
+    change = _size(float(found.step_size[at - 1]), float(found.step_sd[at - 1]), confidence, relative)
+    point = ChangePoint(first + at, found.step, float(found.places[at - 1]), change)
+    before = _steps(x[:at], sd[:at], shared[:at, :at], time[:at], first, confidence, relative)
+    after = _steps(x[at:], sd[at:], shared[at:, at:], time[at:], first + at, confidence, relative)
+    return [*before, point, *after]
+
+
+def _size(mean: float, sd: float, confidence: float, relative: bool) -> Difference:
+    half = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * sd
+    out = math.expm1 if relative else float
+    probability = NormalDist().cdf(abs(mean) / sd) if sd > 0.0 else 1.0
+    return Difference(out(mean), out(mean - half), out(mean + half), confidence, relative, True, probability)

@@ -1,0 +1,258 @@
+"""One rig over time, and some runs side by side: what the rows and results say about a change, as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from tdhil.errors import UsageError
+from tdhil.fleet.changes import LEAST, Difference, History, Measured, difference, history
+from tdhil.fleet.rows import FleetRow, Settings, row_of
+from tdhil.fleet.task import content_hash, read_any
+
+_GOOD: Final = ("valid", "valid_wide")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of the table that is followed. ``scaled``: torque's scale is in it."""
+
+    name: str
+    column: str
+    low: str
+    high: str
+    unit: str
+    scaled: bool
+
+
+QUANTITIES: Final = (
+    Quantity("inertia", "inertia_kg_m2", "inertia_low_kg_m2", "inertia_high_kg_m2", "kg·m²", True),
+    Quantity("viscous friction", "viscous_nm_s_rad", "viscous_low_nm_s_rad", "viscous_high_nm_s_rad", "N·m·s/rad",
+             True),
+    Quantity("Coulomb friction", "coulomb_nm", "coulomb_low_nm", "coulomb_high_nm", "N·m", True),
+    Quantity("lag of speed", "speed_lag_s", "speed_lag_low_s", "speed_lag_high_s", "s", False),
+    Quantity("lag of torque", "torque_lag_s", "torque_lag_low_s", "torque_lag_high_s", "s", False),
+)
+
+
+def measured(row: FleetRow, quantity: Quantity, time: float = 0.0) -> Measured | None:
+    """A row's value with its repeatability; None where it has none."""
+    value, low, high = (getattr(row, name) for name in (quantity.column, quantity.low, quantity.high))
+    if value is None or low is None or high is None or not low < high:
+        return None
+    # Friction and lags are stated at the confidence of the run's own settings, which is J's.
+    scale = (row.torque_scale_rel_sd or 0.0) if quantity.scaled else 0.0
+    return Measured(value, low, high, row.confidence or 0.95, scale, drive_of(row), time)
+
+
+def drive_of(row: FleetRow) -> str | None:
+    """Whose torque scale it is. A drive without a serial number is taken for its rig's, by name and profile."""
+    if row.drive_serial:
+        return f"{row.drive_vendor}:{row.drive_product}:{row.drive_serial}"
+    named = (row.rig, row.drive_name, row.profile)
+    return None if row.rig is None else "assumed " + "|".join(str(one) for one in named)
+
+
+def trend_document(rows: Sequence[FleetRow], rig: str) -> dict[str, Any]:
+    """What a rig's results say over time, as ``tdhil trend --json`` prints it. Raises UsageError for an unknown rig.
+
+    Only results that stand count. Differences have the torque scale taken out where it is one drive's.
+    """
+    mine = [row for row in rows if row.rig == rig]
+    if not mine:
+        known = sorted({row.rig for row in rows if row.rig is not None})
+        shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
+        raise UsageError(f"no log is of a rig {rig!r}", where="--rig",
+                         next_step=f"There are: {shown}" if known else "No log in the table names its rig")
+    standing = [row for row in mine if row.verdict in _GOOD]
+    dated = sorted(((_time_s(row), row) for row in standing if _time_s(row) is not None),
+                   key=lambda one: (one[0], one[1].log))
+    kept = [(float(time_s or 0.0), row) for time_s, row in dated]
+    notes = []
+    if len(mine) > len(standing):
+        notes.append(f"{len(mine) - len(standing)} of {len(mine)} logs have no result that stands: left out")
+    if len(standing) > len(kept):
+        notes.append(f"{len(standing) - len(kept)} logs don't say when they were recorded: left out")
+    if len({row.simulated for _, row in kept}) > 1:
+        notes.append("simulated runs and real ones are mixed")
+    drives = {drive_of(row) for _, row in kept}
+    if len(drives) > 1:
+        notes.append(f"{len(drives)} drives: each has a torque scale of its own, which stays in their differences")
+    if any((one or "assumed").startswith("assumed") for one in drives):
+        notes.append("the drive tells no serial number: runs on this rig are taken for runs on one drive")
+    return {
+        "rig": rig, "logs": len(mine), "results": len(kept), "notes": notes,
+        "quantities": [_followed(quantity, kept) for quantity in QUANTITIES],
+    }
+
+
+def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dict[str, Any]:
+    points = [(row, one) for time_s, row in rows if (one := measured(row, quantity, time_s)) is not None]
+    document: dict[str, Any] = {
+        "name": quantity.name, "column": quantity.column, "unit": quantity.unit,
+        "points": [{"log": row.log, "date": row.date, "value": one.value, "low": one.low, "high": one.high}
+                   for row, one in points],
+        "probability": None, "changes": [], "drift": None,
+    }
+    if len(points) < LEAST:
+        return document | {"text": f"{len(points)} results: {LEAST} are needed for a trend"}
+    found = history([one for _, one in points])
+    document["probability"] = {"none": found.none, "step": found.step, "drift": found.drift}
+    document["changes"] = [
+        {
+            "before": points[change.at - 1][0].log, "after": points[change.at][0].log,
+            "before_date": points[change.at - 1][0].date, "after_date": points[change.at][0].date,
+            "probability": change.probability, "here": change.here, "change": asdict(change.change),
+        }
+        for change in found.changes
+    ]
+    document["drift"] = None if found.drift_change is None else asdict(found.drift_change)
+    return document | {"text": _trend_text(found, document, quantity.unit)}
+
+
+def _trend_text(found: History, document: Mapping[str, Any], unit: str) -> str:
+    if not found.changed:
+        return f"no change is named: \"no change\" has {found.none:.0%}"
+    if found.drift_change is not None:
+        return (f"drifts by {_change_text(found.drift_change, unit)} from first to last "
+                f"(a change {1 - found.none:.1%}, a drift {found.drift:.0%})")
+    steps = [
+        f"changed by {_change_text(point.change, unit)} between {one['before_date'] or one['before']} and "
+        f"{one['after_date'] or one['after']} (a step {point.probability:.1%}, just there {point.here:.0%})"
+        for point, one in zip(found.changes, document["changes"], strict=True)
+    ]
+    return "; ".join(steps) or f"changed ({1 - found.none:.1%}), but where isn't clear"
+
+
+def _change_text(change: Difference, unit: str) -> str:
+    if change.relative:
+        return f"{change.change:+.2%} ({change.low:+.2%} to {change.high:+.2%})"
+    return f"{change.change:+.4g} ({change.low:+.4g} to {change.high:+.4g}) {unit}"
+
+
+def _time_s(row: FleetRow) -> float | None:
+    if row.date is None:
+        return None
+    try:
+        found = datetime.fromisoformat(row.date)
+    except ValueError:
+        return None
+    return found.timestamp()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Some runs side by side
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One log as it is compared: its row, its result document, and what it was run with, by name."""
+
+    row: FleetRow
+    document: Mapping[str, Any]
+    settings: Mapping[str, str]
+
+
+def identified(log: Path, settings: Settings) -> Compared:
+    """Identify one log for a comparison. Raises TdhilError."""
+    from tdhil.session import conclude
+
+    record = read_any(log)
+    record.require_motion()
+    found = conclude(record.recording, record.asked(settings.asked()), str(log), record.assumed).document
+    recording = record.recording
+    row = row_of(str(log), found, settings=settings, torque_scale_rel_sd=recording.torque_scale_rel_sd,
+                 sha256=content_hash(log))
+    return Compared(row, found, _settings(found, recording, record.configuration))
+
+
+def _settings(document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]) -> dict[str, str]:
+    rig, drive = document.get("rig") or {}, document.get("drive") or {}
+    excitation, prior = recording.excitation, recording.lag_prior
+    segments = () if excitation is None else excitation.segments
+    limits = rig.get("limits") or {}
+    identify = run.get("identify")
+    asked = identify if isinstance(identify, Mapping) else {}
+    found: dict[str, Any] = {
+        "date": document.get("date"),
+        "rig": rig.get("name") or rig.get("file"),
+        "load": rig.get("load"),
+        "drive": drive.get("name"),
+        "serial number": drive.get("serial"),
+        "revision": drive.get("revision"),
+        "profile": (document.get("profile") or {}).get("name"),
+        "connection": document.get("connection"),
+        "excitation": None if excitation is None else f"{excitation.kind}, {excitation.mode} mode",
+        "lines, Hz": ", ".join(sorted({" ".join(f"{hertz:.4g}" for hertz in one.lines_hz) for one in segments})),
+        "mean speeds, rad/s": ", ".join(f"{one.offset_rad_s:.3g}" for one in segments),
+        "periods used": document.get("periods_used"),
+        "cycles, Hz": (document.get("cycle") or {}).get("rate_hz"),
+        "gear": recording.gear_ratio,
+        "torque scale, 1 sd": recording.torque_scale_rel_sd,
+        "torque limit, N·m": recording.torque_limit_nm,
+        "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"
+        if {"speed_min_rad_s", "speed_max_rad_s"} <= set(limits) else None,
+        "stated lag of speed, s": prior.speed_lag_s,
+        "stated lag of torque, s": prior.torque_lag_s,
+        "model": document.get("model"),
+        "confidence": asked.get("confidence", 0.95),
+        "tolerance": asked.get("tolerance", 0.05),
+        "recorded by": document.get("recorded_by"),
+        "simulated": document.get("simulated"),
+        "complete": document.get("complete"),
+    }
+    return {name: "–" if value in (None, "") else f"{value:.6g}" if isinstance(value, float) else str(value)
+            for name, value in found.items()}
+
+
+def compare_document(runs: Sequence[Compared]) -> dict[str, Any]:
+    """Settings side by side, what differs marked; differences from the first; apparent inertia, line by line.
+
+    As ``tdhil compare --json`` prints it. Of each quantity the sentence says whether it differs.
+    """
+    first, *others = runs
+    return {
+        "logs": [run.row.log for run in runs],
+        "results": [asdict(run.row) for run in runs],
+        "settings": [
+            {"name": name, "values": [run.settings[name] for run in runs],
+             "differs": len({run.settings[name] for run in runs}) > 1}
+            for name in first.settings
+        ],
+        "differences": [_differences(first.row, other.row) for other in others],
+        "apparent_inertia": [
+            [{"hertz": line["hertz"], **line["apparent_inertia_kg_m2"]} for line in run.document.get("lines") or ()]
+            for run in runs
+        ],
+    }
+
+
+def _differences(first: FleetRow, other: FleetRow) -> dict[str, Any]:
+    found: dict[str, Any] = {"from": first.log, "to": other.log, "quantities": []}
+    for quantity in QUANTITIES:
+        before, after = measured(first, quantity), measured(other, quantity)
+        if before is None or after is None:
+            continue
+        told = difference(before, after)
+        found["quantities"].append({
+            "name": quantity.name, "column": quantity.column, "unit": quantity.unit, **asdict(told),
+            "differs": told.differs,
+        })
+    return found | {"text": _compare_text(first, other, found["quantities"])}
+
+
+def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping[str, Any]]) -> str:
+    inertia = next((one for one in quantities if one["column"] == "inertia_kg_m2"), None)
+    if inertia is None:
+        without = first if first.inertia_kg_m2 is None else other
+        return f"the inertia can't be compared: {without.log} has no result that stands ({without.verdict})"
+    told = Difference(**{name: inertia[name] for name in Difference.__dataclass_fields__})
+    scale = "the torque scale is one drive's and cancels" if told.shared_scale else (
+        "two drives: the torque scale of each is in it")
+    if told.shared_scale and not (first.drive_serial and other.drive_serial):
+        scale = "no serial numbers: taken for one drive, whose torque scale cancels"
+    says = "differ" if told.differs else "can't be told apart"
+    return f"the inertias {says}: {_change_text(told, 'kg·m²')} at {told.confidence:.0%}; {scale}"

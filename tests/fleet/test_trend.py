@@ -1,0 +1,103 @@
+"""`tdhil trend` and `tdhil compare`, from rows and logs to sentences."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.trend_power import draw
+from tdhil.cli.main import main
+from tdhil.errors import UsageError
+from tdhil.fleet.rows import FleetRow
+from tdhil.fleet.table import write_table
+from tdhil.fleet.trend import trend_document
+
+
+def rows(kind, count=24, serial=7):
+    results, at = draw(np.random.default_rng(12), kind, count)
+    return [
+        FleetRow(
+            f"R7-{k:02d}.mcap", "valid", rig="R7", date=f"2026-01-{k + 1:02d}T08:00:00+00:00", simulated=False,
+            inertia_kg_m2=one.value, inertia_low_kg_m2=one.low, inertia_high_kg_m2=one.high, confidence=0.95,
+            torque_scale_rel_sd=0.03, drive_vendor=1, drive_product=2, drive_serial=serial, speed_lag_s=0.4,
+            speed_lag_low_s=0.39, speed_lag_high_s=0.41)
+        for k, one in enumerate(results)
+    ], at
+
+
+@pytest.fixture
+def table(tmp_path):
+    found, _ = rows("step 5 %")
+    write_table([*found, FleetRow("other.mcap", "valid", rig="R8")], tmp_path / "fleet.csv")
+    return tmp_path / "fleet.csv"
+
+
+def test_a_step_is_named_with_its_place_and_size():
+    found, at = rows("step 5 %")
+    document = trend_document(found[::-1], "R7")
+    inertia, lag = document["quantities"][0], document["quantities"][3]
+    (change,) = inertia["changes"]
+    assert (change["before"], change["after"]) == (f"R7-{at - 1:02d}.mcap", f"R7-{at:02d}.mcap")
+    assert change["change"]["low"] < 0.05 < change["change"]["high"]
+    assert "changed by +" in inertia["text"]
+    assert f"between 2026-01-{at:02d}" in inertia["text"]
+    assert lag["changes"] == []
+    assert "no change is named" in lag["text"]
+    assert document["quantities"][1]["text"].startswith("0 results: 4 are needed")
+    assert document["notes"] == []
+    json.dumps(document, allow_nan=False)
+
+
+def test_what_was_left_out_and_assumed_is_said():
+    found, _ = rows("drift 5 %", serial=0)
+    odd = [replace(found[0], verdict="model_rejected"), replace(found[1], date=None), replace(found[2], simulated=True)]
+    document = trend_document([*odd, *found[3:]], "R7")
+    assert "drifts by +" in document["quantities"][0]["text"]
+    assert [note.split(":")[0] for note in document["notes"]] == [
+        "1 of 24 logs have no result that stands", "1 logs don't say when they were recorded",
+        "simulated runs and real ones are mixed", "the drive tells no serial number"]
+    two = trend_document([*found[:12], *(replace(row, drive_serial=9) for row in found[12:])], "R7")
+    assert any("2 drives" in note for note in two["notes"])
+    with pytest.raises(UsageError, match="There are: R7"):
+        trend_document(found, "R9")
+
+
+def test_the_command_trend(table, tmp_path, capsys):
+    report = tmp_path / "trend.html"
+    assert main(["trend", str(table), "--rig", "R7", "--report", str(report)]) == 0
+    assert "inertia: changed by +" in capsys.readouterr().out
+    text = report.read_text(encoding="utf-8")
+    assert "<svg" in text
+    assert "changed by +" in text
+    assert main(["trend", str(table), "--rig", "R7", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["results"] == 24
+    for wrong in (["--rig", "R9"], ["--rig", "R7", "--report", str(report)], ["--rig", "R7", "--report", "x.txt"]):
+        assert main(["trend", str(table), *wrong]) == 2
+    assert main(["trend", str(tmp_path / "none.csv"), "--rig", "R7"]) == 2
+
+
+@pytest.mark.one_worker("fleet")
+def test_the_command_compare(few, tmp_path, capsys):
+    """Two runs of one rig, of which the truth is alike."""
+    report = tmp_path / "compared.html"
+    logs = [str(few / "R1-001.mcap"), str(few / "R1-002.mcap")]
+    assert main(["compare", *logs, "--report", str(report), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    (told,) = document["differences"]
+    inertia = told["quantities"][0]
+    assert inertia["shared_scale"]
+    assert inertia["low"] < 0.0 < inertia["high"]
+    assert "the inertias can't be told apart" in told["text"]
+    differs = {one["name"]: one["differs"] for one in document["settings"]}
+    assert differs["date"]
+    assert not differs["rig"]
+    assert len(document["apparent_inertia"][0]) > 3
+    assert "<svg" in report.read_text(encoding="utf-8")
+    assert main(["compare", *logs]) == 0
+    text = capsys.readouterr().out
+    assert "apparent J, 0.1 Hz" in text
+    assert "can't be told apart" in text
+    assert main(["compare", logs[0]]) == 2
+    assert main(["compare", logs[0], str(tmp_path / "none.mcap")]) == 2
+    assert main(["compare", logs[0], str(few / "empty.mcap")]) == 10
