@@ -37,7 +37,7 @@ def test_contributing_names_what_is_there():
         assert not test or f"def {test.partition('[')[0]}(" in (ROOT / path).read_text(encoding="utf-8"), name
 
 
-@pytest.mark.parametrize("option", ["excitation", "model", "mode"])
+@pytest.mark.parametrize("option", ["excitation", "model", "mode", "drive"])
 def test_the_page_on_rig_yaml_names_every_choice(option):
     from tdhil.cli.main import build_parser
 
@@ -45,7 +45,7 @@ def test_the_page_on_rig_yaml_names_every_choice(option):
     (commands,) = [action for action in parser._actions if action.dest == "command"]
     (choices,) = [action.choices for action in commands.choices["identify"]._actions if action.dest == option]
     text = (ROOT / "docs" / "rig.md").read_text(encoding="utf-8")
-    (row,) = re.findall(rf"^\| `run\.{option}` .*$", text, re.MULTILINE)
+    (row,) = re.findall(rf"^\| `(?:run\.)?{option}` .*$", text, re.MULTILINE)
     assert [name for name in choices if f"`{name}`" not in row] == []
 
 
