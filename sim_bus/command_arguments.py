@@ -2,14 +2,19 @@
 
 import argparse
 import contextlib
+import math
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from profiles import TdhilError
+
+if TYPE_CHECKING:
+    from sim_bus.params import RigParams
 
 EXIT_OK = 0
 EXIT_USAGE = 2
@@ -22,8 +27,22 @@ class Unusable(Exception):
 def add_rig_arguments(group: argparse._ArgumentGroup) -> None:
     """The shaft and what is written of it."""
     group.add_argument("--plant", metavar="FILE", type=Path, help="YAML with other parameters of the rig")
+    group.add_argument("--gains", metavar=("P", "I"), nargs=2, type=_gain,
+                       help="of its speed loop, N·m·s/rad and N·m/rad at the motor, over those of --plant")
     group.add_argument("--seed", metavar="N", type=_seed, default=0, help="seed of all noise (default 0)")
     group.add_argument("--trace", metavar="FILE", type=Path, help="write what the true shaft does to this CSV file")
+
+
+def rig_of(namespace: argparse.Namespace) -> "RigParams":
+    """The rig of ``--plant``, with the gains of ``--gains``. DataFileError for a file that can't be used."""
+    from sim_bus.params import RigParams, load_rig
+
+    params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+    if namespace.gains is None:
+        return params
+    gain, integral = namespace.gains
+    own = {"speed_gain_nm_s_rad": gain, "speed_integral_gain_nm_rad": integral}
+    return params.model_copy(update={"drive": params.drive.model_copy(update=own)})
 
 
 def add_fault_argument(group: argparse._ArgumentGroup, such_as: str) -> None:
@@ -71,6 +90,14 @@ def number_from(lowest: int, highest: int, what: str) -> Callable[[str], int]:
         return int(text)
 
     return parse
+
+
+def _gain(text: str) -> float:
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if math.isfinite(value) and value >= 0.0:
+            return value
+    raise argparse.ArgumentTypeError(f"{text[:40]!r} is not a gain: a number from 0")
 
 
 def _seed(text: str) -> int:

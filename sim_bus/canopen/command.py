@@ -16,6 +16,7 @@ from sim_bus.command_arguments import (
     never_came,
     number_from,
     ready,
+    rig_of,
     until_stopped,
 )
 
@@ -52,11 +53,10 @@ def run(namespace: argparse.Namespace) -> int:
         from profiles import load_canopen_profile
         from sim_bus.canopen.faults import parse_all
         from sim_bus.canopen.simulator import Simulator
-        from sim_bus.params import RigParams, load_rig
 
         faults = parse_all(namespace.fault)
         profile = load_canopen_profile(namespace.profile) if namespace.profile is not None else None
-        params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+        params = rig_of(namespace)
         with _open_bus(namespace) as (bus, reached_by):
             simulator = Simulator(
                 bus, params, node_id=namespace.node, seed=namespace.seed, trace=namespace.trace,

@@ -12,6 +12,7 @@ from sim_bus.command_arguments import (
     never_came,
     number_from,
     ready,
+    rig_of,
     until_stopped,
 )
 
@@ -53,12 +54,11 @@ def run(namespace: argparse.Namespace) -> int:
         from sim_bus.modbus.machine import Machine
         from sim_bus.modbus.server import Server
         from sim_bus.modbus.wrong_maps import parse
-        from sim_bus.params import RigParams, load_rig
 
         if namespace.tcp is None and namespace.rtu is None:
             namespace.complain("one of the arguments --tcp --rtu is required")
         script = parse_all(namespace.fault, "rtu" if namespace.tcp is None else "tcp")
-        params = load_rig(namespace.plant) if namespace.plant is not None else RigParams()
+        params = rig_of(namespace)
         profile = load_modbus_profile(namespace.profile)
         line = profile.line
         names = [one.name for one in profile.parameters]
