@@ -345,7 +345,7 @@ class RunWriter:
     ) -> None:
         self.path = path
         self._raised = self._closing = False
-        self._looked_s = 0.0
+        self._checked_s = 0.0
         self._backlog = Backlog(queue_size or (STEPPED_QUEUE if block else REAL_TIME_QUEUE), block=block)
         try:
             free = shutil.disk_usage(path.absolute().parent).free
@@ -376,8 +376,8 @@ class RunWriter:
 
     def sample(self, sample: Sample) -> None:
         """One cycle's feedback; call it after the cycle's command and frames."""
-        if abs(sample[0] - self._looked_s) >= ALIVE_EVERY_S:
-            self._looked_s = sample[0]
+        if abs(sample[0] - self._checked_s) >= ALIVE_EVERY_S:
+            self._checked_s = sample[0]
             if not (self._closing or self._thread.is_alive()):
                 self._pump.failure = self._pump.failure or RuntimeError("its thread has ended")
                 self._backlog.end()

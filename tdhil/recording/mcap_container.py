@@ -143,7 +143,7 @@ class Container:
     def _put(self, data: bytes) -> None:
         """Writes all of ``data``, or leaves the file as it was before and raises OSError; LogGone where it is gone."""
         if self._watched:
-            self._look()
+            self._require_whole()
         left = memoryview(data)
         try:
             while left:
@@ -158,7 +158,7 @@ class Container:
             raise
         self._offset += len(data)
 
-    def _look(self) -> None:
+    def _require_whole(self) -> None:
         found = os.fstat(self._file.fileno())
         if not found.st_nlink:
             raise LogGone(errno.ENOENT, "the file was removed while it was being written")
