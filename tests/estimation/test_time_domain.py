@@ -53,6 +53,14 @@ def test_without_noise_the_truth_solves_every_bin():
     assert np.sum(np.abs(evaluate(wrong, bins).error[low]) ** 2) > 20.0 * np.sum(error**2)
 
 
+def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
+    """Friction's slope at the mean speed is 17 N·m·s/rad, behind a lag of 0.4 s: J had been read 5 kg·m² too large."""
+    windy = replace(quiet(FIELD), viscous=2.0, quadratic=1.8)
+    said = found(simulate(windy, "torque pulses", [1])[0])
+    assert said.inertia.value == pytest.approx(104.0, rel=2e-3)
+    assert said.inertia.low <= 104.0 <= said.inertia.high
+
+
 def test_slopes_are_the_derivatives(steps):
     bins = bins_of(steps)
     theta = np.array([104.0, 8.0, 0.4, 0.15, -0.02, 0.2, 0.3, 60.0, -60.0, 0.1])

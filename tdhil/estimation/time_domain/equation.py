@@ -7,6 +7,10 @@ With ω = Q_w(s) ω_rep and T = Q_T(s) e^(ds) T_rep the shaft's equation is, fri
 d the delay of the torque report beyond the speed report's. Of the structure of a filter only its low frequencies count:
 κ = 0 is one pole, up to ¼ two poles, ⅓ a moving average, ½ a delay. κ is a nuisance within [0, ½].
 
+Where friction has a part c₂ ω|ω|, C ω_rep gains c₂ Q_w ω_rep|ω_rep|: the shaft's speed is ahead of the reported one,
+and so is its square, ω² = ω_rep² + τ_w d(ω_rep²)/dt + …, but for (τ_w dω_rep/dt)². Of the reported speed as it is, it
+would make J wrong by τ_w times friction's slope there, 2 c₂ ω.
+
 The residual of a bin is e = (A T − C W − c Φ)/A, N·m·s: T_rep less what the model makes of ω_rep.
 """
 
@@ -46,19 +50,23 @@ def evaluate(theta: FloatArray, bins: Bins) -> Evaluated:
     def of_torque(series: ComplexArray) -> ComplexArray:
         return np.asarray(np.einsum("mn,mn->m", series, bins.torque), dtype=np.complex128)
 
-    first = a[:, 0]
-    error = (of_torque(a) - of_speed(c) - bins.level @ theta[FORWARD:BEND] - theta[BEND] * bins.bend) / first
+    def of_bend(series: ComplexArray) -> ComplexArray:
+        return np.asarray(np.einsum("mn,mn->m", series, bins.bend), dtype=np.complex128)
+
+    first, bend, bent = a[:, 0], float(theta[BEND]), of_bend(report)
+    error = (of_torque(a) - of_speed(c) - bins.level @ theta[FORWARD:BEND] - bend * bent) / first
     slopes = np.empty((len(s), PARAMETERS), dtype=np.complex128)
     slopes[:, INERTIA] = -of_speed(product(polynomial(s, 0.0, 1.0), report))
     slopes[:, VISCOUS] = -of_speed(report)
-    slopes[:, SPEED_LAG] = -of_speed(product(shaft, polynomial(s, 0.0, 1.0, 2.0 * shape_w * lag_w)))
-    slopes[:, SPEED_SHAPE] = -of_speed(product(shaft, polynomial(s, 0.0, 0.0, lag_w**2)))
+    for index, by in ((SPEED_LAG, polynomial(s, 0.0, 1.0, 2.0 * shape_w * lag_w)),
+                      (SPEED_SHAPE, polynomial(s, 0.0, 0.0, lag_w**2))):
+        slopes[:, index] = -of_speed(product(shaft, by)) - bend * of_bend(by)
     by_lag = product(late, polynomial(s, 0.0, 1.0, 2.0 * shape_t * lag_t))
     by_shape = product(late, polynomial(s, 0.0, 0.0, lag_t**2))
     by_skew = product(a, polynomial(s, 0.0, 1.0))
     for index, series in ((TORQUE_LAG, by_lag), (TORQUE_SHAPE, by_shape), (SKEW, by_skew)):
         slopes[:, index] = of_torque(series) - error * series[:, 0]
     slopes[:, FORWARD:BEND] = -bins.level
-    slopes[:, BEND] = -bins.bend
+    slopes[:, BEND] = -bent
     slopes /= first[:, None]
     return Evaluated(error, slopes, c[:, 0] / first)

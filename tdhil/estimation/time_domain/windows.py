@@ -140,7 +140,7 @@ class Window:
 class Bins:
     """M equations. ``s`` = 2πj f (M,); ``speed``, ``torque`` (M, 4): X_n; ``level`` (M, 2): ∫φ turning forward, back.
 
-    ``bend`` (M,): ∫φ ω|ω|; ``energy`` (M,): ∫w², s, by which the noise power of a bin grows; ``window`` (M,): which.
+    ``bend`` (M, 4): X_n of ω|ω|; ``energy`` (M,): ∫w², s, by which a bin's noise power grows; ``window`` (M,): which.
     """
 
     s: ComplexArray
@@ -169,7 +169,7 @@ def joined(parts: list[Bins]) -> Bins:
     if not parts:
         none, empty = np.zeros(0, dtype=np.complex128), np.zeros(0)
         wide = np.zeros((0, ORDERS), dtype=np.complex128)
-        return Bins(none, wide, wide, np.zeros((0, 2), dtype=np.complex128), none, empty, empty)
+        return Bins(none, wide, wide, np.zeros((0, 2), dtype=np.complex128), wide, empty, empty)
     return Bins(*(np.concatenate([getattr(part, name) for part in parts])
                   for name in ("s", "speed", "torque", "level", "bend", "energy", "window")))
 
@@ -208,7 +208,7 @@ def seen_through(window: Window, part: Samples, shape: FloatArray, s: ComplexArr
     weights = shape * np.array([1.0, -1.0, 1.0, -1.0]) * step[:, None]
     columns = np.concatenate(
         [weights * speed[:, None], weights * torque[:, None], weights[:, :1],
-         weights[:, :1] * (speed * np.abs(speed))[:, None]],
+         weights * (speed * np.abs(speed))[:, None]],
         axis=1,
     )
     seen = np.concatenate([
@@ -217,4 +217,4 @@ def seen_through(window: Window, part: Samples, shape: FloatArray, s: ComplexArr
     level = np.zeros((len(s), 2), dtype=np.complex128)
     level[:, 0 if window.run.direction > 0.0 else 1] = seen[:, 8]
     energy = np.full(len(s), float(np.sum(shape[:, 0] ** 2 * step)))
-    return Bins(s, seen[:, :4], seen[:, 4:8], level, seen[:, 9], energy, np.full(len(s), float(window.number)))
+    return Bins(s, seen[:, :4], seen[:, 4:8], level, seen[:, 9:13], energy, np.full(len(s), float(window.number)))
