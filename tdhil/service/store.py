@@ -362,7 +362,7 @@ class Index:
 
     def _open(self, *, filled: bool = True) -> sqlite3.Connection:
         new = not self._path.exists()
-        base = sqlite3.connect(self._path, timeout=2.0)
+        base = sqlite3.connect(self._path, timeout=0.5)
         try:
             base.execute("pragma journal_mode = delete")
             base.execute("pragma synchronous = full")

@@ -57,6 +57,8 @@ class Supervisor:
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._live: dict[str, str | None] = {}         # run: the code that was shown
         self._lost: set[str] = set()
+        self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
+        self._braking = False
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._notes: list[threading.Thread] = []
@@ -67,8 +69,11 @@ class Supervisor:
         """Find the runs that live, see to those that don't any more, and go on looking."""
         for run in self.store.ids():
             with suppress(Exception):
-                if not self.store.status(run).ended:
+                status = self.store.status(run)
+                if not status.ended:
                     self._live[run] = None
+                elif status.state is State.STOP_NOT_CONFIRMED:
+                    self._unconfirmed[run] = status
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
 
@@ -81,7 +86,9 @@ class Supervisor:
             thread.join(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Ask all runs to stop, and wait until they have ended; have they?"""
+        """Begin no more runs, ask all to stop, and wait until they have ended; have they?"""
+        with self._asking:             # who is about to begin one has begun it, and it is among those that are stopped
+            self._braking = True
         for run in self.live():
             with suppress(Exception):
                 self.stop(run, who)
@@ -116,6 +123,8 @@ class Supervisor:
                     raise Conflict("this key was used for another request", where="Idempotency-Key",
                                    next_step="Take a new key")
                 return Asked(before, new=False)
+            if self._braking:
+                raise Conflict("the service is ending", next_step="Start tdhil serve again")
             self.refuse_busy(rig)
             run = self.store.new_id()
             request = Request(run, rig.id, str(rig.path.resolve()), rig.sha256, options, who, now(), rig.simulated,
@@ -154,15 +163,8 @@ class Supervisor:
 
     def blocked(self, rig_id: str) -> str | None:
         """The run that blocks the rig until it is signed off."""
-        statuses, signed = [], []
-        for run in self.store.ids():
-            with suppress(Exception):
-                status = self.store.status(run)
-                if status.rig == rig_id and status.state is State.STOP_NOT_CONFIRMED:
-                    statuses.append(status)
-                    if self.store.signed_off(run) is not None:
-                        signed.append(run)
-        found = blocking(statuses, signed)
+        statuses = [one for one in tuple(self._unconfirmed.values()) if one.rig == rig_id]
+        found = blocking(statuses, [one.id for one in statuses if self.store.signed_off(one.id) is not None])
         return None if found is None else found.id
 
     def confirm(self, run: str, code: str, binding: str | None, who: str) -> Status:
@@ -190,6 +192,8 @@ class Supervisor:
             try:
                 found = ask(folder, wish, timeout_s=1.0)
             except (Refused, CommunicationLost):
+                if (status := self.store.status(run)).ended:
+                    return status
                 # Its process may be about to begin. It looks for this file once it listens: one of us sees the other.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})
                 found = ask(folder, wish, timeout_s=1.0)
@@ -278,6 +282,8 @@ class Supervisor:
                           f" (run {run}):   {code[:3]} {code[3:]}\n")
 
     def _settle(self, run: str, status: Status) -> None:
+        if status.state is State.STOP_NOT_CONFIRMED:
+            self._unconfirmed[run] = status
         child = self._children.pop(run, None)
         if child is not None:
             with suppress(subprocess.TimeoutExpired):

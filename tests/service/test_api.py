@@ -393,6 +393,23 @@ def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
     assert len(after.store.ids()) == 1
 
 
+def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    assert service.supervisor.brake("service ending")
+    assert service.store.status(run).state is State.STOPPED
+    assert "is ending" in call.start("b", expect=409)["error"]["what"]
+
+
+def test_a_stop_of_a_run_that_has_ended_leaves_it_as_it_is(call, service):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    wait_for("its end", lambda: not service.supervisor.live())
+    before = sorted(one.name for one in service.store.place(run).iterdir())
+    assert call("POST", f"/runs/{run}/stop", 200)["state"] == "done"
+    assert sorted(one.name for one in service.store.place(run).iterdir()) == before
+
+
 def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")
