@@ -1,7 +1,8 @@
 """Whole runs on shafts that swing: the shipped two-mass and string examples, the string with its pipe known, and a bit
-on bottom that turns steadily; how many are answered, how far off, how many covered, how wide.
+on bottom that turns steadily, without and with 500 N·m of noise; how many are answered, how far off, how many covered,
+how wide.
 
-    python benchmarks/string_runs.py [--seeds 50] [--first 1] [--cases two-mass string pipe loaded]
+    python benchmarks/string_runs.py [--seeds 50] [--first 1] [--cases two-mass string pipe loaded bit]
 
 Every run is one `tdhil identify --simulate` over the CANopen path in stepped time, 20 to 40 s of processor time; one
 after the other, so that it can run beside other work.
@@ -42,7 +43,10 @@ CASES = {
     "string": ("plant_string.yaml", ""),
     "pipe": ("plant_string.yaml", PIPE + STRING),
     "loaded": ("plant_stick_slip.yaml", ON_BOTTOM),
+    "bit": ("plant_stick_slip.yaml", ON_BOTTOM),
 }
+BIT_NOISE = "noise: {bottom_load_nm: 500.0}\n"
+"""Of the case `bit`: what the bit scatters by."""
 
 
 @dataclass
@@ -82,6 +86,10 @@ def run(case: str, seed: int, keep: Path | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "tdhil", "identify", "--simulate", "--json", "--seed", str(seed),
                    "--plant", str(EXAMPLES / plant)]
+        if case == "bit":
+            noisy = Path(folder) / "plant.yaml"
+            noisy.write_text((EXAMPLES / plant).read_text(encoding="utf-8") + BIT_NOISE, encoding="utf-8")
+            command[command.index("--plant") + 1] = str(noisy)
         if rig:
             path = Path(folder) / "rig.yaml"
             path.write_text(rig, encoding="utf-8")

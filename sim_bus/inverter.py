@@ -9,7 +9,7 @@
 Owns no clock and no thread: whoever calls `step` says how much time goes by.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from math import copysign, exp, expm1, inf, pi, sqrt
@@ -64,6 +64,22 @@ class Disturbance:
         """Moves the load by one step and returns it, N·m."""
         self.load_nm = self._decay * self.load_nm + self._kick * normal
         return self.load_nm
+
+
+class BottomLoad:
+    """What the bit of a string scatters by: a load that wanders, of a stream of its own."""
+
+    def __init__(self, params: NoiseParams, rng: np.random.Generator) -> None:
+        self._params = params
+        self._normals = (one for row in normals(rng) for one in row)
+        self._load_nm = 0.0
+
+    def wander(self, dt_s: float) -> float:
+        """Moves it by a step and returns it, N·m."""
+        decay = exp(-dt_s / self._params.bottom_correlation_s)
+        kick = self._params.bottom_load_nm * sqrt(1.0 - decay**2)
+        self._load_nm = decay * self._load_nm + kick * next(self._normals)
+        return self._load_nm
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -326,8 +342,8 @@ class Inverter:
     """Control, power stage and shaft of one simulated drive."""
 
     __slots__ = (
-        "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_torque_gain", "control", "params", "reporting",
-        "state", "torque_nm",
+        "_bottom_load", "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_torque_gain", "control",
+        "params", "reporting", "state", "torque_nm",
     )
 
     def __init__(self, params: RigParams, rng: np.random.Generator) -> None:
@@ -336,11 +352,12 @@ class Inverter:
         self.reporting = Reporting(params)
         plant = build(params.plant)
         self.state: MotorState = plant.rest()
-        self._move = plant.step
+        self._move: Callable[..., MotorState] = plant.step
         self.torque_nm = 0.0
         """True torque on the shaft during the last step."""
         self._disturbance = Disturbance(params.noise)
         self._normals = normals(rng)
+        self._bottom_load = BottomLoad(params.noise, rng.spawn(1)[0]) if params.noise.bottom_load_nm > 0.0 else None
         self._lagged_nm = 0.0
         self._dt_s = 0.0
         self._torque_gain = 1.0
@@ -365,7 +382,11 @@ class Inverter:
             self._lagged_nm += self._torque_gain * (demand - self._lagged_nm)
             torque = self._lagged_nm + disturbance.torque_sd_nm * ripple
         self.torque_nm = torque
-        self.state = state = self._move(self.state, torque, dt_s, disturbance.wander(load))
+        at_motor = disturbance.wander(load)
+        if self._bottom_load is None:
+            self.state = state = self._move(self.state, torque, dt_s, at_motor)
+        else:
+            self.state = state = self._move(self.state, torque, dt_s, at_motor, self._bottom_load.wander(dt_s))
         self.reporting.step(0.5 * (speed + state.speed_rad_s) + offset, torque, speed_noise, torque_noise)
 
     def steps(self, duration_s: float) -> tuple[int, float]:
@@ -382,6 +403,7 @@ class Inverter:
             coulomb_nm=share * motor.coulomb_nm,
         )
         self.state = RigidState(before.speed_rad_s, before.angle_rad)
+        self._bottom_load = None
         self._move = build(left).step
 
     def _prepare(self, dt_s: float) -> None:

@@ -5,10 +5,11 @@ A noise, lag or quantum of 0 switches that effect off.
 """
 
 from pathlib import Path
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from profiles import NonNegative, Positive, Validated
+from profiles import NonNegative, Positive, Validated, refuse_if
 from sim_bus.plant import AnyPlantParams
 from sim_bus.plant import Params as PlantParams
 
@@ -47,6 +48,9 @@ class NoiseParams(Validated):
     torque_nm: NonNegative = 10.0
     load_nm: NonNegative = 3.0
     load_correlation_s: Positive = 0.5
+    bottom_load_nm: NonNegative = 0.0
+    """At the bottom of a string: what its bit scatters by."""
+    bottom_correlation_s: Positive = 0.5
 
 
 class RigParams(Validated):
@@ -56,6 +60,12 @@ class RigParams(Validated):
     drive: DriveParams = DriveParams()
     reporting: ReportingParams = ReportingParams()
     noise: NoiseParams = NoiseParams()
+
+    @model_validator(mode="after")
+    def _has_a_bottom(self) -> Self:
+        rigid = isinstance(self.plant, PlantParams) and self.noise.bottom_load_nm > 0.0
+        refuse_if([("noise.bottom_load_nm", "needs a plant with a bottom: kind two_mass or string")] * rigid)
+        return self
 
 
 QUIET = NoiseParams(speed_sensor_rad_s=0.0, torque_nm=0.0, load_nm=0.0)

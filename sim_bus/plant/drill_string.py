@@ -121,8 +121,13 @@ class DrillString:
         silence = np.zeros(self.cells)
         return StringState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, silence, silence, 0.0, 0.0)
 
-    def step(self, state: StringState, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> StringState:
-        """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed."""
+    def step(
+        self, state: StringState, torque_nm: float, dt_s: float, load_nm: float = 0.0, bottom_load_nm: float = 0.0
+    ) -> StringState:
+        """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed.
+
+        ``bottom_load_nm`` likewise at the bottom, beside its own, for the ticks that end within the step.
+        """
         drive = torque_nm - load_nm - self.params.load_nm
         left = dt_s
         while left > 0.0:
@@ -134,7 +139,7 @@ class DrillString:
                 speed_rad_s=speed, angle_rad=state.angle_rad + travel, bristle_rad=bristle,
                 into_tick_s=state.into_tick_s + piece)
             if piece >= until_tick:
-                state = self._tick(state)
+                state = self._tick(state, bottom_load_nm)
             left -= piece
         return state
 
@@ -142,11 +147,11 @@ class DrillString:
         """τ at the top, what the string takes from the motor."""
         return self.impedance_nm_s_rad * state.speed_rad_s - float(state.up_nm[0])
 
-    def _tick(self, state: StringState) -> StringState:
+    def _tick(self, state: StringState, bottom_load_nm: float) -> StringState:
         """Waves one cell on, the bottom one tick on."""
         down, up, twice = state.down_nm, state.up_nm, 2.0 * self.impedance_nm_s_rad
         arrived = float(down[-1])
-        speed, angle, bristle, travel = self._bottom_end(state, arrived)
+        speed, angle, bristle, travel = self._bottom_end(state, arrived, bottom_load_nm)
         between = (down[:-1] + up[1:]) * self._pass
         new_down, new_up = np.empty_like(down), np.empty_like(up)
         np.subtract(between, up[1:], out=new_down[1:])
@@ -157,7 +162,9 @@ class DrillString:
         return StringState(state.speed_rad_s, state.angle_rad, state.bristle_rad, speed, angle, bristle,
                            new_down, new_up, 0.0, state.angle_rad)
 
-    def _bottom_end(self, state: StringState, arrived: float) -> tuple[float, float, float, float]:
+    def _bottom_end(
+        self, state: StringState, arrived: float, load_nm: float
+    ) -> tuple[float, float, float, float]:
         """(speed, angle, bristle, travel) of the bottom after a tick."""
         angle = state.bottom_angle_rad
         if self.params.bottom_end == "clamped":
@@ -167,7 +174,8 @@ class DrillString:
             return speed, angle + speed * self.tick_s, 0.0, speed * self.tick_s
         shaft = self._bottom
         speed, bristle, travel = self._bottom_move(
-            shaft, state.bottom_speed_rad_s, state.bottom_bristle_rad, arrived - shaft.load_nm, self.tick_s)
+            shaft, state.bottom_speed_rad_s, state.bottom_bristle_rad, arrived - shaft.load_nm - load_nm,
+            self.tick_s)
         return speed, angle + travel, bristle, travel
 
     def _with_string(self, shaft: Shaft) -> Shaft:

@@ -77,14 +77,17 @@ class TwoMassState(NamedTuple):
 
 
 def step(params: TwoMassParams, state: TwoMassState, torque_nm: float, dt_s: float,
-         load_nm: float = 0.0) -> TwoMassState:
-    """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed."""
+         load_nm: float = 0.0, bottom_load_nm: float = 0.0) -> TwoMassState:
+    """The state ``dt_s`` later, under constant torque; ``load_nm`` acts at the motor, against positive speed.
+
+    ``bottom_load_nm`` likewise at the bottom, beside its own.
+    """
     mobility = params.mobility_1_kg_m2
     fastest = max(sqrt(params.stiffness_nm_rad * mobility), params.damping_nm_s_rad * mobility)
     count = 1 + int(fastest * dt_s / _CUT)
     drive = torque_nm - load_nm - params.load_nm
     for _ in range(count):
-        state = _piece(params, state, drive, dt_s / count)
+        state = _piece(params, state, drive, bottom_load_nm, dt_s / count)
     return state
 
 
@@ -94,17 +97,20 @@ def spring_torque(params: TwoMassParams, state: TwoMassState) -> float:
             + params.damping_nm_s_rad * (state.speed_rad_s - state.bottom_speed_rad_s))
 
 
-def _piece(params: TwoMassParams, state: TwoMassState, drive: float, dt_s: float) -> TwoMassState:
+def _piece(
+    params: TwoMassParams, state: TwoMassState, drive: float, bottom_load_nm: float, dt_s: float
+) -> TwoMassState:
     bottom, damping = params.bottom, params.damping_nm_s_rad
+    below_nm = bottom.load_nm + bottom_load_nm
     speed, angle, bristle, low_speed, low_angle, low_bristle = state
     move, low_move = advance_of(params), advance_of(bottom)
     difference = speed - low_speed
     spring = params.stiffness_nm_rad * (angle - low_angle + 0.5 * dt_s * difference)
     torque = spring + damping * difference
     end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
-    low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - bottom.load_nm, dt_s)
+    low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
     if damping > 0.0:
         torque = spring + 0.5 * damping * (difference + end - low_end)
         end, end_bristle, travel = move(params, speed, bristle, drive - torque, dt_s)
-        low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - bottom.load_nm, dt_s)
+        low_end, low_end_bristle, low_travel = low_move(bottom, low_speed, low_bristle, torque - below_nm, dt_s)
     return TwoMassState(end, angle + travel, end_bristle, low_end, low_angle + low_travel, low_end_bristle)

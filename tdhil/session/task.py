@@ -83,6 +83,7 @@ def machine_limits(
     What is accepted is a run's, on its own command line: no file of the bench says it.
     """
     limits = require_limits(bench)
+    pipe = pipe_of(bench)
     return MachineLimits(
         speed_min_rad_s=limits.speed_min_rad_s,
         speed_max_rad_s=limits.speed_max_rad_s,
@@ -95,6 +96,7 @@ def machine_limits(
         probe_travel_rad=limits.probe_travel_rad,
         allow_reverse=bench.allow_reverse,
         load=bench.load.kind,
+        wave_impedance_nm_s_rad=0.0 if pipe is None else pipe.impedance_nm_s_rad,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
         accept_no_watchdog=accept_no_watchdog,
         accept_shared_watchdog=accept_shared_watchdog,

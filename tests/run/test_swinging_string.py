@@ -130,6 +130,16 @@ def test_a_string_that_sticks_and_slips_is_named_with_its_period_and_amplitude()
     assert "Lift the bit off bottom" in str(hit.value)
 
 
+def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
+    """As regular, but the bit turns all the while: by ζ and the mean speed it would swing by 3 kN·m if it stuck."""
+    limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
+    here = ringing(bit_nm=400.0)
+    calmed = calm_string(here.bench, limits, 3.0, 0.5)
+    assert calmed.swing.regular > 0.6
+    assert 80.0 < calmed.swing.torque_nm < 1800.0
+    assert any(kind == "string" and "gets no calmer" in text for kind, text in here.log.events)
+
+
 def seen(torque_nm=200.0, demand_nm=None, speed=3.0, time_s=0.0):
     return Sample(time_s, 0.0, 0.0, True, speed, torque_nm, demand_nm, Mode.TORQUE, PowerState.ENABLED, False, False, 0)
 

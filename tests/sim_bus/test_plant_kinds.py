@@ -8,16 +8,16 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from profiles.errors import DataFileError
 from profiles.yaml_loader import parse_model
 from sim_bus.inverter import Inverter
-from sim_bus.params import FAITHFUL, QUIET, DriveParams, RigParams, load_rig
+from sim_bus.params import FAITHFUL, QUIET, DriveParams, NoiseParams, RigParams, load_rig
 from sim_bus.plant.drill_string import StringParams
 from sim_bus.plant.kinds import PLANTS, build
 from sim_bus.plant.rigid import Params
-from sim_bus.plant.two_mass import TwoMassParams
+from sim_bus.plant.two_mass import Bottom, TwoMassParams
 
 ROOT = Path(__file__).parents[2]
 KINDS = {"plant.yaml": Params, "plant_two_mass.yaml": TwoMassParams, "plant_string.yaml": StringParams,
@@ -135,3 +135,39 @@ def test_two_masses_turn_behind_the_canopen_face(bench: Callable[..., Any], tmp_
     with (tmp_path / "trace.csv").open(encoding="utf-8") as stream:
         traced = [float(row["speed_rad_s"]) for row in csv.DictReader(stream) if not row["event"]]
     assert np.allclose(traced[-2000:], motor[1:], rtol=1e-5, atol=1e-7)
+
+def test_a_load_at_the_bottom_is_felt_at_the_motor_one_wave_later() -> None:
+    """And it moves two masses as the spring lets it; what happens at the motor stays as it is without one."""
+    params = StringParams(length_m=500.0, drag_nm_s_rad_m=0.0, coulomb_nm=0.0, bottom=Bottom(coulomb_nm=0.0))
+    plant = build(params)
+    calm = loaded = plant.rest()
+    first = None
+    for step in range(400):
+        calm, loaded = plant.step(calm, 500.0, 0.001), plant.step(loaded, 500.0, 0.001, 0.0, 300.0)
+        if first is None and calm.speed_rad_s != loaded.speed_rad_s:
+            first = 0.001 * step
+    assert first == pytest.approx(params.delay_s, abs=0.006)
+    assert loaded.speed_rad_s < calm.speed_rad_s
+    two = build(TwoMassParams(coulomb_nm=0.0, bottom=Bottom(coulomb_nm=0.0, viscous_nm_s_rad=0.0)))
+    state = two.rest()
+    for _ in range(10):
+        state = two.step(state, 0.0, 0.002, 0.0, 300.0)
+    assert state.bottom_speed_rad_s == pytest.approx(-300.0 * 0.02 / 374.0, rel=0.01)
+
+
+def test_a_rigid_shaft_has_no_bottom_to_be_loaded() -> None:
+    with pytest.raises(ValidationError, match="needs a plant with a bottom"):
+        RigParams(noise=NoiseParams(bottom_load_nm=10.0))
+
+
+def test_what_disturbs_the_motor_is_the_same_with_a_load_at_the_bottom() -> None:
+    plant = StringParams()
+    with_one, without = (
+        Inverter(RigParams(plant=plant, noise=NoiseParams(bottom_load_nm=load)), np.random.default_rng(3))
+        for load in (50.0, 0.0)
+    )
+    for _ in range(50):                  # before anything of the bottom's comes up
+        with_one.step(0.002)
+        without.step(0.002)
+    assert with_one.speed_rad_s == without.speed_rad_s
+    assert with_one.state.bottom_speed_rad_s != without.state.bottom_speed_rad_s

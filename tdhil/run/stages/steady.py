@@ -102,8 +102,12 @@ WINDOW_S = 12.0
 NO_CALMER = 0.75
 """Of what it was over the time before: a swing that is still above this share gets no smaller."""
 
-STICK_SLIP_SPEED_SHARE, STICK_SLIP_REGULAR = 0.04, 0.6
-"""Of the mean speed, that the top swings by at least in stick-slip; the least autocorrelation after one period."""
+STICK_SLIP_REGULAR = 0.6
+"""The least autocorrelation, after one period, of a swing that repeats."""
+
+STICK_SLIP_SHARE, STICK_SLIP_TORQUE_SHARE = 0.6, 0.5
+"""A bit that sticks and slips swings by the mean speed and more, and so the top's torque by ζ times that. This share of
+it tells stick-slip from a swing that noise keeps going. Where ζ is not known: a share of the mean torque."""
 
 SHORTEST_SWING_S = 1.5
 MOST_CALMING_S = 120.0
@@ -197,7 +201,8 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
         before = swing_of(samples[-2 * window : -window], loop.period_s)
         if now.torque_nm >= NO_CALMER * before.torque_nm:
             left = swing_of(samples[-2 * window :], loop.period_s)
-            if left.regular >= STICK_SLIP_REGULAR and left.speed_rad_s >= STICK_SLIP_SPEED_SHARE * target_rad_s:
+            mean_nm = float(trace(samples[-2 * window :]).torque_nm.mean())
+            if _feeds_itself(left, limits.wave_impedance_nm_s_rad, target_rad_s, mean_nm):
                 raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
             if abs(_mean_speed(samples[-window:]) - target_rad_s) <= 2.0 * tolerance_rad_s:
                 loop.log.event(
@@ -214,6 +219,14 @@ def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, t
         + (f" every {left.period_s:.1f} s" if left.regular >= STICK_SLIP_REGULAR else "") + f"); {torque}",
         where=f"at {loop.now_s:.1f} s",
         next_step=helps,
+    )
+
+
+def _feeds_itself(swing: Swing, wave_impedance_nm_s_rad: float, speed_rad_s: float, mean_nm: float) -> bool:
+    """Does a swing that repeats go as far as that of a bit that sticks and slips?"""
+    by_speed_nm = STICK_SLIP_SHARE * wave_impedance_nm_s_rad * speed_rad_s
+    return swing.regular >= STICK_SLIP_REGULAR and swing.torque_nm >= (
+        by_speed_nm or STICK_SLIP_TORQUE_SHARE * abs(mean_nm)
     )
 
 
