@@ -1,10 +1,12 @@
 """A thousand logs of twenty rigs, ten of them poisoned: the same table by every road, whoever is killed; what it costs.
 
     python benchmarks/fleet_thousand.py [--logs 1000] [--roads pool one dask] [--kills 50] [--folder DIR]
+    python benchmarks/fleet_thousand.py --quick
     python benchmarks/fleet_thousand.py --cost [--copies 20]
 
-The logs are real run.mcap files of the studies' batch simulator. With --cost: CPU seconds a log of a real run's size
-(simulated once, 8.7 MB), cold and from the cache, beside a plain replay; memory; how soon the pool starts.
+With --quick logs are hashed and not identified: the machinery alone, within minutes. The logs are real
+run.mcap files of the studies' batch simulator. With --cost: CPU seconds a log of a real run's size (simulated once, 8.7
+MB), cold and from the cache, beside a plain replay; memory; how soon the pool starts.
 """
 
 import argparse
@@ -104,7 +106,7 @@ def pool_processes(of: int) -> list[int]:
     return found
 
 
-def by_road(road: str, request: FleetRequest, kills: int) -> tuple[FleetRow, ...]:
+def by_road(road: str, request: FleetRequest, kills: int, function: Any) -> tuple[FleetRow, ...]:
     began = time.monotonic()
     if road == "dask":
         import dask
@@ -123,11 +125,11 @@ def by_road(road: str, request: FleetRequest, kills: int) -> tuple[FleetRow, ...
 
             killer = Killer(kills, victims)
             summary = run_fleet(
-                replace(request, scheduler=cluster.scheduler_address), killer, function=poison.identify)
+                replace(request, scheduler=cluster.scheduler_address), killer, function=function)
             asking.close()
     else:
         killer = Killer(kills if road == "pool" else 0, lambda: pool_processes(os.getpid()))
-        summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=poison.identify)
+        summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=function)
     rows = summary.rows
     names = Counter(row.log for row in rows)
     print(f"{road:5}: {len(rows)} rows, {sum(not row.failed for row in rows)} results, "
@@ -141,10 +143,12 @@ def thousand(asked: argparse.Namespace, folder: Path) -> None:
     logs = folder / "logs"
     if not logs.exists():
         generate(logs, asked.logs, asked.rigs)
+    function = poison.quick if asked.quick else poison.identify
+    os.environ["TDHIL_CALLS"] = str(folder / "calls.txt")
     tables = {}
     for road in asked.roads:
         request = FleetRequest((str(logs),), folder / f"{road}.parquet", limits=LIMITS, cache=False, again=True)
-        tables[road] = [repr(row) for row in by_road(road, request, asked.kills)]
+        tables[road] = [repr(row) for row in by_road(road, request, asked.kills, function)]
     first = next(iter(tables.values()))
     for road, rows in tables.items():
         differ = sum(a != b for a, b in zip(rows, first, strict=True))
@@ -204,6 +208,7 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=20)
     parser.add_argument("--roads", nargs="+", choices=("pool", "one", "dask"), default=["pool", "one", "dask"])
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--quick", action="store_true", help="the machinery alone: rows without identifying")
     parser.add_argument("--folder", type=Path, help="where logs and tables stay")
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--copies", type=int, default=20)

@@ -7,6 +7,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,30 +80,44 @@ def run(namespace: argparse.Namespace) -> int:
 
 def run_watch(namespace: argparse.Namespace) -> int:
     """Look, identify what is new, look again, until Ctrl-C."""
-    from tdhil.fleet import find_logs, run_fleet
-
     folder: Path = namespace.folder
     if not folder.is_dir():
         raise UsageError("there is no such folder", where=str(folder))
     request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
-    seen: set[str] = set()
-    rested: dict[str, tuple[int, int]] = {}
+    watch = Watch(request)
     while True:
-        now = {log: _stamp(log) for log in find_logs(request.roots).logs}
-        # A file that grows without a lock (a copy that is under way) is left until it rests.
-        calm = all(rested.get(log) == stamp for log, stamp in now.items()) or namespace.once
-        rested = now
-        if now and calm and set(now) != seen:
-            summary = run_fleet(request)
-            for row in summary.rows:
-                if row.log not in seen:
-                    _tell(row, namespace.json)
-            seen = {row.log for row in summary.rows}
-            if summary.interrupted:
-                raise KeyboardInterrupt
+        for row in watch.look(at_once=namespace.once):
+            _tell(row, namespace.json)
         if namespace.once:
             return int(ExitCode.OK)
         time.sleep(namespace.every)
+
+
+class Watch:
+    """What was there the last time, and what is done. A file that grows without a lock (a copy that is under way) is
+    left until it is the same at two looks.
+    """
+
+    def __init__(self, request: FleetRequest) -> None:
+        self._request = request
+        self._before: dict[str, tuple[int, int]] = {}
+        self._done: dict[str, tuple[int, int]] = {}
+
+    def look(self, *, at_once: bool = False) -> list[FleetRow]:
+        """Rows of what is new since the last look; the table then has them, too. KeyboardInterrupt as usual."""
+        from tdhil.fleet import find_logs, run_fleet
+
+        now = {log: _stamp(log) for log in find_logs(self._request.roots).logs}
+        resting = {log: stamp for log, stamp in now.items() if at_once or self._before.get(log) == stamp}
+        self._before = now
+        if all(self._done.get(log) == stamp for log, stamp in resting.items()):
+            return []
+        summary = run_fleet(replace(self._request, roots=tuple(resting)))
+        if summary.interrupted:
+            raise KeyboardInterrupt
+        fresh = [row for row in summary.rows if self._done.get(row.log) != resting.get(row.log)]
+        self._done = resting
+        return fresh
 
 
 def _stamp(log: str) -> tuple[int, int]:
@@ -117,8 +132,6 @@ def _tell(row: FleetRow, as_json: bool) -> None:
     from tdhil.report import PlainConsole
 
     if as_json:
-        from dataclasses import asdict
-
         sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
     else:
         PlainConsole().print(f"{row.log}: {_result_text(row)}", soft_wrap=True)

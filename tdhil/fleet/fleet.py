@@ -87,7 +87,7 @@ class FleetSummary:
     def exit_code(self) -> int:
         """0: every log has a result; 3: some have none, or aren't done; 10: none has."""
         bad = sum(row.failed for row in self.rows)
-        if bad == len(self.rows):
+        if self.rows and bad == len(self.rows):
             return 10
         return 3 if bad or self.left else 0
 

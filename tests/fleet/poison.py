@@ -46,7 +46,7 @@ def identify(task: LogTask) -> Done:
 def quick(task: LogTask) -> Done:
     """A row without identifying; a note of each call in the file that TDHIL_CALLS names."""
     head = head_of(task.log)
-    if head.startswith(b"poison"):
+    if head.startswith(b"poison") or not Path(task.log).is_file():
         return identify(task)
     with Path(os.environ["TDHIL_CALLS"]).open("a") as file:
         file.write(task.log + "\n")

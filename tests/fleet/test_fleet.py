@@ -242,3 +242,20 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     assert main(["fleet", str(tmp_path / "none"), "--out", str(out)]) == 2
     assert main(["watch", str(few), "--out", str(out), "--once", "--jobs", "1"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 7
+
+
+def test_watch_takes_what_rests_and_leaves_what_grows(tmp_path):
+    from tdhil.cli.fleet import Watch
+
+    folder = tmp_path / "logs"
+    many(folder, 2)
+    watch = Watch(FleetRequest((str(folder),), tmp_path / "fleet.csv", jobs=1))
+    assert watch.look() == []                              # seen for the first time: it may be growing
+    growing = folder / "growing.mcap"
+    growing.write_bytes(b"half")
+    assert [Path(row.log).name for row in watch.look()] == ["000.mcap", "001.mcap"]
+    growing.write_bytes(b"half and more")
+    assert watch.look() == []
+    assert [Path(row.log).name for row in watch.look()] == ["growing.mcap"]
+    assert watch.look() == []
+    assert len(read_table(tmp_path / "fleet.csv")) == 3
