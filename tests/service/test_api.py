@@ -15,6 +15,7 @@ import pytest
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
+from tdhil.errors import UsageError
 from tdhil.service.answers import API, ROUTES, document
 from tdhil.service.states import State
 from tests.service.conftest import URL, Service, wait_for
@@ -108,6 +109,78 @@ def test_downloads_come_in_pieces(client, call, service):
     assert answer.headers["content-range"] == "bytes 5-8/100"
     call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
     call("GET", f"/runs/{run}/report.html", 404)
+
+
+PLAN = {"excitation": "sine", "expected_half_width": None}
+
+
+def worked(service: Service, monkeypatch: pytest.MonkeyPatch, answer: Any) -> list[tuple[str, dict[str, Any]]]:
+    """Arithmetic is played: what was asked for."""
+    asked: list[tuple[str, dict[str, Any]]] = []
+
+    def work(what: str, run: str | None, given: dict[str, Any]) -> dict[str, Any]:
+        asked.append((what, given))
+        if isinstance(answer, Exception):
+            raise answer
+        return {"document": answer}
+
+    monkeypatch.setattr(service.supervisor, "work", work)
+    return asked
+
+
+def test_a_plan_is_asked_for_and_moves_nothing(call, service, monkeypatch):
+    asked = worked(service, monkeypatch, PLAN)
+    assert call("POST", "/rigs/a/plan", 200, json={"tolerance": "1%"})["plan"] == PLAN
+    assert [(what, given["options"]) for what, given in asked] == [("plan", {"tolerance": 0.01})]
+    call("POST", "/rigs/nobody/plan", 404, json={})
+    call("POST", "/rigs/a/plan", 422, json={"excitation": "x"})
+    assert service.store.ids() == []
+
+
+def test_a_replay_stands_beside_the_first_result(call, service, monkeypatch):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    first = call("GET", f"/runs/{run}", 200)["result"]
+    asked = worked(service, monkeypatch, {"verdict": "valid_wide"})
+    for number in ("001", "002"):
+        waiting = call("POST", f"/runs/{run}/replays", 202, json={"model": "rigid"})
+        assert (waiting["name"], waiting["state"]) == (number, "waiting")
+        done = wait_for("the replay", lambda name=number: (
+            found if (found := call("GET", f"/runs/{run}/replays/{name}", 200))["state"] == "done" else None))
+        assert done["result"] == {"verdict": "valid_wide"}
+    assert asked == [("replay", {"model": "rigid"})] * 2
+    found = call("GET", f"/runs/{run}", 200)
+    assert found["result"] == first
+    assert [one["name"] for one in found["replays"]] == ["001", "002"]
+    call("GET", f"/runs/{run}/replays/003", 404)
+    call("POST", f"/runs/{run}/replays", 422, json={"model": 7})
+
+
+def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_end(call, service, monkeypatch):
+    live = call.start("b", what="hold")["id"]
+    service.wait(live, "moving")
+    call("POST", f"/runs/{live}/replays", 422, json={})
+    run = call.start()["id"]
+    service.wait(run, "done")
+    worked(service, monkeypatch, UsageError("no such model", where="model"))
+    name = call("POST", f"/runs/{run}/replays", 202, json={"model": "x"})["name"]
+    failed = wait_for("the replay", lambda: (
+        found if (found := call("GET", f"/runs/{run}/replays/{name}", 200))["state"] == "failed" else None))
+    assert failed["error"]["what"] == "no such model"
+
+
+def test_the_pdf_is_made_when_it_is_first_asked_for(call, service, monkeypatch):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    asked = worked(service, monkeypatch, {"file": "report.pdf"})
+    call("GET", f"/runs/{run}/report.pdf", 404)        # played: nothing came of it
+    (service.store.place(run) / "report.pdf").write_bytes(b"%PDF")
+    (service.store.place(run) / "report.html").write_bytes(b"<p>ours")
+    assert call("GET", f"/runs/{run}/report.pdf", 200).content == b"%PDF"
+    assert len(asked) == 1
+    page = call("GET", f"/runs/{run}/report.html", 200)
+    assert "sandbox" in page.headers["content-security-policy"]
+    assert "script-src" not in page.headers["content-security-policy"]
 
 
 def test_health_and_metrics(client, call, service):
