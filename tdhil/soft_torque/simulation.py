@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, pi
+from math import ceil, e, pi, sqrt
 from typing import Literal
 
 import numpy as np
@@ -318,8 +318,11 @@ class _Bit:
         self._impedance = grid.impedance_nm_s_rad[-1]
         self._viscous = viscous_nm_s_rad + self._impedance + 0.5 * grid.drag_nm_s_rad[-1]
         self._falls = friction.static_nm - friction.coulomb_nm
-        fastest = self._falls / friction.stribeck_speed_rad_s if self._falls else 0.0
-        self._parts = int(np.clip(ceil(fastest / self._inertia * grid.tick_s / 0.02), 1, 25))
+        # A falling branch steeper than what the line takes grows: in parts of 2 %. One that isn't runs to a balance,
+        # which the tangent's exponential reaches in one step.
+        steepest = sqrt(2.0 / e) * self._falls / friction.stribeck_speed_rad_s if self._falls else 0.0
+        growth = max(0.0, steepest - self._viscous) / self._inertia * grid.tick_s
+        self._parts = int(np.clip(ceil(growth / 0.02), 1, 25))
         self._part_s = grid.tick_s / self._parts
         self._tick_s = grid.tick_s
 

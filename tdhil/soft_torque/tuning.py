@@ -58,7 +58,7 @@ WRONG_BY = (0.126, 0.76)
 """Errors of J whose cost is told: the paper's method on a simulated field rig, and its own spread of slopes."""
 BROADBAND_BELOW = 0.8
 """Mean |r| above which a controller isn't called broadband: a plain soft one has 0.94 on the reference case."""
-_LEAST_SOFT, _MOST_SOFT = 0.08, 2.0
+_LEAST_SOFT, _MOST_SOFT = 0.02, 2.0
 
 
 class TuningRefused(TdhilError):
@@ -306,7 +306,7 @@ def _best_softness(case: TuneCase, held: Sequence[float], share: float, most: fl
         law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
         return least_damping(case, case.drive, law, held)
 
-    grid = np.geomspace(_LEAST_SOFT, top, 11)
+    grid = np.geomspace(_LEAST_SOFT, top, 15)
     seen = [damping(float(one)) for one in grid]
     at = int(np.argmax(seen))
     if seen[at] <= 0.0:

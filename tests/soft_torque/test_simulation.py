@@ -22,7 +22,19 @@ from tdhil.soft_torque import (
     simulate,
 )
 from tdhil.soft_torque.simulation import _Top
-from tests.soft_torque.cases import DRIVE, HALF, SOFT_025, SOFT_1, STIFF, STRING, TABLE, Pipe, lumped_chain, string_with
+from tests.soft_torque.cases import (
+    BIT,
+    DRIVE,
+    HALF,
+    SOFT_025,
+    SOFT_1,
+    STIFF,
+    STRING,
+    TABLE,
+    Pipe,
+    lumped_chain,
+    string_with,
+)
 
 SMOOTH = {"friction": "coulomb", "static_nm": None, "stribeck_speed_rad_s": None, "coulomb_nm": 0.0}
 """A bit without dry friction: everything is linear."""
@@ -151,6 +163,22 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
     swing = solution.t < (solution.t_events[0][0] if solution.t_events[0].size else 12.0)
     highest = solution.y[1][swing].max()
     assert trace.bit_rad_s[trace.time_s < solution.t[swing][-1] + 0.1, 0, 0].max() == pytest.approx(highest, rel=0.03)
+
+
+def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
+    """Collars as lines leave the bit next to no inertia of its own: half a tick of them; half as much does the same."""
+    from tdhil.soft_torque import Bottom, Section, StringFile, string_of
+
+    pipe = Section(length_m=1500.0, outer_diameter_m=0.127, inner_diameter_m=0.1086)
+    collars = Section(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
+    string = string_of(StringFile(sections=(pipe,), bottom=Bottom(sections=(collars,), **BIT)))
+    target = np.array([[60.0 * RPM]])
+    coarse, fine = (simulate(string, [(DRIVE, STIFF)], Begin("stuck", target), target, 1.0, 12.0, 0.05, tick)
+                    for tick in (0.006, 0.003))
+    assert coarse.last_stuck_s[0, 0] == pytest.approx(fine.last_stuck_s[0, 0], abs=0.1)
+    slow = [np.convolve(trace.bit_rad_s[:, 0, 0], np.ones(10) / 10.0, "same") for trace in (coarse, fine)]
+    seen = np.interp(fine.time_s, coarse.time_s, slow[0])
+    assert np.max(np.abs(seen - slow[1])) < 0.08 * slow[1].max()
 
 
 def test_cure_speeds_of_the_reference_case():
