@@ -95,38 +95,38 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def pool_processes(of: int) -> list[int]:
+def processes(of: int, word: bytes) -> list[int]:
     found = []
     for pid in children(of):
         try:
-            if b"tdhil.fleet.pool" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if word in Path(f"/proc/{pid}/cmdline").read_bytes():
                 found.append(pid)
         except OSError:
             continue
     return found
 
 
+def pool_processes(of: int) -> list[int]:
+    return processes(of, b"tdhil.fleet.pool")
+
+
+def cluster_processes() -> list[int]:
+    """Dask's workers, and the process that each of them keeps."""
+    workers = processes(os.getpid(), b"spawn_main")
+    return workers + [pid for worker in workers for pid in pool_processes(worker)]
+
+
 def by_road(road: str, request: FleetRequest, kills: int, function: Any) -> tuple[FleetRow, ...]:
     began = time.monotonic()
     if road == "dask":
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import LocalCluster
 
         dask.config.set({"distributed.scheduler.allowed-failures": 10})
-        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
-            asking = Client(cluster, set_as_default=False)
-
-            def victims() -> list[int]:
-                try:
-                    workers = list(asking.run(os.getpid).values())
-                except Exception:
-                    return []
-                return workers + [pid for worker in workers for pid in pool_processes(worker)]
-
-            killer = Killer(kills, victims)
-            summary = run_fleet(
-                replace(request, scheduler=cluster.scheduler_address), killer, function=function)
-            asking.close()
+        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40) as cluster:
+            killer = Killer(kills, cluster_processes)
+            there = replace(request, scheduler=cluster.scheduler_address)
+            summary = run_fleet(there, killer, function=function)
     else:
         killer = Killer(kills if road == "pool" else 0, lambda: pool_processes(os.getpid()))
         summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=function)

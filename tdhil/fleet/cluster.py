@@ -10,6 +10,7 @@ import importlib
 import platform
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from importlib import metadata
 from typing import Any, Final, TypeVar
@@ -86,10 +87,19 @@ def _results(
             return
         for future in _done(distributed, client, list(under_way)):
             task, tries = under_way.pop(future)
-            if future.status == "finished":
-                yield task, future.result()
+            try:
+                result: Result | Loss = future.result(timeout=_LOOK_S)
+            except (TimeoutError, CancelledError):
+                # Done by a worker that died with it before it was fetched. Waiting for Dask to do it again has no end
+                # where that closed its last worker; here `_done` says so.
+                future.cancel()
+                submit(task, tries)
                 continue
-            failure = future.exception()
+            except Exception as error:
+                failure = error
+            else:
+                yield task, result
+                continue
             if not isinstance(failure, distributed.scheduler.KilledWorker):
                 raise TdhilError(f"a worker of the cluster failed: {failure!r}", where="fleet")
             if tries < _RESUBMIT:
