@@ -14,10 +14,11 @@ NAMES = [name for name in profile_names() if name not in ("generic/cia402", "max
 
 
 def weighed(name):
-    """One profile always, two in CI (one of them CANopen); the others differ in registers only."""
-    if name == "schneider/atv320":
-        return name
-    heavy = name in ("siemens/g120", "siemens/s120-canopen")
+    """Three in CI, one of them CANopen; the others differ in registers only.
+
+    Without these, tests/path/test_cli_modbus.py runs the generic profile, and test_braking_probe.py those of vendors.
+    """
+    heavy = name in ("schneider/atv320", "siemens/g120", "siemens/s120-canopen")
     return pytest.param(name, marks=pytest.mark.heavy if heavy else pytest.mark.long)
 
 
