@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         run_fleet as run_fleet,
     )
     from tdhil.fleet.pool import TaskLimits as TaskLimits
-    from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings
+    from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings, row_of as row_of
     from tdhil.fleet.table import read_table as read_table
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
     from tdhil.fleet.trend import (
@@ -28,7 +28,7 @@ else:
             "changes": ("Difference", "History", "Measured", "difference", "history"),
             "fleet": ("FleetRequest", "FleetSummary", "Progress", "find_logs", "run_fleet"),
             "pool": ("TaskLimits",),
-            "rows": ("FleetRow", "Settings"),
+            "rows": ("FleetRow", "Settings", "row_of"),
             "table": ("read_table",),
             "task": ("Done", "LogTask", "identify_log"),
             "trend": ("Compared", "compare_document", "identified", "trend_document"),

@@ -93,6 +93,22 @@ class PlanView:
 
 
 @dataclass(frozen=True)
+class TrendView:
+    """A rig's results over time, and whether they changed: the document of `tdhil trend --json`."""
+
+    rig: str
+    trend: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class CompareView:
+    """Runs side by side: the document of `tdhil compare --json`."""
+
+    runs: list[str]
+    comparison: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class StoppedView:
     """A stop of a rig: its runs, and where it has none, what `tdhil stop` saw (exit code 0: at rest)."""
 
@@ -184,6 +200,8 @@ class Route:
 ROUTES: Final = (
     Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
     Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
+    Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
+          {200: TrendView}, errors=(404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
           OPTIONS, (403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Ask for a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
@@ -192,6 +210,8 @@ ROUTES: Final = (
           {200: StoppedView}, Nothing, (403, 404, 503)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
           query={"rig": "of this rig only", "state": "in this state only", "limit": "at most so many (100)"}),
+    Route("GET", "/runs/compare", "compare", "Runs side by side", "viewer", {200: CompareView}, errors=(404, 422),
+          query={"runs": "two to eight, with commas between"}),
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
     Route("POST", "/runs/{run}/confirm", "confirm", "Let it move, with the code shown at the rig", "operator",
           {200: RunView}, ConfirmBody, (403, 404, 409, 422)),

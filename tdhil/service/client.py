@@ -54,6 +54,17 @@ class Client:
     def rig(self, rig: str) -> dict[str, Any]:
         return self._object("GET", f"/rigs/{quote(rig, safe='')}")
 
+    def trend(self, rig: str) -> dict[str, Any]:
+        """Its results over time, and whether they changed: the document of ``tdhil trend --json``."""
+        found: dict[str, Any] = self._object("GET", f"/rigs/{quote(rig, safe='')}/trend")["trend"]
+        return found
+
+    def compare(self, *runs: str) -> dict[str, Any]:
+        """Runs side by side: the document of ``tdhil compare --json``."""
+        asked = urlencode({"runs": ",".join(runs)})
+        found: dict[str, Any] = self._object("GET", f"/runs/compare?{asked}")["comparison"]
+        return found
+
     def plan(self, rig: str, **options: Any) -> dict[str, Any]:
         """What a run with these options would do, and what to expect of it; nothing is connected to."""
         return self._object("POST", f"/rigs/{quote(rig, safe='')}/plan", options)

@@ -136,10 +136,22 @@ class RunProcess:
             raise
         session.close()
         write_json(self.folder / "result.json", found.document)
+        recording = session.log.recording(complete=True)
+        self._row(found.document, recording.torque_scale_rel_sd)
         if report:
-            self._report(found.document, session.log.recording(complete=True))
+            self._report(found.document, recording)
         self._end(State.DONE, int(found.exit_code), verdict=found.document["verdict"])
         return int(found.exit_code)
+
+    def _row(self, document: Mapping[str, Any], torque_scale_rel_sd: float) -> None:
+        """The run as a line of its rig's history."""
+        from tdhil.fleet import Settings, row_of
+
+        try:
+            row = row_of(self.request.id, document, settings=Settings(), torque_scale_rel_sd=torque_scale_rel_sd)
+            write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
+        except Exception as error:             # the result stands without it
+            print(f"the history can't be written: {error}", file=sys.stderr)  # noqa: T201
 
     def _report(self, document: Mapping[str, Any], recording: Any) -> None:
         from tdhil.errors import UsageError

@@ -40,6 +40,7 @@ from tdhil.service.answers import (
     OPTIONS,
     ROUTES,
     AuditView,
+    CompareView,
     ErrorView,
     HealthView,
     PlanView,
@@ -48,6 +49,7 @@ from tdhil.service.answers import (
     Route,
     RunView,
     StoppedView,
+    TrendView,
     adapter,
     document,
     plain,
@@ -199,6 +201,7 @@ class Web:
                        if route.name in ("health", "metrics")]
         pages = [
             Way("/", self._page("rigs.html", "rigs")),
+            Way("/rigs/{rig}", self._page("history.html", "rigs")),
             Way("/start/{rig}", self._page("start.html", "rigs")),
             Way("/runs", self._page("runs.html", "runs")),
             Way("/runs/{run}", self._page("run.html", "runs")),
@@ -265,6 +268,33 @@ class Web:
         asked = {"rig_file": str(rig.path.resolve()), "options": options}
         found = await anyio.to_thread.run_sync(partial(self.supervisor.work, "plan", None, asked), limiter=self._works)
         return PlanView(rig.id, rig.sha256, found["document"])
+
+    async def _trend(self, request: Request, body: Any) -> TrendView:
+        rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
+
+        def rows() -> list[dict[str, Any]]:
+            runs = self.list_runs(rig.id, "done", 1000)
+            return [row for one in runs if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
+
+        found = await self._off(rows)
+        if not found:
+            nothing = {"rig": rig.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
+            return TrendView(rig.id, nothing)
+        asked = {"rows": found, "rig": rig.id}
+        done = await anyio.to_thread.run_sync(partial(self.supervisor.work, "trend", None, asked), limiter=self._works)
+        return TrendView(rig.id, done["document"])
+
+    async def _compare(self, request: Request, body: Any) -> CompareView:
+        runs = [one for one in request.query_params.get("runs", "").split(",") if one]
+        if not 2 <= len(set(runs)) == len(runs) <= 8:
+            raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID")
+        for run in runs:
+            if not (await self._off(partial(self.store.place, run)) / "run.mcap").is_file():
+                raise NotThere("this run has no log", where=f"run {run}")
+        asked = {"runs": runs, "runs_folder": str(self.store.runs)}
+        work = partial(self.supervisor.work, "compare", None, asked)
+        done = await anyio.to_thread.run_sync(work, limiter=self._works)
+        return CompareView(runs, done["document"])
 
     async def _start(self, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
         key = request.headers.get("idempotency-key")

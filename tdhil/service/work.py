@@ -1,4 +1,4 @@
-"""Arithmetic beside the web: ``python -m tdhil.service.work plan|replay|report|recover``, a question on stdin.
+"""Arithmetic beside the web: ``python -m tdhil.service.work plan|replay|…``, a question on stdin.
 
 A process of its own, nicer than everything that moves: neither a page nor a stop waits for it.
 """
@@ -15,7 +15,7 @@ from typing import Any, Final
 from tdhil.errors import UsageError
 from tdhil.service.states import Told
 
-NICE: Final = {"plan": 5}              # somebody waits for it
+NICE: Final = {"plan": 5, "trend": 5}      # somebody waits for it
 USUAL_NICE: Final = 19
 
 
@@ -67,7 +67,24 @@ def recover(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": None}
 
 
-WORK: Final = {"plan": plan, "replay": replay, "report": report, "recover": recover}
+def trend(asked: dict[str, Any]) -> dict[str, Any]:
+    """What the rows of a rig's runs say over time."""
+    from tdhil.fleet import FleetRow, trend_document
+
+    return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], asked["rig"])}
+
+
+def compare(asked: dict[str, Any]) -> dict[str, Any]:
+    """Some runs side by side, each identified from its log."""
+    from tdhil.fleet import Settings, compare_document, identified
+
+    os.chdir(asked["runs_folder"])
+    return {"document": compare_document([identified(Path(run) / "run.mcap", Settings()) for run in asked["runs"]])}
+
+
+WORK: Final = {
+    "plan": plan, "replay": replay, "report": report, "recover": recover, "trend": trend, "compare": compare,
+}
 
 
 def main(arguments: list[str]) -> int:

@@ -169,6 +169,26 @@ def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_en
     assert failed["error"]["what"] == "no such model"
 
 
+def test_a_rig_s_results_over_time_and_runs_side_by_side(call, service, monkeypatch):
+    assert call("GET", "/rigs/a/trend", 200)["trend"]["results"] == 0
+    call("GET", "/rigs/nobody/trend", 404)
+    runs = []
+    for _ in range(2):
+        runs.append(call.start()["id"])
+        service.wait(runs[-1], "done")
+        wait_for("its end", lambda: not service.supervisor.live())
+        (service.store.place(runs[-1]) / "row.json").write_text('{"log": "x"}')
+    wait_for("the index", lambda: len(call("GET", "/runs?state=done", 200)) == 2)
+    asked = worked(service, monkeypatch, {"quantities": []})
+    assert call("GET", "/rigs/a/trend", 200)["trend"] == {"quantities": []}
+    assert call("GET", f"/runs/compare?runs={','.join(runs)}", 200)["runs"] == runs
+    assert asked == [("trend", {"rows": [{"log": "x"}] * 2, "rig": "a"}),
+                     ("compare", {"runs": runs, "runs_folder": str(service.store.runs)})]
+    for wrong in ("", runs[0], f"{runs[0]},{runs[0]}", ",".join("abcdefghi")):
+        call("GET", f"/runs/compare?runs={wrong}", 422)
+    call("GET", f"/runs/compare?runs={runs[0]},../../x", 404)
+
+
 def test_the_pdf_is_made_when_it_is_first_asked_for(call, service, monkeypatch):
     run = call.start()["id"]
     service.wait(run, "done")

@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
-PAGES = ("/", "/start/a", "/runs", "/audit")
+PAGES = ("/", "/start/a", "/rigs/a", "/runs", "/audit")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},

@@ -91,6 +91,9 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
         assert second.client.download(run, "log.mcap", tmp_path / "copy.mcap").read_bytes() == (
             folder / "run.mcap").read_bytes()
         assert len(second.client.runs()) == 1
+        (inertia, *_) = second.client.trend("simulated-canopen")["quantities"]
+        assert [(one["log"], one["value"]) for one in inertia["points"]] == [
+            (run, found["result"]["inertia_kg_m2"]["value"])]
         assert second.client.audit()["broken"] is None
         assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(104.0, rel=0.02)
     one = json.loads((folder / "result.json").read_bytes())

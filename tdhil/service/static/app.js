@@ -104,6 +104,7 @@
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
         rig.run ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
+        rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
         rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, "Sign off") : null));
   }
 
@@ -467,6 +468,53 @@
     });
   }
 
+  // -- a rig over time
+
+  function historyPlot(where, quantity) {
+    const style = getComputedStyle(document.documentElement), at = (one) => new Date(one.date).getTime() / 1000;
+    const points = quantity.points, ink = style.getPropertyValue("--dim").trim(), line = style.getPropertyValue("--line").trim();
+    const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
+    const low = Math.min(...points.map((one) => one.low)), high = Math.max(...points.map((one) => one.high)), pad = 0.1 * (high - low);
+    const first = at(points[0]), last = at(points[points.length - 1]), side = Math.max(60, 0.08 * (last - first));
+    const plot = new uPlot({
+      width: where.clientWidth || 320, height: 220, legend: { show: false }, cursor: { show: false },
+      scales: { x: { range: () => [first - side, last + side] }, y: { range: () => [low - pad, high + pad] } },
+      axes: [{ ...axis, size: 56 }, { ...axis, size: 58 }],
+      series: [{}, { stroke: style.getPropertyValue("--speed").trim(), width: 0, points: { show: true, size: 7 }, paths: () => null }],
+      hooks: { draw: [(self) => {
+        const c = self.ctx;
+        c.save();
+        c.strokeStyle = style.getPropertyValue("--speed").trim();
+        c.lineWidth = 2 * devicePixelRatio;
+        for (const one of points) {
+          const x = self.valToPos(at(one), "x", true);
+          c.beginPath(); c.moveTo(x, self.valToPos(one.low, "y", true)); c.lineTo(x, self.valToPos(one.high, "y", true)); c.stroke();
+        }
+        c.restore();
+      }] },
+    }, [points.map(at), points.map((one) => one.value)], where);
+    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 220 })).observe(where);
+  }
+
+  async function historyPage() {
+    const rig = document.body.dataset.rig, where = byId("history");
+    try {
+      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend`, undefined, {}, 120000);
+      show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, one)));
+      for (const quantity of trend.quantities.filter((one) => one.points.length)) {
+        const plot = el("div", { class: "plot", role: "img", "aria-label": `${quantity.name} over time` });
+        where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
+          el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
+          el("figure", {}, el("figcaption", {}, "each with its repeatability on this drive"), plot),
+          el("details", {}, el("summary", {}, "Numbers"), el("div", { class: "scroll" }, el("table", {}, el("tbody", {}, ...quantity.points.map((one) => el("tr", {},
+            el("th", { scope: "row" }, el("a", { href: `/runs/${one.log}` }, when(one.date))), el("td", {}, `${number(one.value)} (${number(one.low)} to ${number(one.high)})`)))))))));
+        historyPlot(plot, quantity);
+      }
+    } catch (error) {
+      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+    }
+  }
+
   function auditPage() {
     every(5000, async () => {
       const found = await call("GET", "/audit");
@@ -477,6 +525,6 @@
     });
   }
 
-  const pages = { rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, audit: auditPage };
+  const pages = { rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, history: historyPage, audit: auditPage };
   (pages[document.body.dataset.page] || (() => {}))();
 })();
