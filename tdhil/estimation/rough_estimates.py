@@ -66,11 +66,13 @@ def rough_inertia(
     level_a: Level,
     level_b: Level,
     friction: RoughFriction | None = None,
+    swinging: bool = False,
 ) -> RoughInertia | None:
     """Inertia from the change of speed between two levels, either way; (N,) arrays, time rising.
 
     ``friction`` from elsewhere (two levels of the speed stage) allows level_b to be not quite steady, as after a ramp
-    of torque; without it, it is taken from these two levels. None if there is no change of speed to go by.
+    of torque; without it, it is taken from these two levels. ``swinging``: the levels' speeds are known by their means,
+    about which the shaft swings. None if there is no change of speed to go by.
     """
     own = friction or rough_friction(time_s, speed_rad_s, torque_nm, level_a, level_b)
     good = np.isfinite(speed_rad_s) & np.isfinite(torque_nm)
@@ -86,7 +88,13 @@ def rough_inertia(
     if last - first < 8 or len(before) < 4 or len(after) < 4:
         return None
     change = float(np.mean(after) - np.mean(before))
-    scatter = float(np.hypot(np.std(before), np.std(after)))
+    if swinging:
+        ends = ((level_a, before), (level_b, after))
+        scatter = math.hypot(*(
+            _sd_of_mean(time[(time >= level.start_s) & (time < level.end_s)], seen) for level, seen in ends
+        ))
+    else:
+        scatter = float(np.hypot(np.std(before), np.std(after)))
     if abs(change) <= 3.0 * scatter or change == 0.0:
         return None
     surplus = torque[first:last] - own.coulomb_nm - own.viscous_nm_s_rad * speed[first:last]

@@ -56,3 +56,12 @@ def test_nothing_to_go_by_gives_nothing():
     assert rough_inertia(time, speed, -torque, Level(1.0, 5.0), Level(11.0, 14.0)) is None
     nan = np.full_like(torque, np.nan)
     assert rough_inertia(time, speed, nan, Level(1.0, 5.0), Level(11.0, 14.0)) is None
+
+
+def test_levels_about_which_the_shaft_swings_are_known_by_their_means():
+    time, speed, torque = ramp(hold=24.0)
+    swing = 1.45 * np.sin(2.0 * np.pi * time / 6.0 + 0.3)
+    levels = Level(0.0, 24.0), Level(28.0, 52.0)
+    assert rough_inertia(time, speed + swing, torque, *levels) is None
+    found = rough_inertia(time, speed + swing, torque, *levels, swinging=True)
+    assert found.inertia_kg_m2 == pytest.approx(104.0, rel=0.2)

@@ -18,9 +18,20 @@ from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.speed_check import Onlooker, SpeedUnitCheck
-from tdhil.run.stages.steady import SteadyLevel, calm_string, hold_damped, steady_level, trace, wait_until_steady
+from tdhil.run.stages.steady import (
+    CALM_SHARE,
+    SteadyLevel,
+    calm_string,
+    hold_damped,
+    steady_level,
+    trace,
+    wait_until_steady,
+)
 
 LEVEL_S = 6.0
+RESTLESS_LEVEL_S = 24.0
+"""Of a string that gets no calmer: some swings, over which they average out."""
+
 FIRST_RAMP_S = 8.0
 """The first ramp takes this long over the whole window; a rig too light to show in it is ramped faster."""
 
@@ -33,6 +44,12 @@ from its own inertia to all of the string's. A plan has to leave room for it, an
 
 TRIES = 4
 NOBODY = Onlooker()
+
+_WRONG_TORQUE = "Is the sign or the scale of the torque right? A wider speed window gives a better ramp"
+_TOO_RESTLESS = (
+    "What the string swings by hides the ramp: a wider speed window gives a better one; or lift the bit off bottom, or"
+    " take weight off it"
+)
 
 
 @dataclass(frozen=True)
@@ -94,11 +111,11 @@ def run_speed(
         ramped = _ramp(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
         between, high_samples = [*ramped, *high_held.settling], high_held.level
-        held = loop.cycles(LEVEL_S)
-        low, high = steady_level(low_samples[-held:]), steady_level(high_samples[-held:])
-        moved = trace([*low_samples[-held:], *between, *high_samples[-held:]])
+        low, high = steady_level(low_samples), steady_level(high_samples)
+        moved = trace([*low_samples, *between, *high_samples])
         rough = rough_inertia(
-            moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
+            moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level,
+            swinging=limits.load == "string",
         )
         if rough is not None and rough.rel_error <= good_enough:
             break
@@ -111,7 +128,7 @@ def run_speed(
         raise DriveFault(
             f"no plausible inertia could be read off the speed ramp ({found})",
             where="stage speed",
-            next_step="Is the sign or the scale of the torque right? A wider speed window gives a better ramp",
+            next_step=_TOO_RESTLESS if limits.load == "string" else _WRONG_TORQUE,
         )
     model = RigGuess(
         rough.inertia_kg_m2,
@@ -127,8 +144,8 @@ def run_speed(
         rough,
         Ramp(low.level.end_s, high.level.start_s),
         tuple(high_samples[-loop.cycles(0.5) :]),
-        tuple(_samples(part, torque_offset_nm) for part in (low_samples[-held:], high_samples[-held:])),
-        _course(low_samples[-held:], ramped, high_held, mean_speeds(limits)),
+        tuple(_samples(part, torque_offset_nm) for part in (low_samples, high_samples)),
+        _course(low_samples, ramped, high_held, mean_speeds(limits)),
     )
 
 
@@ -183,7 +200,8 @@ def _settle_and_hold(
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
-        level, asked = hold_damped(loop, calmed.damper, LEVEL_S)
+        restless = calmed.swing.torque_nm > CALM_SHARE * limits.torque_nm
+        level, asked = hold_damped(loop, calmed.damper, RESTLESS_LEVEL_S if restless else LEVEL_S)
         return _Held([*calmed.samples, *later], level, [*calmed.setpoints_rad_s, *asked_later, *asked])
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
     settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
