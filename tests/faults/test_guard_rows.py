@@ -150,10 +150,14 @@ class Slow(FakeDrive):
     late_every = 0
     overruns = 0
 
-    @property
-    def counters(self):
+    def exchange(self, command):
+        sample = super().exchange(command)
         if self.late_every and self.cycles % self.late_every == 0:
             self.overruns += 1
+        return sample
+
+    @property
+    def counters(self):
         return Counters(self.cycles, self.missed, 0, self.overruns)
 
 
