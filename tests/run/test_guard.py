@@ -189,6 +189,25 @@ def test_a_slow_loop_is_judged_by_no_less_than_ten_cycles():
         watch.check_pace(Counters(cycles=10, overruns=9))
 
 
+@given(late=st.lists(st.sampled_from([0, 0, 0, 1]), min_size=1, max_size=450), reckoning=st.integers(0, 150),
+       before=st.integers(0, 300))
+def test_counters_that_are_read_when_it_is_time_end_the_run_in_the_same_cycle(late, reckoning, before):
+    """As those that are read in every cycle do; ``before``: cycles that the drive has had when the loop begins."""
+    def ends(due):
+        watch, overruns = guard(), 0
+        for k, one in enumerate(late):
+            overruns += one
+            watch.reckoning = reckoning // 2 <= k < reckoning
+            if due(watch):
+                try:
+                    watch.check_pace(Counters(cycles=before + k + 1, overruns=overruns))
+                except CommunicationLost as error:
+                    return k, error.what
+        return None
+
+    assert ends(Guard.pace_is_due) == ends(lambda _: True)
+
+
 # -- frozen feedback (row 19) --------------------------------------------------------------------------------------
 
 

@@ -257,6 +257,18 @@ def test_a_string_that_sticks_and_slips_does_not(period_s, depth):
     assert followed(lambda t: min(7.0, t), speed, 90.0, STRING) is None
 
 
+@given(st.lists(st.tuples(st.floats(0.0, 9.0), st.floats(0.0, 9.0)), min_size=1, max_size=60))
+def test_whoever_is_near_the_latest_reference_is_within_all_of_them(rows):
+    """The quick answer and the one by all blocks are the same."""
+    following = watching(period_s=0.1)._following
+    for k, (reference, speed) in enumerate(rows):
+        following.see(reference, sample(speed, time_s=0.1 * k))
+        mean, window = following.speed_rad_s, following._window_rad_s
+        below = min(block.lowest for block in following._blocks) - window - mean
+        above = mean - max(block.highest for block in following._blocks) - window
+        assert following._side == (1.0 if below > 0.0 else -1.0 if above > 0.0 else 0.0)
+
+
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_noise_about_a_wrong_speed_is_no_coming_nearer(noise):
     found = followed(lambda t: 3.0, lambda t, _: 1.0 + noise * math.sin(1e4 * t), 60.0)
