@@ -17,7 +17,7 @@ from tdhil.cli.main import main
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table
 from tdhil.run.settings import ExcitationRequest
-from tdhil.session.confirm import summary
+from tdhil.session.confirm import motion_summary
 
 EVIL = "\x1b[2J\x1b]0;x\x07A\x9b31m[/][red]\u202egnirts\u2066\x00\r\nDrive: safe\u2028 \x7f"
 ROOT = Path(__file__).parents[2]
@@ -79,7 +79,7 @@ def test_the_preflight_table_and_the_prompt():
     assert "[red]" in table
     limits = SimpleNamespace(probe_torque_nm=1.0, probe_travel_rad=1.0, speed_min_rad_s=0.5, speed_max_rad_s=10.0,
                              torque_nm=1.0, time_s=60.0)
-    text = summary(found, limits, ExcitationRequest(), (EVIL,))      # type: ignore[arg-type]
+    text = motion_summary(found, limits, ExcitationRequest(), (EVIL,))      # type: ignore[arg-type]
     assert harmless(text)
     assert "\nDrive: safe" not in text      # no line of its own in what the operator confirms
 
