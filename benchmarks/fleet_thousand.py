@@ -110,13 +110,13 @@ def pool_processes(of: int) -> list[int]:
     return processes(of, b"tdhil.fleet.pool")
 
 
-def cluster_processes() -> list[int]:
-    """Dask's workers, and the process that each of them keeps."""
+def cluster_processes(workers_too: bool) -> list[int]:
+    """The process that each worker of Dask keeps; and the workers."""
     workers = processes(os.getpid(), b"spawn_main")
-    return workers + [pid for worker in workers for pid in pool_processes(worker)]
+    return (workers if workers_too else []) + [pid for worker in workers for pid in pool_processes(worker)]
 
 
-def by_road(road: str, request: FleetRequest, kills: int, function: Any) -> tuple[FleetRow, ...]:
+def by_road(road: str, request: FleetRequest, kills: int, function: Any, workers_too: bool) -> tuple[FleetRow, ...]:
     began = time.monotonic()
     if road == "dask":
         import dask
@@ -124,7 +124,7 @@ def by_road(road: str, request: FleetRequest, kills: int, function: Any) -> tupl
 
         dask.config.set({"distributed.scheduler.allowed-failures": 10})
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40) as cluster:
-            killer = Killer(kills, cluster_processes)
+            killer = Killer(kills, lambda: cluster_processes(workers_too))
             there = replace(request, scheduler=cluster.scheduler_address)
             summary = run_fleet(there, killer, function=function)
     else:
@@ -148,7 +148,7 @@ def thousand(asked: argparse.Namespace, folder: Path) -> None:
     tables = {}
     for road in asked.roads:
         request = FleetRequest((str(logs),), folder / f"{road}.parquet", limits=LIMITS, cache=False, again=True)
-        tables[road] = [repr(row) for row in by_road(road, request, asked.kills, function)]
+        tables[road] = [repr(row) for row in by_road(road, request, asked.kills, function, asked.kill_workers)]
     first = next(iter(tables.values()))
     for road, rows in tables.items():
         differ = sum(a != b for a, b in zip(rows, first, strict=True))
@@ -208,6 +208,7 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=20)
     parser.add_argument("--roads", nargs="+", choices=("pool", "one", "dask"), default=["pool", "one", "dask"])
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--kill-workers", action="store_true", help="kill Dask's own workers, too")
     parser.add_argument("--quick", action="store_true", help="the machinery alone: rows without identifying")
     parser.add_argument("--folder", type=Path, help="where logs and tables stay")
     parser.add_argument("--cost", action="store_true")
