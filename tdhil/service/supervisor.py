@@ -28,6 +28,8 @@ from tdhil.session import Holder, holder_of
 
 LOOK_S: Final = 0.2
 """So often it is looked whether a run still lives."""
+INDEX_LOOKS: Final = 10
+"""Every so many looks what the index didn't take is tried again."""
 STOP_S: Final = 60.0
 """What `tdhil stop` may take for a shaft that turns on."""
 KEYS: Final = 500
@@ -58,6 +60,7 @@ class Supervisor:
         self._live: dict[str, str | None] = {}         # run: the code that was shown
         self._lost: set[str] = set()
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
+        self._unindexed: set[str] = set()
         self._braking = False
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -74,6 +77,7 @@ class Supervisor:
                     self._live[run] = None
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
+        self._in_background(self._rebuild_index)       # what a web that was killed left out of it
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
 
@@ -246,7 +250,11 @@ class Supervisor:
         self._live[run] = None
 
     def _look(self) -> None:
+        looks = 0
         while not self._end.wait(LOOK_S):
+            looks += 1
+            if self._unindexed and looks % INDEX_LOOKS == 0:
+                self._in_background(self._index_again)
             for run in self.live():
                 try:
                     self._look_at(run)
@@ -355,8 +363,21 @@ class Supervisor:
     def _index(self, run: str) -> None:
         try:
             self.index.put(self.store.summary(run))
-        except Exception as error:             # locked, or a full disk: the files have it
-            self._say(f"the index has to wait: {error}")
+            self._unindexed.discard(run)
+        except Exception as error:             # locked, or a full disk: the files have it, and it is tried again
+            if run not in self._unindexed:
+                self._say(f"the index has to wait: {error}")
+            self._unindexed.add(run)
+
+    def _index_again(self) -> None:
+        for run in tuple(self._unindexed):
+            self._index(run)
+
+    def _rebuild_index(self) -> None:
+        try:
+            self.index.rebuild()
+        except Exception as error:
+            self._say(f"the index can't be made: {error}")
 
     def _in_background(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, daemon=True)

@@ -57,7 +57,7 @@ from tdhil.service.answers import (
 from tdhil.service.asking import RigFile, options_of
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.states import Conflict, NotAllowed, NotThere, State, Told, now
-from tdhil.service.store import read_json, write_json
+from tdhil.service.store import Summary, read_json, write_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.wire import Refused, lives
 from tdhil.version import __version__
@@ -482,12 +482,20 @@ class Web:
             blocked, drive, profile, limits, next((one for one in last if one.inertia_kg_m2 is not None), None),
         )
 
-    def list_runs(self, rig: str | None, state: str | None, limit: int) -> Any:
-        """From the index; from the files where that can't be had."""
-        with suppress(sqlite3.Error, OSError):
-            return self.supervisor.index.find(rig=rig, state=state, limit=limit)
-        found = [one for one in self.store.summaries() if rig in (None, one.rig) and state in (None, one.state)]
-        return found[:limit]
+    def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
+        """From the index, or from the files where that can't be had; of a live run always from its files."""
+        live = self.supervisor.live()
+        now_live = []
+        for run in live:
+            with suppress(NotThere):
+                now_live.append(self.store.summary(run))
+        try:
+            ended = [one for one in self.supervisor.index.find(rig=rig, state=state, limit=limit + len(live))
+                     if one.id not in live]
+        except (sqlite3.Error, OSError):
+            ended = [one for one in self.store.summaries() if one.id not in live]
+        found = [one for one in (*now_live, *ended) if rig in (None, one.rig) and state in (None, one.state)]
+        return sorted(found, key=lambda one: one.id, reverse=True)[:limit]
 
     def replays(self, run: str) -> list[ReplayView]:
         """Those that are made, and those that wait."""

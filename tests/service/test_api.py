@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -516,8 +517,6 @@ def test_nothing_moves_by_a_restart(call, service, tmp_path, rigs):
 
 
 def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypatch):
-    import sqlite3
-
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     wait_for("the index", lambda: call("GET", "/runs", 200))
@@ -532,6 +531,30 @@ def test_a_locked_index_and_a_full_audit_hold_up_no_stop(call, service, monkeypa
         service.wait(run, "stopped")
         assert service.web.list_runs(None, None, 10)[0].id == run      # from the files
     base.close()
+    wait_for("the index", lambda: service.index.find(state="stopped"))     # it is tried again
+
+
+def test_the_list_says_what_a_run_is_now(call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    assert [(one["id"], one["state"]) for one in call("GET", "/runs", 200)] == [(run, "moving")]
+    assert call("GET", "/runs?state=requested", 200) == []
+    assert len(call("GET", "/runs?state=moving&rig=a", 200)) == 1
+    assert call("GET", "/runs?state=moving&rig=b", 200) == []
+
+
+def test_what_a_killed_web_left_out_of_the_index_is_in_it_again(call, service, tmp_path, rigs):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    wait_for("the index", lambda: service.index.find(state="done"))
+    before = service.index.find()
+    with service.index._lock, sqlite3.connect(service.store.folder / "index.sqlite") as base:
+        base.execute("update runs set state = 'moving'")
+    base.close()
+    after = Service(tmp_path / "data", rigs)
+    after.supervisor.start()
+    wait_for("the index", lambda: after.index.find() == before)
+    after.supervisor.close()
 
 
 def test_the_audit_says_who_did_what_and_that_it_holds(call, service):
