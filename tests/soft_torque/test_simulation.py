@@ -182,11 +182,19 @@ def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
 
 
 def test_cure_speeds_of_the_reference_case():
-    """Four controllers of the notes at once; the study has the rest."""
-    search = Search(lowest_rpm=24.0, highest_rpm=200.0, duration_s=80.0)
+    """Four controllers of the notes: 3 rpm below the bit sticks in the end, 2 rpm above it turns."""
+    cures = np.array([[183.0], [72.0], [57.0], [40.0]])
+    target = (cures + np.array([[-3.0, 2.0]])) * RPM
     loops = [(DRIVE, law) for law in (STIFF, SOFT_1, SOFT_025, HALF)]
-    cures = lowest_turning(STRING, loops, "stuck", search)
-    assert cures == pytest.approx([183.0, 72.0, 57.0, 40.0], abs=2.0)
+    trace = simulate(STRING, loops, Begin("stuck", target), target, 1.0, 80.0, 20.0)
+    assert (trace.last_stuck_s > 60.0).tolist() == [[True, False]] * 4
+
+
+def test_a_critical_speed_is_found_to_its_resolution():
+    """Coarse, then fine, over a window of few speeds, for one controller."""
+    search = Search(lowest_rpm=48.0, highest_rpm=64.0, coarse_rpm=8.0, resolution_rpm=2.0, duration_s=50.0, calm_s=15.0)
+    (cure,) = lowest_turning(STRING, [(DRIVE, SOFT_025)], "stuck", search)
+    assert cure == pytest.approx(57.0, abs=2.0)
 
 
 def test_without_a_bit_there_are_no_critical_speeds():
