@@ -258,4 +258,57 @@ FLEET: tuple[CoveragePlant, ...] = (
         "fan", "half of the friction's slope goes with the square of speed", 104.0, 4.0, 60.0, (0.5, 10.0), 400.0,
         _lag(0.40), _lag(0.15), FIELD_NOISE, Reading(jitter_s=0.004), bend=Bend(square_nm_s2_rad2=0.6),
     ),
+    # What made intervals wide, or sound runs refused, on rigs that were drawn at random (benchmarks/random_rigs.py).
+    CoveragePlant(
+        "short_matched", "5 ms on both reports", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0, _lag(0.005), _lag(0.005),
+        FIELD_NOISE, Reading(jitter_s=0.004), model_true=True, degenerate=True,
+    ),
+    CoveragePlant(
+        "short_heavy", "6.4 and 3.2 ms on a large top drive", 3000.0, 120.0, 400.0, (0.5, 12.0), 6000.0, _lag(0.0064),
+        _lag(0.0032), Noise(60.0, 1.5, 120.0, 0.01, 0.003, 30.0, 0.1 * RPM, 20.0),
+        Reading(rate_hz=50.0, jitter_s=0.005, command_s=0.02), lowest_hz=0.05, model_true=True, degenerate=True,
+    ),
+    CoveragePlant(
+        "both_long", "long lags on both reports", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0, _lag(0.70), _lag(0.55),
+        FIELD_NOISE, Reading(jitter_s=0.004), model_true=True,
+    ),
+    CoveragePlant(
+        "stribeck_short", "friction that falls by 24 N·m, behind lags of 5 ms", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.005), _lag(0.005), FIELD_NOISE, Reading(jitter_s=0.004), bend=Bend(24.0, 1.5),
+    ),
+    CoveragePlant(
+        "fan_lag", "nearly all of the friction's slope goes with the square of speed, behind 0.3 s", 104.0, 1.0, 60.0,
+        (0.5, 10.0), 400.0, _lag(0.30), _lag(0.05), FIELD_NOISE, Reading(jitter_s=0.004),
+        bend=Bend(square_nm_s2_rad2=1.0),
+    ),
+    CoveragePlant(
+        "register", "whole rpm, ten times a second, in little noise", 350.0, 20.0, 150.0, (0.5, 12.0), 1200.0,
+        _lag(0.30), _lag(0.10), Noise(5.0, 0.6, 5.0, 0.001, 0.001, 2.0, 1.0 * RPM, 3.0), Reading(10.0, command_s=0.1),
+    ),
+    CoveragePlant(
+        "calm_coarse", "speed in half rpm, torque in percent, hardly any noise", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.40), _lag(0.15), Noise(0.6, 0.5, 1.0, 0.001, 0.0, 0.2, 0.5 * RPM, 4.0),
+    ),
+    CoveragePlant(
+        "late_torque", "torque read 60 ms after speed", 250.0, 15.0, 90.0, (0.5, 12.0), 900.0, _lag(0.20), _lag(0.10),
+        Noise(8.0, 0.8, 20.0, 0.02, 0.004, 4.0, 0.1 * RPM, 2.0), Reading(20.0, 0.005, torque_after_s=0.060),
+        model_true=True,
+    ),
+    CoveragePlant(
+        "late_speed", "speed read 60 ms after torque, both hardly filtered", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.010), _lag(0.005), FIELD_NOISE, Reading(20.0, 0.005, speed_after_s=0.060), model_true=True,
+        degenerate=True,
+    ),
+    CoveragePlant(
+        "three_poles_torque", "torque through three poles", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0, _lag(0.10),
+        _lag(0.15, 0.12, 0.10), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "three_poles_both", "both signals through three poles", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0,
+        _lag(0.22, 0.15, 0.10), _lag(0.10, 0.06, 0.04), FIELD_NOISE, Reading(jitter_s=0.004),
+    ),
+    CoveragePlant(
+        "slow_load", "a load of 12 N·m that wanders in eight seconds", 104.0, 8.0, 60.0, (0.5, 10.0), 400.0, _lag(0.30),
+        _lag(0.10), Noise(12.0, 8.0, 10.0, 0.02, 0.003, 2.0, 0.1 * RPM, 1.0), Reading(jitter_s=0.004), model_true=True,
+    ),
 )
