@@ -84,7 +84,11 @@ SUBJECTS = {
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"
     ),
-    "canopen/drive": _driver("canopen/drive", "test_late_host.py", "test_drive_faults.py"),
+    "canopen/drive": _driver(
+        "canopen/drive", "test_preflight.py", "test_trouble.py", "test_late_host.py", "test_drive_faults.py",
+        "test_feedback.py", "test_sdo_feedback.py", "test_other_master.py", "test_supervision.py", "test_position.py",
+        "test_guarding.py", "test_no_watchdog.py", "test_profile_preflight.py", "test_drive_contract.py",
+    ),
     "clock": _driver(
         "clock", "test_late_host.py", "test_drive_faults.py",
         within="RECENT LATE_SHARE RATES_HZ STALL_S STALL_CYCLES how_late quantile Ticks",
