@@ -353,7 +353,7 @@ class RunWriter:
                 raise LogRefused(
                     f"only {free / 1e6:.0f} MB free for the log, {min_free_bytes / 1e6:.0f} MB wanted",
                     where=str(path), next_step="Free some space, or log to another disk")
-            file = opener(path) if opener else path.open("wb" if overwrite else "xb", buffering=0)
+            file = opener(path) if opener else path.open("w+b" if overwrite else "x+b", buffering=0)
             container = Container(file)
         except OSError as error:
             kind = LogRefused if error.errno in _FULL else LogUnopened

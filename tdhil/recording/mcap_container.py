@@ -14,6 +14,7 @@ system in one piece with its indexes, so what a kill leaves is whole chunks and 
 import errno
 import os
 import stat
+import sys
 from contextlib import suppress
 from struct import Struct
 from typing import Any, Final, Protocol
@@ -33,6 +34,8 @@ LIBRARY: Final = f"{PACKAGE} {__version__}"
 _MESSAGE: Final = Struct("<BQHIQQ")
 _INDEX: Final = Struct("<BQHI")
 _FOOTER_HEAD: Final = Struct("<BQQQ")
+_TAIL: Final = 16
+"""Bytes that are compared with what was written: a time and an offset of the last index, never all zero."""
 
 
 class RawFile(Protocol):
@@ -63,6 +66,8 @@ class Container:
     def __init__(self, file: RawFile) -> None:
         self._file = file
         self._offset = 0
+        self._tail = b""                                # of what was written last
+        self._seam: tuple[int, bytes] = (0, b"")        # where that begins, and what stands before it
         self._watched = _is_named(file)
         self._compress = zstandard.ZstdCompressor(level=1).compress
         self._parts: list[bytes] = []
@@ -156,6 +161,8 @@ class Container:
                 self._file.seek(self._offset)
                 self._file.truncate()
             raise
+        self._seam = (self._offset - len(self._tail), self._tail)
+        self._tail = data[-_TAIL:]
         self._offset += len(data)
 
     def _require_whole(self) -> None:
@@ -165,6 +172,20 @@ class Container:
         if found.st_size < self._offset:
             raise LogGone(
                 errno.EIO, f"the file was cut to {found.st_size} of {self._offset} bytes while it was being written"
+            )
+        # Cut between the last look and the last write: the write has made it long again, with a hole before it.
+        start, before = self._seam
+        if sys.platform == "win32":    # has no pread, and lets nobody cut a file that another writes
+            return
+        try:
+            stands = os.pread(self._file.fileno(), len(before), start)
+        except OSError:                # a file that can't be read, too: nothing to compare
+            return
+        if stands != before:
+            raise LogGone(
+                errno.EIO,
+                f"the file was cut to less than {start + len(before)} of {self._offset} bytes"
+                " while it was being written",
             )
 
     def _statistics(self) -> Statistics:

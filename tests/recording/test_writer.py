@@ -2,6 +2,7 @@
 
 import errno
 import io
+import os
 import random
 import threading
 import time
@@ -13,9 +14,10 @@ from drivers.drive import Command, Mode
 from tdhil.errors import ExitCode, LogBroken, LogError, exit_code
 from tdhil.recording import log_writer
 from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import Event
+from tdhil.recording.log_format import CHANNELS, Event
 from tdhil.recording.log_reader import read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
+from tdhil.recording.mcap_container import Container, LogGone
 from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import RESULT, fill, frames, make_run, sample
@@ -278,12 +280,38 @@ def test_a_stage_that_lost_records_is_marked_so_in_the_log(tmp_path):
     assert log.recording(complete=True).stages == run.stages
 
 
+@pytest.mark.parametrize("left", [0, 5, 1000])
+def test_a_cut_just_before_a_write_is_told_at_the_next(tmp_path, left):
+    class Cutting(io.FileIO):          # between the container's look at the file and its write
+        armed = False
+
+        def write(self, data):
+            if self.armed:
+                os.truncate(self.name, left)
+                Cutting.armed = False
+            return super().write(data)
+
+    container = Container(Cutting(tmp_path / "log.mcap", "x+"))
+
+    def one_chunk():
+        container.add(min(CHANNELS), 1_000_000_000, bytes(100))
+        container.close_chunk()
+
+    for _ in range(3):
+        one_chunk()
+    Cutting.armed = True
+    one_chunk()
+    with pytest.raises(LogGone, match="was cut to less than"):
+        one_chunk()
+
+
 # -- a log that somebody takes away --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("block", [True, False])
 @pytest.mark.parametrize(("how", "said"), [
-    ("removed", "removed while it was being written"), ("replaced", "removed while"), ("cut", "was cut to 0 of"),
+    ("removed", "removed while it was being written"), ("replaced", "removed while"),
+    ("cut", "was cut to (0|less than .*) of"),
     ("shortened", "was cut to"),
 ])
 def test_a_log_that_was_taken_away_is_told_at_once(tmp_path, block, how, said):
