@@ -19,6 +19,7 @@ def inertias(found):
     return tuple(np.array([getattr(e, name) for e in estimates]) for name in ("value", "low", "high"))
 
 
+@pytest.mark.heavy
 def test_within_one_percent_and_covering(default_run):
     rig, motion, plan, shaft = default_run
     found = [identify(recording) for recording in recordings(rig, motion, shaft, SEEDS)]

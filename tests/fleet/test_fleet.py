@@ -77,6 +77,7 @@ def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
     assert again.row == replace(first.row, log=str(copy))
 
 
+@pytest.mark.heavy
 def test_one_process_or_two_give_the_same_table(few, tmp_path):
     one, two = (run_fleet(FleetRequest((str(few),), tmp_path / f"{jobs}.csv", jobs=jobs, cache=False)).rows
                 for jobs in (1, 2))
@@ -198,6 +199,7 @@ def test_a_log_that_may_not_be_read_has_a_row(tmp_path, few, monkeypatch):
     assert (row.error_kind, row.error_text, row.sha256) == ("PermissionError", "can't be read: Permission denied", None)
 
 
+@pytest.mark.heavy
 def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
     """Dask's scheduler and a worker of it in this process; the log is read in one beside it, as ever."""
     distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
