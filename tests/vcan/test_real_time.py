@@ -18,7 +18,7 @@ import multiprocessing
 import os
 import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,13 @@ def further_interface(name: str) -> Iterator[list[str]]:
         run(ip, "link", "del", name)
 
 
+def go_first(drive: Peer) -> None:
+    """A real drive has a processor of its own, and isn't silent because the host's computer is busy."""
+    for thread in Path(f"/proc/{drive.child.pid}/task").iterdir():
+        with suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, int(thread.name), -15)
+
+
 @pytest.fixture(scope="module")
 def lanes(tmp_path_factory):
     with ExitStack() as stack:
@@ -115,6 +122,7 @@ def lanes(tmp_path_factory):
             folder = tmp_path_factory.mktemp(name)
             options = ("-i", "socketcan", "-c", name, "--seed", 5 + index)
             drive = stack.enter_context(peer(folder, *options, program=PLAIN))
+            go_first(drive)
             found.append((drive, folder, range(index, RUNS, len(names))))
         lanes = [Lane(*one) for one in found]
         for lane in lanes:
