@@ -36,11 +36,16 @@ class PowerState(Enum):
 
 
 class Command(NamedTuple):
-    """One cycle's wish: the mode, and the setpoint of each mode (the other one seeds a later switch)."""
+    """One cycle's wish: the mode, and the setpoint of each mode (the other one seeds a later switch).
+
+    ``torque_offset_nm`` is added by the drive to what its speed loop asks for; only where `DriveLimits.torque_offset`
+    was asked for, in speed mode, and while it is to be enabled: with anything else asked for it goes out as zero.
+    """
 
     mode: Mode
     speed_rad_s: float
     torque_nm: float
+    torque_offset_nm: float = 0.0
 
 
 class Sample(NamedTuple):
@@ -101,6 +106,7 @@ class DriveLimits:
     accept_wider: frozenset[str] = frozenset()     # of `drivers.own_limits.NAMES`: own limits that may be made wider
     accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
     temperature_c: float | None = None     # °C; above it the run is stopped, where the drive tells a temperature
+    torque_offset: bool = False            # will `Command.torque_offset_nm` be used? refused where the drive has none
 
 
 @dataclass(frozen=True)
@@ -148,6 +154,7 @@ class Preflight:
     safe_action: str                   # what the drive does by itself when the host falls silent
     filters: ReportingFilters = ReportingFilters()
     torque_setpoint: str = "torque setpoint"     # object or register that takes it
+    torque_offset_resolution_nm: float = 0.0     # one count of the torque offset; 0: not asked for, or there is none
     kept_torque_nm: float | None = None          # the drive's own limit, where it was tighter than asked and stayed
     kept_speed_rad_s: float | None = None        # (`drivers.own_limits`)
     quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows

@@ -207,6 +207,20 @@ class Torque(Entry):
     has_demand: bool = Field(description="does the drive report its torque demand in 6074h, in the unit of 6077h?")
 
 
+class TorqueOffset(Entry):
+    """A torque that the drive adds to that of its own speed loop: 60B2h, torque offset (CiA 402-2).
+
+    Mapped and used by those runs alone that ask for it, such as the measurement of the drive's own impedance.
+    """
+
+    index: Index = Field(default=0x60B2, description="object that takes it, 16 bits with a sign")
+    sub: SubIndex = Field(default=0, description="its sub-index")
+    rated_per_lsb: Positive = Field(description="its unit as a share of rated torque, such as 0.001")
+    modes: tuple[I8, ...] = Field(
+        min_length=1, description="speed modes of `modes.speed` in which the drive adds it; the standard names 9 alone"
+    )
+
+
 class Watchdog(Entry):
     """What stops the drive when the host falls silent."""
 
@@ -275,6 +289,9 @@ class CanopenProfile(DriveProfile):
         "has them; null = none, and the operator is asked what he sees",
     )
     torque: Torque
+    torque_offset: TorqueOffset | None = Field(
+        default=None, description="a torque added to the speed loop's, over the bus; null = none"
+    )
     watchdog: Watchdog
     cyclic: Cyclic
     filters: tuple[ReportingFilter, ...] = Field(default=(), description="where reported-signal filters can be read")

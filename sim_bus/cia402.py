@@ -171,6 +171,7 @@ class Application:
         self.controlword = 0
         self.target_speed_rad_s = 0.0
         self.target_torque_nm = 0.0
+        self.torque_offset_nm = 0.0    # 60B2h, of the cyclic synchronous modes
         self.modes = frozenset(Mode) - {Mode.VELOCITY}        # only a drive whose profile says so has it
         self.warning = False
         self.deaf = False              # scripted: no command moves the state machine
@@ -241,7 +242,7 @@ class Application:
         """Reset of the device: no torque, switch on disabled, setpoints forgotten."""
         self.controlword = 0
         self.mode = self.first_mode
-        self.target_speed_rad_s = self.target_torque_nm = 0.0
+        self.target_speed_rad_s = self.target_torque_nm = self.torque_offset_nm = 0.0
         self._own_stop = False
         self._weighed = None
         self._enter(State.SWITCH_ON_DISABLED)
@@ -317,6 +318,7 @@ class Application:
     def regulate(self) -> None:
         """Hands state, mode and setpoints to the control loops; called once before the steps of a cycle."""
         control, settings = self.inverter.control, self.settings
+        control.offset_nm = self.torque_offset_nm if self.mode is Mode.CYCLIC_VELOCITY else 0.0
         if self._after_stop is not None or self.state is State.QUICK_STOP:
             control.stop(self._ramp(self._stop_option))
         elif self.state is not State.ENABLED:
@@ -328,7 +330,7 @@ class Application:
             target = self.target_speed_rad_s if released else 0.0
             control.speed(target, settings.accel_rad_s2, settings.decel_rad_s2)
         elif self.mode is Mode.CYCLIC_TORQUE:
-            control.torque(self.target_torque_nm)
+            control.torque(self.target_torque_nm + self.torque_offset_nm)
         elif self.mode is Mode.CYCLIC_VELOCITY:
             control.speed(self.target_speed_rad_s)
         elif self.mode is Mode.PROFILE_TORQUE:

@@ -140,7 +140,10 @@ class Reporting:
 # The drive's loops: speed PI with anti-windup, torque mode under a speed limit, ramps, bumpless switching.
 #
 # Speed control: e = ramped reference − filtered speed, demand = K_p e + I, dI/dt = K_i e, clamped to the
-# torque limits; the integral stands still while the clamp holds and e would push further into it.
+# torque limits; the integral stands still while the clamp holds and e would push further into it. The reference may be
+# smoothed first. A torque offset (CiA 402-2, 60B2h) is added to the demand, inside the clamp. The standard doesn't say
+# what becomes of it in a quick stop; here it goes on acting for as long as speed is regulated, which is the worse case
+# of the two for whoever stops the shaft.
 #
 # Torque mode: demand = ramped torque − K_p x − I with x the speed beyond the limit and dI/dt = K_i x, I ≥ 0: nothing
 # happens below the limit, and in the long run the limit is held exactly. The same on the negative side.
@@ -181,12 +184,15 @@ class Controller:
         "_integral",
         "_overspeed",
         "_params",
+        "_reference_gain",
+        "_smoothed",
         "_target",
         "_up",
         "demand_nm",
         "filtered_rad_s",
         "limited",
         "limits",
+        "offset_nm",
         "reference",
         "regulation",
     )
@@ -205,11 +211,14 @@ class Controller:
         self._integral = 0.0
         self._overspeed = 0.0          # integral of the speed limiter, N·m
         self._came_from = 0.0          # sign of the speed when the stop began
+        self.offset_nm = 0.0           # torque offset
+        self._smoothed = 0.0           # the reference behind its filter, rad/s
         self.prepare(params.control_period_s)
 
     def prepare(self, dt_s: float) -> None:
-        """Fits the speed filter to a step of ``dt_s``."""
+        """Fits the speed and reference filters to a step of ``dt_s``."""
         self._filter_gain = lag_gain(dt_s, self._params.speed_filter_s)
+        self._reference_gain = lag_gain(dt_s, self._params.reference_filter_s)
 
     def off(self) -> None:
         """No torque; the shaft coasts."""
@@ -275,8 +284,8 @@ class Controller:
 
     def _enter_speed_control(self, regulation: Regulation) -> None:
         if self.regulation not in {Regulation.SPEED, Regulation.STOP}:
-            self.reference = self.filtered_rad_s
-            self._integral = self.demand_nm
+            self.reference = self._smoothed = self.filtered_rad_s
+            self._integral = self.demand_nm - self.offset_nm
         self.regulation = regulation
 
     def _ramp(self, dt_s: float) -> None:
@@ -299,9 +308,12 @@ class Controller:
         if self.regulation is Regulation.STOP and self._came_from and self.filtered_rad_s * self._came_from <= 0.0:
             self._came_from = 0.0
             self._integral = self.reference = reference = 0.0
+        if self._reference_gain != 1.0:
+            self._smoothed += self._reference_gain * (reference - self._smoothed)
+            reference = self._smoothed
         error = reference - self.filtered_rad_s
         growth = params.speed_integral_gain_nm_rad * error * dt_s
-        demand = params.speed_gain_nm_s_rad * error + self._integral
+        demand = params.speed_gain_nm_s_rad * error + self._integral + self.offset_nm
         if demand > limits.torque_forward_nm:
             demand, limited = limits.torque_forward_nm, True
             growth = min(growth, 0.0)

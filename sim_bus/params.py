@@ -24,6 +24,8 @@ class DriveParams(Validated):
     speed_gain_nm_s_rad: NonNegative = 300.0
     speed_integral_gain_nm_rad: NonNegative = 300.0
     speed_filter_s: NonNegative = 0.02
+    reference_filter_s: NonNegative = 0.0
+    """First-order smoothing of the speed setpoint, before the speed loop."""
     torque_lag_s: NonNegative = 0.01
     control_period_s: float = Field(default=0.002, gt=0.0, le=0.01)
     """The longest step of control and plant."""

@@ -6,14 +6,17 @@ One cycle, all of it sent by this loop and nothing by any other thread or by the
            700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
 
 Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
-switch and the torque target that seeds it therefore act together. A drive that knows no heartbeat consumer is asked
-by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in `shape`.
+switch and the torque target that seeds it therefore act together. Where a torque offset is used (60B2h) it goes out in
+RPDO2 with every cycle, as zero from the cycle on in which a stop is asked for. A drive that knows no heartbeat consumer
+is asked by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in
+`shape`.
 """
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from drivers.canopen import preflight as checks
@@ -21,10 +24,24 @@ from drivers.canopen import watchdog as arming
 from drivers.canopen.bus import PEER_DEAD_S, CanLink
 from drivers.canopen.limits import check_parameters, note_temperature, set_limits
 from drivers.canopen.other_master import Strangers
-from drivers.canopen.pdo import RPDO2, Feedback, Reported, Units, encode_speed, encode_torque, shape_of
+from drivers.canopen.pdo import (
+    Feedback,
+    Reported,
+    Units,
+    encode_speed,
+    encode_torque,
+    encode_torque_offset,
+    shape_of,
+)
 from drivers.canopen.pdo_mapping import slow_syncs
 from drivers.canopen.position import Angle, find_angle
-from drivers.canopen.preflight import find_free_node, find_units, read_identity, refuse_in_doubt
+from drivers.canopen.preflight import (
+    find_free_node,
+    find_torque_offset,
+    find_units,
+    read_identity,
+    refuse_in_doubt,
+)
 from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
 from drivers.canopen.sdo_feedback import keep_stepping, poll, push
@@ -198,7 +215,7 @@ class Cia402Drive:
         checks.check_identity(table, self._identity, self._profile)
         checks.check_state(table, objects, self._units, self._profile)
         check_parameters(table, objects, self._profile)
-        self._codes = checks.choose_modes(table, objects, self._profile)
+        self._codes = checks.choose_modes(table, objects, self._profile, limits.torque_offset)
         self._modes = {code: mode for mode, code in self._codes.items()}
         table.checks += scaling.checks
         self._angle = find_angle(table, objects, self._profile)
@@ -208,10 +225,14 @@ class Cia402Drive:
         checks.clear_targets(table, objects, self._profile)
         for code in self._codes.values():
             checks.check_mode_display(table, objects, code, self._pause)
+        if limits.torque_offset and (offset := find_torque_offset(table, objects, self._profile, rated_nm)) is not None:
+            self._shape = replace(self._shape, offset=offset[0])
+            self._units = replace(self._units, offset_nm_per_lsb=offset[1])
+        self._standing.offset = self._shape.offset
         with_demand, others = arming.map_pdos(table, objects, self._node, self._profile, self._shape, self.period_s)
         for number, cob_id in others.items():
             self._strangers.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
-        self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.mode else {}), **others}
+        self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.second else {}), **others}
         self._slow_layout = self._shape.slow(with_demand)
         self._life.pace(limits.watchdog_s / 5.0)
         self._life.host_node = self._strangers.settle_number(table)
@@ -292,6 +313,8 @@ class Cia402Drive:
             back.watch_setpoint("the target torque", 0x6071)
         if self._shape.mode:
             back.watch_setpoint("the mode of operation", 0x6060)
+        if self._shape.offset is not None and self._shape.offset[1] == 0:
+            back.watch_setpoint("the torque offset", self._shape.offset[0])
 
     def _start(self, stall_share: float = 0.5) -> None:
         """Operational from now on, and watched. Standing still for this share of the watchdog's time is an error."""
@@ -351,6 +374,9 @@ class Cia402Drive:
             raise CommandRejected(f"the drive was not prepared for {command.mode.value} mode", where="6060h")
         speed_raw = encode_speed(command.speed_rad_s, self._units, self._shape.target_speed)
         torque_raw = encode_torque(command.torque_nm, self._units)
+        offset_raw = encode_torque_offset(command.torque_offset_nm, self._units)
+        if self._wish is not Wish.ENABLED or command.mode is not Mode.SPEED:
+            offset_raw = 0
         self._ticks.wait(self._listen_until)
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
         self._check()
@@ -361,9 +387,13 @@ class Cia402Drive:
         code, shown_code = self._codes[command.mode], self._reported.shown_code
         self._since_mode_sent += 1
         again = code != shown_code and self._since_mode_sent >= _REPEAT_MODE_CYCLES
-        if code != self._sent_code or again or self._mode_overwritten:
-            if self._shape.mode:
-                self._link.send(self._rpdo2_id, RPDO2.pack(code))
+        changes = code != self._sent_code or again or self._mode_overwritten
+        offset = self._shape.offset
+        if (changes and self._shape.mode) or offset is not None:
+            self._link.send(self._rpdo2_id, self._shape.slow_setpoints(code, offset_raw))
+            if offset is not None:
+                self._read_back.sent(offset[0], offset_raw)
+        if changes:
             self._sent_code, self._since_mode_sent, self._mode_overwritten = code, 0, False
         word = controlword_towards(self._reported.state, self._wish)
         self._link.send(self._rpdo1_id, self._shape.setpoints(word, torque_raw, speed_raw), self._ticks.check)
@@ -452,7 +482,7 @@ class Cia402Drive:
         half_s = 0.5 * (self.clock.now_s() - begun_s)
         self._reported.take(found.status, found.speed, found.torque)
         self._follow_state()
-        push(self._objects, found.status, self._wish, self._watchdog_s)
+        push(self._objects, found.status, self._wish, self._watchdog_s, self._shape.offset)
         self._life.feed()
         self._ticks.put_off()
         return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)

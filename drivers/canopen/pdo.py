@@ -34,7 +34,7 @@ from profiles.canopen import CanopenProfile, ObjectType
 #
 #     RPDO1  6040h controlword u16 | 6071h target torque i16 ‰ | 60FFh target velocity i32 LSB
 #     TPDO1  6041h statusword  u16 | 6077h torque actual i16 ‰ | 606Ch velocity actual i32 LSB
-#     RPDO2  6060h modes of operation i8
+#     RPDO2  6060h modes of operation i8 [| 60B2h torque offset i16 ‰, then in every cycle]
 #     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰]
 #
 # ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
@@ -43,6 +43,8 @@ from profiles.canopen import CanopenProfile, ObjectType
 RPDO1 = struct.Struct("<Hhi")
 TPDO1 = struct.Struct("<Hhi")
 RPDO2 = struct.Struct("<b")
+RPDO2_OFFSET = struct.Struct("<h")
+RPDO2_MODE_OFFSET = struct.Struct("<bh")
 TPDO2_MODE = struct.Struct("<b")
 TPDO2_MODE_DEMAND = struct.Struct("<bh")
 
@@ -74,6 +76,7 @@ class Units:
     speed_rad_s_per_lsb: float
     torque_nm_per_lsb: float
     target_nm_per_lsb: float | None = None      # None: as reported
+    offset_nm_per_lsb: float = 0.0              # of the torque offset, where one is used
 
 
 def encode_speed(speed_rad_s: float, units: Units, target: tuple[int, int, int] = TARGET_VELOCITY) -> int:
@@ -86,6 +89,15 @@ def encode_torque(torque_nm: float, units: Units) -> int:
     """N·m at the motor shaft → 6071h. Raises CommandRejected outside i16 or if not finite."""
     per_lsb = units.target_nm_per_lsb or units.torque_nm_per_lsb
     return _encode(torque_nm, per_lsb, 15, "target torque 6071h", "N·m")
+
+
+def encode_torque_offset(torque_nm: float, units: Units) -> int:
+    """N·m at the motor shaft → 60B2h. Raises CommandRejected outside i16, if not finite, or where none is mapped."""
+    if not units.offset_nm_per_lsb:
+        if torque_nm != 0.0:
+            raise CommandRejected("a torque offset was not prepared for", where="60B2h")
+        return 0
+    return _encode(torque_nm, units.offset_nm_per_lsb, 15, "torque offset 60B2h", "N·m")
 
 
 def _encode(value: float, per_lsb: float, bits: int, where: str, unit: str) -> int:
@@ -211,6 +223,7 @@ class Shape:
     mode: bool = True                                  # is there an RPDO2 with 6060h?
     torque: tuple[int, int, int] = TORQUE_ACTUAL       # index, subindex, bits of the reported torque
     vl: bool = False                                   # is the speed told in 6042h and shown in 6044h?
+    offset: tuple[int, int, int] | None = None         # index, subindex, bits of a torque offset that RPDO2 carries
     feedback: Struct = TPDO1                           # statusword, torque, speed; wide: of both TPDOs, put together
 
     @property
@@ -235,6 +248,17 @@ class Shape:
         if self.vl:
             return RPDO1_VL.pack(word | VL_RELEASED if word == ENABLE_OPERATION else word, speed_raw)
         return RPDO1_SPEED.pack(word, speed_raw)
+
+    @property
+    def second(self) -> tuple[tuple[int, int, int], ...]:
+        """What RPDO2 carries; () where there is none."""
+        return (MODE,) * self.mode + (() if self.offset is None else (self.offset,))
+
+    def slow_setpoints(self, code: int, offset_raw: int) -> bytes:
+        """RPDO2."""
+        if self.offset is None:
+            return RPDO2.pack(code)
+        return RPDO2_MODE_OFFSET.pack(code, offset_raw) if self.mode else RPDO2_OFFSET.pack(offset_raw)
 
     def data_size(self) -> int:
         """Bytes of TPDO1."""

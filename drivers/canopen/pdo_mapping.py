@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from drivers.canopen.pdo import (
     CONTROLWORD,
-    MODE,
     MODE_DISPLAY,
     STANDARD,
     STATUSWORD,
@@ -59,7 +58,7 @@ def slow_syncs(period_s: float) -> int:
 
 
 def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
-    """RPDO1, TPDO1, RPDO2 (where the mode may change), TPDO2; ``with_demand`` adds 6074h where the drive has it.
+    """RPDO1, TPDO1, RPDO2 (`Shape.second`), TPDO2; ``with_demand`` adds 6074h where the drive has it.
 
     ``slow``: see `slow_syncs`.
     """
@@ -71,7 +70,7 @@ def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -
         first, second, syncs = (shape.torque, shape.actual_speed), (STATUSWORD, *shown), 1
     else:
         first, second, syncs = (STATUSWORD, shape.torque, shape.actual_speed), shown, slow
-    modes = (Pdo(True, 2, 1, (MODE,)),) if shape.mode else ()
+    modes = (Pdo(True, 2, 1, shape.second),) if shape.second else ()
     return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
 
 

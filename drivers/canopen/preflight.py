@@ -227,11 +227,18 @@ def refuse_if_driven(objects: Objects) -> None:
         )
 
 
-def choose_modes(table: Table, objects: Objects, profile: CanopenProfile) -> dict[Mode, int]:
-    """The first of the profile's modes that the drive says it supports (6502h), for speed and for torque."""
+def choose_modes(
+    table: Table, objects: Objects, profile: CanopenProfile, with_offset: bool = False
+) -> dict[Mode, int]:
+    """The first of the profile's modes that the drive says it supports (6502h), for speed and for torque.
+
+    ``with_offset``: of the speed modes, those alone in which the drive adds a torque offset.
+    """
     supported = objects.read_if_there(0x6502)
     chosen: dict[Mode, int] = {}
-    for mode, codes in ((Mode.SPEED, profile.modes.speed), (Mode.TORQUE, profile.modes.torque)):
+    adding = profile.torque_offset.modes if with_offset and profile.torque_offset is not None else profile.modes.speed
+    speed = [code for code in profile.modes.speed if code in adding]
+    for mode, codes in ((Mode.SPEED, speed), (Mode.TORQUE, profile.modes.torque)):
         for code in codes:
             if supported is None or code < 1 or supported >> code - 1 & 1:
                 chosen[mode] = code
@@ -266,13 +273,38 @@ def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> No
     """No setpoint of an earlier run may act when the drive is enabled."""
     index, _, bits = VL_TARGET if profile.speed.vl else TARGET_VELOCITY
     targets = ((0x6071, 16), (index, bits)) if profile.modes.torque else ((index, bits),)
+    offset = profile.torque_offset
+    if offset is not None and objects.read_if_there(offset.index, offset.sub):
+        targets = (*targets, (offset.index, 16))       # what a host that died has left there
 
     def work() -> tuple[str, bool]:
         for index, bits in targets:
-            objects.write(index, 0, 0, bits)
+            objects.write(index, 0 if offset is None or index != offset.index else offset.sub, 0, bits)
         return "0", True
 
     table.attempt("targets", "0", ", ".join(f"{index:04X}h" for index, _ in targets), work)
+
+
+def find_torque_offset(
+    table: Table, objects: Objects, profile: CanopenProfile, rated_nm: float
+) -> tuple[tuple[int, int, int], float] | None:
+    """Index, subindex and bits of the torque offset, and N·m for one count; None: refused, with the reason."""
+    entry = profile.torque_offset
+    if entry is None:
+        table.row(
+            "torque offset", "there", f"profile {profile.name} has none", False, "profile, torque_offset",
+            "The drive's own impedance can be measured from its speed reference instead (--impedance reference)",
+        )
+        return None
+    where = name(entry.index, entry.sub)
+
+    def work() -> tuple[str, bool]:
+        objects.write(entry.index, entry.sub, 0, 16)
+        return str(objects.read(entry.index, entry.sub, signed=True)), True
+
+    if not table.attempt("torque offset", "0", where, work, "The drive has no torque offset: see its manual"):
+        return None
+    return (entry.index, entry.sub, 16), entry.rated_per_lsb * rated_nm
 
 
 def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
@@ -316,6 +348,7 @@ def report(
         safe_action=profile.watchdog.reaction if watchdog_s else "none",
         filters=filters,
         torque_setpoint="6071h",
+        torque_offset_resolution_nm=units.offset_nm_per_lsb,
         kept_torque_nm=kept.get(TORQUE),
         kept_speed_rad_s=kept.get(SPEED),
         quick_stop_holds=quick_stop_holds(objects, profile),

@@ -75,6 +75,7 @@ class Standing:
         self._since_s: float | None = None
         self._turn = 0
         self.rpdos: dict[int, int] = {}
+        self.offset: tuple[int, int, int] | None = None    # index, subindex, bits of a torque offset that is in use
         self.by_sdo = False
 
     def set_period(self, period_s: float) -> None:
@@ -106,7 +107,14 @@ class Standing:
         return done
 
     def push(self, state: State, wish: Wish) -> None:
-        """Towards ``wish`` by SDO, one request a cycle: the controlword, and zero setpoints in between."""
+        """Towards ``wish`` by SDO, one request a cycle: the controlword, and zero setpoints in between.
+
+        A torque offset goes first, whatever the state.
+        """
+        if self.offset is not None and self._turn == 0:
+            self._turn = 1
+            self._write(_EXPEDITED_2, self.offset[0], 0, self.offset[1])
+            return
         if wish is Wish.QUICK_STOP and state in _LEFT_ALONE:
             return
         if wish is Wish.OFF and state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
@@ -116,12 +124,13 @@ class Standing:
             index, _, bits = self._target
             self._write(_EXPEDITED_4 if bits == 32 else _EXPEDITED_2, index, 0)
         elif self._turn % 4 == 2:
-            self._write(_EXPEDITED_2, 0x6071, 0)
+            index, sub, _ = self.offset or (0x6071, 0, 16)
+            self._write(_EXPEDITED_2, index, 0, sub)
         else:
             self._write(_EXPEDITED_2, 0x6040, controlword_towards(state, wish))
 
-    def _write(self, command: int, index: int, value: int) -> None:
-        request = bytes((command,)) + index.to_bytes(2, "little") + b"\0" + value.to_bytes(4, "little")
+    def _write(self, command: int, index: int, value: int, sub: int = 0) -> None:
+        request = bytes((command,)) + index.to_bytes(2, "little") + bytes((sub,)) + value.to_bytes(4, "little")
         self._link.send(0x600 + self._node, request)
 
 
@@ -204,6 +213,10 @@ class Cia402Target:
         self._link.close()
 
     def _prepare(self) -> None:
+        offset = self._profile.torque_offset
+        if offset is not None and self._objects.read_if_there(offset.index, offset.sub):
+            with suppress(ObjectRefused):          # of a host that died, perhaps; it goes first
+                self._objects.write(offset.index, offset.sub, 0, 16)
         option = self._objects.read_if_there(0x605A, signed=True)
         self._prepared = True
         if option == _COAST:

@@ -68,13 +68,20 @@ def keep_stepping(objects: Objects, profile: CanopenProfile, period_s: float) ->
             return
 
 
-def push(objects: Objects, status: int, wish: Wish, watchdog_s: float) -> None:
-    """The controlword towards ``wish`` by SDO, where the drive isn't there; never one that enables."""
+def push(
+    objects: Objects, status: int, wish: Wish, watchdog_s: float, offset: tuple[int, int, int] | None = None
+) -> None:
+    """The controlword towards ``wish`` by SDO, where the drive isn't there; never one that enables.
+
+    A torque ``offset`` that is in use is taken away first.
+    """
     state = decode(status)
     if wish is Wish.ENABLED or state in _AT_REST[wish]:
         return
     with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
         try:
+            if offset is not None:
+                objects.write(offset[0], offset[1], 0, offset[2])
             objects.write(0x6040, 0, controlword_towards(state, wish), 16)
         except (CommunicationLost, ObjectRefused):
             return                     # the next look sees what became of it

@@ -4,7 +4,7 @@
 606B 606C 60FF 606D 606F   velocities and their windows                0.1 rpm (60A9h)
 6083 6084 6085             accelerations                               0.1 rpm/s
 6080                       max motor speed                             rpm
-6071 6072 6074 6077 60E0 60E1   torques                                ‰ of 6076h
+6071 6072 6074 6077 60B2 60E0 60E1   torques                           ‰ of 6076h
 6064 · 608F                angle · its counts a turn                   increments
 6076 · 6075                rated torque · rated current                mN·m · mA
 6087                       torque slope                                ‰ of 6076h per second
@@ -49,6 +49,7 @@ class ObjectUnits:
     max_torque: float              # 6072h 60E0h 60E1h
     torque_slope: float            # 6087h, per second
     rated_torque: float            # 6076h, or where the profile has it
+    torque_offset: float           # 60B2h
 
 
 def standard_units(drive: DriveParams) -> ObjectUnits:
@@ -56,12 +57,13 @@ def standard_units(drive: DriveParams) -> ObjectUnits:
     tenth_rpm, per_mille = TURN / 600.0, drive.rated_torque_nm / 1000.0
     return ObjectUnits(
         tenth_rpm, tenth_rpm, tenth_rpm, tenth_rpm, TURN / 60.0, per_mille, per_mille, per_mille, per_mille, 0.001,
+        per_mille,
     )
 
 
 def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str, float]) -> ObjectUnits:
     """As the profile says; ``scales`` are the values of the parameters it multiplies and divides by."""
-    usual, speed, torque = standard_units(drive), profile.speed, profile.torque
+    usual, speed, torque, offset = standard_units(drive), profile.speed, profile.torque, profile.torque_offset
     turns_per_s = speed.rpm_per_lsb / 60.0
     for name in speed.times:
         turns_per_s *= scales[name]
@@ -89,6 +91,7 @@ def profile_units(drive: DriveParams, profile: CanopenProfile, scales: dict[str,
         max_torque=share(torque.max_torque_rated_per_lsb, usual.max_torque),
         torque_slope=share(torque.slope_rated_s_per_lsb, usual.torque_slope),
         rated_torque=torque.rated_torque_nm_per_lsb or usual.rated_torque,
+        torque_offset=share(None if offset is None else offset.rated_per_lsb, usual.torque_offset),
     )
 
 
@@ -123,6 +126,7 @@ class ApplicationObjects:
             key_of(0x6040): application.write_controlword,
             key_of(0x6060): self._mode_by_pdo,
             key_of(0x6071): self._set_target_torque,
+            key_of(0x60B2): self._set_torque_offset,
             key_of(0x60FF): self._set_target_velocity,
             key_of(0x6042): self._set_target_velocity,
         }
@@ -158,6 +162,7 @@ class ApplicationObjects:
         live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
         live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
         live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)
+        live[key_of(0x60B2)] = lambda: clamped(application.torque_offset_nm / units.torque_offset, 16)
         live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / velocity, 32)
         live[key_of(0x6042)] = lambda: clamped(application.target_speed_rad_s / velocity, 16)
         live[key_of(0x6044)] = lambda: clamped(reporting.speed_rad_s / velocity, 16)
@@ -233,6 +238,9 @@ class ApplicationObjects:
 
     def _set_target_torque(self, counts: int) -> None:
         self._application.target_torque_nm = counts * self._units.target_torque
+
+    def _set_torque_offset(self, counts: int) -> None:
+        self._application.torque_offset_nm = counts * self._units.torque_offset
 
     def _set_target_velocity(self, counts: int) -> None:
         self._application.target_speed_rad_s = counts * self._units.velocity

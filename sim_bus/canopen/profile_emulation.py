@@ -205,6 +205,7 @@ class WornProfile:
             0x6085: stop.deceleration_rpm_s_per_lsb is not None,
             0x6087: torque.slope_rated_s_per_lsb is not None,
             0x60A9: speed.si_unit is not None,
+            0x60B2: profile.torque_offset is not None and profile.torque_offset.index == 0x60B2,
             0x60E0: torque.max_torque_rated_per_lsb is not None,
             0x60E1: torque.max_torque_rated_per_lsb is not None,
         }

@@ -28,6 +28,7 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 #              30 fresh:1  38 limit_active:1  40 standstill:1  48 state:1  50 mode:1  5D status:4
 #              [61 torque_demand_nm:8]                                    only where the drive tells it
 #     Command  09 time_s:8  11 speed_rad_s:8  19 torque_nm:8  20 mode:1
+#              [29 torque_offset_nm:8]                                    only where there is one
 #     Frames   09 time_s:8  { 12 length  Frame } …
 #     Frame    09 time_s:8  10 outgoing:1  1D identifier:4  22 length  data
 #
@@ -55,8 +56,9 @@ def pack_sample(sample: Sample) -> bytes:
 
 def pack_command(time_s: float, command: Command) -> bytes:
     """A `Command` message; ``time_s`` is control time."""
-    mode, speed_rad_s, torque_nm = command
-    return _COMMAND.pack(0x09, time_s, 0x11, speed_rad_s, 0x19, torque_nm, 0x20, MODES[mode])
+    mode, speed_rad_s, torque_nm, offset_nm = command
+    fixed = _COMMAND.pack(0x09, time_s, 0x11, speed_rad_s, 0x19, torque_nm, 0x20, MODES[mode])
+    return fixed if offset_nm == 0.0 else fixed + _DEMAND.pack(0x29, offset_nm)
 
 
 def pack_frames(frames: list[RawFrame]) -> bytes:

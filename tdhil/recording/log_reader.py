@@ -273,7 +273,7 @@ def read_cycles(path: Path) -> Iterator[tuple[Command | None, Sample]]:
         if number == log_format.SAMPLE:
             yield command, _sample_of(message)
         elif (mode := MODE_OF.get(message.mode)) is not None:
-            command = Command(mode, message.speed_rad_s, message.torque_nm)
+            command = Command(mode, message.speed_rad_s, message.torque_nm, message.torque_offset_nm)
 
 
 def _sample_of(message: Any) -> Sample:

@@ -13,7 +13,9 @@ the window's lower end nothing comes to harm: that end is held by the reported s
 
 In speed mode it is the following error that is held, as motion controllers do, by a window and a time. What the shaft
 may be late by is not taken for an error: the window lies about all that the reference was over the longest plausible
-lag, and a shaft that comes nearer, however slowly a heavy one may at its torque limit, is waited for.
+lag, and a shaft that comes nearer, however slowly a heavy one may at its torque limit, is waited for. A torque offset
+moves the shaft away from its reference on purpose: while one may be commanded, the speed window is held instead, at
+both ends.
 """
 
 from __future__ import annotations
@@ -74,7 +76,10 @@ PACE_S, LATE_SHARE = 2.0, 0.2
 
 
 class Guard:
-    """Holds the machine's limits over one run. ``model``, ``expected``, ``no_braking`` are set as the stages learn."""
+    """Holds the machine's limits over one run.
+
+    ``model``, ``expected``, ``no_braking`` and ``torque_offset_nm`` are set as the stages learn.
+    """
 
     def __init__(
         self,
@@ -110,6 +115,8 @@ class Guard:
         """Why no torque below zero may be commanded in torque mode; empty: it may. Set by whoever runs the stages."""
         self.to_brake = ""
         """What would change that."""
+        self.torque_offset_nm = 0.0
+        """The largest torque offset that may be commanded, either way; 0: none. Set by the stage that uses one."""
         self.reckoning = False
         """Arithmetic goes on beside the loop and makes it late: that alone is no reason to stop."""
         self.host_late: Callable[[], str] = lambda: ""
@@ -117,9 +124,17 @@ class Guard:
 
     def check_command(self, command: Command) -> None:
         """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""
-        speed, torque = command.speed_rad_s, command.torque_nm
-        if not (math.isfinite(speed) and math.isfinite(torque)):
-            raise CommandRejected(f"setpoint is not finite (speed {speed}, torque {torque})", where="guard")
+        speed, torque, offset = command.speed_rad_s, command.torque_nm, command.torque_offset_nm
+        if not (math.isfinite(speed) and math.isfinite(torque) and math.isfinite(offset)):
+            raise CommandRejected(
+                f"setpoint is not finite (speed {speed}, torque {torque}, torque offset {offset})", where="guard"
+            )
+        if offset != 0.0 and (command.mode is not Mode.SPEED or abs(offset) > self.torque_offset_nm * (1.0 + 1e-9)):
+            raise CommandRejected(
+                f"torque offset {offset:.1f} N·m in {command.mode.value} mode is beyond what this stage may command:"
+                f" {self.torque_offset_nm:g} N·m, in speed mode",
+                where="guard",
+            )
         if abs(torque) > self._limits.torque_nm * (1.0 + 1e-9):
             raise CommandRejected(
                 f"torque setpoint {torque:.1f} N·m is beyond the limit of {self._limits.torque_nm:g} N·m", where="guard"
@@ -202,7 +217,11 @@ class Guard:
         self._check_mode(command, sample)
         self._check_frozen(command, sample, where)
         self._check_limited(command, sample)
-        self._check_following(command, sample, where)
+        if self.torque_offset_nm > 0.0 and command.mode is Mode.SPEED:
+            self._following.reset()
+            self._check_lower_end(sample.speed_rad_s, where)
+        else:
+            self._check_following(command, sample, where)
         if command.mode is Mode.TORQUE and self.model is not None:
             self._check_window(self.model, command, sample.speed_rad_s, where)
 
@@ -256,6 +275,10 @@ class Guard:
                 where=where,
                 next_step="The shaft was stopped. Lower the amplitude or raise the offset",
             )
+        self._check_lower_end(speed_rad_s, where)
+
+    def _check_lower_end(self, speed_rad_s: float, where: str) -> None:
+        limits = self._limits
         if speed_rad_s < limits.speed_min_rad_s - self._speed_noise_rad_s:
             raise LimitHit(
                 f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s",
@@ -281,13 +304,18 @@ class Guard:
     def _check_frozen(self, command: Command, sample: Sample, where: str) -> None:
         """Values that no longer follow: a gateway, or a drive's process image, that repeats its last one."""
         seen, torque_mode = (sample.speed_rad_s, sample.torque_nm), command.mode is Mode.TORQUE
+        with_offset = self.torque_offset_nm > 0.0 and not torque_mode
         setpoint = command.torque_nm if torque_mode else command.speed_rad_s
+        if with_offset:
+            setpoint = command.torque_offset_nm
         still = self._still
         if still is None or still.seen != seen or still.mode is not command.mode or sample.limit_active:
             self._still = _Still(seen, command.mode, sample.time_s, setpoint)
             return
         still.lowest, still.highest = min(still.lowest, setpoint), max(still.highest, setpoint)
         limit = self._limits.torque_nm if torque_mode else self._limits.speed_max_rad_s
+        if with_offset:
+            limit = self.torque_offset_nm
         moved = still.highest - still.lowest > FROZEN_SHARE * limit
         if moved and sample.time_s - still.since_s >= FROZEN_S:
             raise CommunicationLost(

@@ -9,6 +9,7 @@ from tdhil.run.settings import ControlAssumptions
 from tests.run.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
 
 REST = Command(Mode.SPEED, 0.0, 0.0)
+OFFSET = Command(Mode.SPEED, 5.0, 0.0, 20.0)
 REVERSIBLE = replace(LIMITS, allow_reverse=True)
 MODEL = RigGuess(inertia_kg_m2=100.0, viscous_nm_s_rad=10.0, coulomb_nm=50.0)
 

@@ -11,7 +11,7 @@ from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, TdhilError
 from tdhil.run.guard import Guard
 from tests.run.fake_drive import LIMITS, NAN, PERIOD_S, SPEED_RESOLUTION, TORQUE_RESOLUTION
-from tests.run.guarded import MODEL, REST, REVERSIBLE, guard, sample
+from tests.run.guarded import MODEL, OFFSET, REST, REVERSIBLE, guard, sample
 
 INF = math.inf
 
@@ -333,3 +333,39 @@ def test_arithmetic_beside_the_loop_may_make_it_late():
     watch.check_pace(Counters(cycles=300, overruns=125))          # counted from its end on
     with pytest.raises(CommunicationLost, match="late in 30 of 100"):
         watch.check_pace(Counters(cycles=400, overruns=155))
+
+
+@pytest.mark.parametrize("offset", [20.1, -20.1, NAN, INF])
+def test_a_torque_offset_beyond_what_the_stage_may_command_is_rejected(offset):
+    watch = guard()
+    watch.torque_offset_nm = 20.0
+    watch.check_command(OFFSET)
+    with pytest.raises(CommandRejected, match="torque offset"):
+        watch.check_command(OFFSET._replace(torque_offset_nm=offset))
+
+
+def test_no_torque_offset_is_commanded_where_no_stage_has_asked_for_one_nor_in_torque_mode():
+    watch = guard()
+    with pytest.raises(CommandRejected, match="torque offset"):
+        watch.check_command(OFFSET)
+    watch.torque_offset_nm = 20.0
+    with pytest.raises(CommandRejected, match="torque mode"):
+        watch.check_command(OFFSET._replace(mode=Mode.TORQUE))
+
+
+def test_a_torque_offset_moves_the_shaft_from_its_reference_and_the_window_is_held_instead():
+    watch = guard()
+    watch.expected, watch.torque_offset_nm = PowerState.ENABLED, 20.0
+    for cycle in range(4000):          # 16 s, far from the reference
+        watch.check_sample(OFFSET, sample(6.5 + 0.01 * (cycle % 2), time_s=cycle * PERIOD_S))
+    with pytest.raises(LimitHit, match="left its window"):
+        watch.check_sample(OFFSET, sample(0.5 * LIMITS.speed_min_rad_s, time_s=17.0))
+
+
+def test_feedback_that_stands_still_while_the_torque_offset_moves_is_none():
+    watch = guard()
+    watch.expected, watch.torque_offset_nm = PowerState.ENABLED, 20.0
+    with pytest.raises(CommunicationLost, match="frozen"):
+        for cycle in range(200):
+            command = OFFSET._replace(torque_offset_nm=0.1 * cycle)
+            watch.check_sample(command, sample(5.0, 50.0, time_s=cycle * PERIOD_S))

@@ -172,3 +172,45 @@ def test_nothing_acts_when_off() -> None:
     drive = Inverter(RigParams(), np.random.default_rng(0))
     run(drive, 1.0)
     assert drive.speed_rad_s == 0.0 and drive.torque_nm == 0.0
+
+
+def test_a_torque_offset_is_added_to_the_speed_loop_inside_its_limit_and_the_loop_takes_it_up() -> None:
+    drive = inverter()
+    drive.control.speed(3.0)
+    run(drive, 20.0)
+    before = drive.control.demand_nm
+    drive.control.offset_nm = 50.0
+    drive.step(DT)
+    assert drive.control.demand_nm - before == pytest.approx(50.0, abs=0.5)
+    run(drive, 25.0)
+    assert drive.speed_rad_s == pytest.approx(3.0, abs=2e-3)
+    assert drive.control.demand_nm == pytest.approx(60.0 + 8.0 * 3.0, abs=1.0)
+    drive.control.offset_nm = 1000.0
+    drive.step(DT)
+    assert drive.control.demand_nm == 400.0 and drive.control.limited
+
+
+def test_a_stop_with_an_offset_that_stays_comes_to_rest_all_the_same() -> None:
+    drive = inverter()
+    drive.control.speed(3.0)
+    run(drive, 20.0)
+    drive.control.offset_nm = 50.0
+    drive.control.stop(2.0)
+    run(drive, 15.0)
+    assert drive.speed_rad_s == pytest.approx(0.0, abs=1e-3)
+
+
+def test_the_reference_filter_is_of_first_order_and_begins_at_the_speed_that_is() -> None:
+    slow = RigParams().drive.model_copy(
+        update={"reference_filter_s": 0.5, "speed_gain_nm_s_rad": 30000.0, "speed_filter_s": 0.0, "torque_lag_s": 0.0,
+                "torque_limit_nm": 4000.0}
+    )
+    drive = inverter(drive=slow)
+    drive.control.speed(2.0)
+    speeds = run(drive, 0.5)
+    assert speeds[-1] == pytest.approx(2.0 * (1.0 - math.exp(-1.0)), rel=0.02)
+    run(drive, 5.0)
+    drive.control.torque(drive.control.demand_nm)
+    drive.control.speed(2.0)
+    drive.step(DT)
+    assert drive.speed_rad_s == pytest.approx(2.0, abs=0.01)
