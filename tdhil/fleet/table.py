@@ -11,11 +11,10 @@ import sqlite3
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self
+from typing import IO, Any, Final
 
 from tdhil.errors import LogBroken, LogUnopened, UsageError
 from tdhil.fleet.rows import COLUMNS, FleetRow, row_from_json
@@ -29,7 +28,7 @@ _SQLITE: Final = {str: "TEXT", float: "REAL", int: "INTEGER", bool: "INTEGER"}
 # The journal: one line a row as soon as it is there, so that an end at any moment costs what was in hand
 
 
-class Journal:
+class Journal(AbstractContextManager["Journal"]):
     """Lines of JSON in a folder beside the table. One host writes it at a time; a line that was cut is not there.
 
     Raises UsageError where another host has it, LogUnopened and LogBroken where the disk refuses.
@@ -97,12 +96,7 @@ class Journal:
             raise UsageError("another fleet is at work on it", where=str(self._path),
                              next_step="Wait for it, or choose another --out") from None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

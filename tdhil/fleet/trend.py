@@ -163,46 +163,47 @@ def identified(log: Path, settings: Settings) -> Compared:
     record = read_any(log)
     record.require_motion()
     found = conclude(record.recording, record.asked(settings.asked()), str(log), record.assumed).document
-    recording = record.recording
-    row = row_of(str(log), found, settings=settings, torque_scale_rel_sd=recording.torque_scale_rel_sd,
+    row = row_of(str(log), found, settings=settings, torque_scale_rel_sd=record.recording.torque_scale_rel_sd,
                  sha256=content_hash(log))
-    return Compared(row, found, _settings(found, recording, record.configuration))
+    return Compared(row, found, _settings(row, found, record.recording, record.configuration))
 
 
-def _settings(document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]) -> dict[str, str]:
-    rig, drive = document.get("rig") or {}, document.get("drive") or {}
+def _settings(
+    row: FleetRow, document: Mapping[str, Any], recording: Any, run: Mapping[str, Any]
+) -> dict[str, str]:
+    rig = document.get("rig") or {}
     excitation, prior = recording.excitation, recording.lag_prior
     segments = () if excitation is None else excitation.segments
     limits = rig.get("limits") or {}
     identify = run.get("identify")
     asked = identify if isinstance(identify, Mapping) else {}
     found: dict[str, Any] = {
-        "date": document.get("date"),
-        "rig": rig.get("name") or rig.get("file"),
+        "date": row.date,
+        "rig": row.rig,
         "load": rig.get("load"),
-        "drive": drive.get("name"),
-        "serial number": drive.get("serial"),
-        "revision": drive.get("revision"),
-        "profile": (document.get("profile") or {}).get("name"),
-        "connection": document.get("connection"),
+        "drive": row.drive_name,
+        "serial number": row.drive_serial,
+        "revision": row.drive_revision,
+        "profile": row.profile,
+        "connection": row.connection,
         "excitation": None if excitation is None else f"{excitation.kind}, {excitation.mode} mode",
         "lines, Hz": ", ".join(sorted({" ".join(f"{hertz:.4g}" for hertz in one.lines_hz) for one in segments})),
         "mean speeds, rad/s": ", ".join(f"{one.offset_rad_s:.3g}" for one in segments),
-        "periods used": document.get("periods_used"),
+        "periods used": row.periods_used,
         "cycles, Hz": (document.get("cycle") or {}).get("rate_hz"),
         "gear": recording.gear_ratio,
-        "torque scale, 1 sd": recording.torque_scale_rel_sd,
+        "torque scale, 1 sd": row.torque_scale_rel_sd,
         "torque limit, N·m": recording.torque_limit_nm,
         "speed window, rad/s": f"{limits['speed_min_rad_s']:g} to {limits['speed_max_rad_s']:g}"
         if {"speed_min_rad_s", "speed_max_rad_s"} <= set(limits) else None,
         "stated lag of speed, s": prior.speed_lag_s,
         "stated lag of torque, s": prior.torque_lag_s,
-        "model": document.get("model"),
+        "model": row.model,
         "confidence": asked.get("confidence", 0.95),
         "tolerance": asked.get("tolerance", 0.05),
-        "recorded by": document.get("recorded_by"),
-        "simulated": document.get("simulated"),
-        "complete": document.get("complete"),
+        "recorded by": row.recorded_by,
+        "simulated": row.simulated,
+        "complete": row.complete,
     }
     return {name: "–" if value in (None, "") else f"{value:.6g}" if isinstance(value, float) else str(value)
             for name, value in found.items()}
