@@ -12,11 +12,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from tdhil.errors import UsageError
+from tdhil.errors import LogError, TdhilError, UsageError
 from tdhil.fleet.pool import Loss, Pool, TaskLimits
 from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
-from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, sidecar_of
+from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, remote, sidecar_of, told_of
 
 _SLOWEST: Final = 5
 _GOOD: Final = ("valid", "valid_wide")
@@ -220,8 +220,15 @@ def _row(request: FleetRequest, journal: Journal, log: str, stamp: Stamp) -> Fle
 
 
 def _stamp(log: str) -> Stamp:
-    """Size in bytes and time of the last change in ns, of a trace also of what stands beside it."""
+    """Size in bytes and time of the last change in ns, of a trace also of what stands beside it.
+
+    Of a URL, instead of the time, what its file system tells the one content from another by.
+    """
     if "://" in log:
+        with suppress(OSError, TdhilError):
+            system, inside = remote(log)
+            with told_of(log):
+                return int(system.info(inside)["size"] or 0), int(system.ukey(inside), 16) >> 196
         return None
     path = Path(log)
     try:
@@ -292,15 +299,10 @@ def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, name
 
 def _remote(root: str) -> list[str]:
     """The logs below a URL that fsspec can list."""
-    import importlib
-
+    system, inside = remote(root)
     try:
-        fsspec: Any = importlib.import_module("fsspec")
-        system, inside = fsspec.core.url_to_fs(root)
-        names = [inside] if system.isfile(inside) else system.find(inside)
-    except ImportError as error:
-        raise UsageError(f"a library for this address is missing: {error}", where=root,
-                         next_step="Install the extra `cluster`, and for s3:// s3fs") from error
-    except (OSError, ValueError) as error:
+        with told_of(root):
+            names = [inside] if system.isfile(inside) else system.find(inside)
+    except (OSError, LogError) as error:
         raise UsageError(f"can't be listed: {error}", where=root) from error
     return [system.unstrip_protocol(name) for name in names if name.lower().endswith(".mcap")]

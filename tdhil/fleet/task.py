@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from pydantic import Field
 
 from profiles import DataModel
-from tdhil.errors import NothingRecoverable, TdhilError, UsageError
+from tdhil.errors import LogError, NothingRecoverable, TdhilError, UsageError
 from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_of
 from tdhil.version import __version__
 
@@ -193,19 +193,38 @@ def local_copy(log: str) -> Iterator[Path]:
     if "://" not in log:
         yield Path(log)
         return
-    try:
-        from importlib import import_module
+    with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder:
+        target = Path(folder) / log.rsplit("/", 1)[-1]
+        system, inside = remote(log)
+        with told_of(log), system.open(inside, "rb") as source, target.open("wb") as file:
+            while block := source.read(_BLOCK):
+                file.write(block)
+        yield target
 
-        fsspec: Any = import_module("fsspec")
-        with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder:
-            target = Path(folder) / log.rsplit("/", 1)[-1]
-            with fsspec.open(log, "rb") as source, target.open("wb") as file:
-                while block := source.read(_BLOCK):
-                    file.write(block)
-            yield target
+
+def remote(url: str) -> tuple[Any, str]:
+    """The file system behind a URL, of fsspec, and the path there. Raises UsageError where a library is missing."""
+    from importlib import import_module
+
+    try:
+        with told_of(url):
+            system, inside = import_module("fsspec").core.url_to_fs(url)
     except ImportError as error:
-        raise UsageError(f"a library for this address is missing: {error}", where=log,
-                         next_step="Install the extra `cluster`, and for s3:// s3fs") from error
+        extra = "s3" if url.startswith(("s3://", "s3a://")) else "cluster"
+        raise UsageError(f"a library for this address is missing: {error}", where=url,
+                         next_step=f"Install: pip install 'tdhil[{extra}]', and what the message names") from error
+    return system, inside
+
+
+@contextmanager
+def told_of(url: str) -> Iterator[None]:
+    """What libraries behind fsspec raise of trees of their own (no credentials, no network) is a LogError here."""
+    try:
+        yield
+    except (OSError, ImportError):
+        raise
+    except Exception as error:
+        raise LogError(f"can't be fetched: {error}", where=url, next_step="Look at address and credentials") from error
 
 
 # ---------------------------------------------------------------------------------------------------------------------

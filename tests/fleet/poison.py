@@ -6,10 +6,11 @@ import ctypes
 import os
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from tdhil.fleet.rows import FleetRow, failure_row
-from tdhil.fleet.task import Done, LogTask, content_hash, identify_log
+from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, local_copy
 
 KILLS, HANGS, EATS, OUTSIDE = b"poison: kills", b"poison: hangs", b"poison: eats", b"poison: outside"
 
@@ -53,6 +54,12 @@ def quick(task: LogTask) -> Done:
     time.sleep(0.01)
     path = Path(task.log)
     return Done(FleetRow(log=task.log, verdict="valid", sha256=content_hash(path), size_bytes=path.stat().st_size))
+
+
+def quick_anywhere(task: LogTask) -> Done:
+    """The same of a log behind an address."""
+    with local_copy(task.log) as path:
+        return replace(done := quick(replace(task, log=str(path))), row=replace(done.row, log=task.log))
 
 
 def work(task):

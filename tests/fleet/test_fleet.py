@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -197,6 +198,58 @@ def test_a_log_that_may_not_be_read_has_a_row(tmp_path, few, monkeypatch):
     monkeypatch.setattr(task, "content_hash", refuse)
     row = identify_log(LogTask(str(log))).row
     assert (row.error_kind, row.error_text, row.sha256) == ("PermissionError", "can't be read: Permission denied", None)
+
+
+@pytest.fixture
+def bucket(few):
+    """Two logs and something else in fsspec's memory, which only this process has."""
+    memory = pytest.importorskip("fsspec").filesystem("memory")
+    memory.put(str(few / "R1-000.mcap"), "/logs/R1-000.mcap")
+    memory.pipe({"/logs/below/empty.mcap": b"", "/logs/read.me": b"no log"})
+    yield "memory://logs"
+    memory.rm("/logs", recursive=True)
+
+
+def test_logs_behind_an_address(few, bucket, monkeypatch):
+    assert find_logs((bucket,)).logs == ("memory:///logs/R1-000.mcap", "memory:///logs/below/empty.mcap")
+    assert find_logs((f"{bucket}/R1-000.mcap",)).logs == ("memory:///logs/R1-000.mcap",)
+    here, there = (identify_log(LogTask(log)).row for log in (str(few / "R1-000.mcap"), f"{bucket}/R1-000.mcap"))
+    assert repr(replace(there, log=here.log)) == repr(here)
+    assert identify_log(LogTask(f"{bucket}/below/empty.mcap")).row.error_text == "the file is empty"
+    assert identify_log(LogTask(f"{bucket}/none.mcap")).row.error_kind == "FileNotFoundError"
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(UsageError, match=r"library for this address is missing.*tdhil\[s3\]"):
+        find_logs(("s3://bucket/logs",))
+
+
+def test_an_address_that_can_t_be_reached_is_no_mistake_of_ours(bucket, monkeypatch):
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    class NoCredentials(Exception):
+        """As boto's: of no tree that we know."""
+
+    def refuse(*_, **__):
+        raise NoCredentials("no credentials")
+
+    monkeypatch.setattr(MemoryFileSystem, "_open", refuse)
+    row = identify_log(LogTask(f"{bucket}/R1-000.mcap")).row
+    assert (row.error_kind, row.sha256) == ("LogError", None)
+    assert "can't be fetched: no credentials" in row.error_text
+    monkeypatch.setattr(MemoryFileSystem, "isfile", refuse)
+    with pytest.raises(UsageError, match="can't be listed"):
+        find_logs((bucket,))
+
+
+def test_what_was_done_behind_an_address_is_not_fetched_again(tmp_path, calls):
+    """By file://, which the pool's processes reach, too."""
+    pytest.importorskip("fsspec")
+    (folder,) = many(tmp_path / "logs", 4)
+    request = FleetRequest((f"file://{folder}",), tmp_path / "fleet.csv", jobs=1)
+    first = run_fleet(request, function=poison.quick_anywhere)
+    assert [row.log for row in first.rows] == [f"file://{folder}/{k:03d}.mcap" for k in range(4)]
+    (tmp_path / "logs" / "002.mcap").write_bytes(b"another")
+    second = run_fleet(request, function=poison.quick_anywhere)
+    assert (second.done_before, len(second.rows)) == (3, 4)
 
 
 @pytest.mark.heavy
