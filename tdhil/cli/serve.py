@@ -18,6 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default=HOST, metavar="ADDRESS",
                         help=f"where to listen (default {HOST}; this computer only)")
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default {PORT}; 0: any that is free")
+    parser.add_argument("--viewer", action="append", metavar="ORIGIN", default=[],
+                        help="where Foxglove or Lichtblick come from in a browser, such as http://localhost:8080:"
+                        " that page may read logs as they grow, and nothing else; more than one by repeating it")
     parser.set_defaults(run=run)
 
 
@@ -33,4 +36,5 @@ def run(namespace: argparse.Namespace) -> int:
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)  # noqa: T201
 
-    return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say)
+    viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
+    return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers)

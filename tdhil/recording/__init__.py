@@ -10,12 +10,15 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_format import (
         CAN as CAN, CHANNELS as CHANNELS, CLASSES as CLASSES, COMMAND as COMMAND, EXCITATION as EXCITATION,
-        MODBUS as MODBUS, SAMPLE as SAMPLE,
+        MODBUS as MODBUS, SAMPLE as SAMPLE, schema_name as schema_name,
     )
     from tdhil.recording.log_reader import read_cycles as read_cycles, read_frames as read_frames, read_run as read_run
-    from tdhil.recording.log_tail import LogNews as LogNews, LogTail as LogTail
+    from tdhil.recording.log_tail import (
+        LogChunks as LogChunks, LoggedMessage as LoggedMessage, LogNews as LogNews, LogTail as LogTail,
+        messages_in as messages_in,
+    )
     from tdhil.recording.log_writer import RunWriter as RunWriter
-    from tdhil.recording.mcap_container import MAGIC as MAGIC
+    from tdhil.recording.mcap_container import MAGIC as MAGIC, schema_of as schema_of
     from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, LagPrior as LagPrior,
@@ -29,11 +32,11 @@ else:
         __name__,
         {
             "csv": ("Bench", "USUAL", "parse_columns", "read_recording"),
-            "log_format": ("CAN", "CHANNELS", "CLASSES", "COMMAND", "EXCITATION", "MODBUS", "SAMPLE"),
+            "log_format": ("CAN", "CHANNELS", "CLASSES", "COMMAND", "EXCITATION", "MODBUS", "SAMPLE", "schema_name"),
             "log_reader": ("read_cycles", "read_frames", "read_run"),
-            "log_tail": ("LogNews", "LogTail"),
+            "log_tail": ("LogChunks", "LogNews", "LogTail", "LoggedMessage", "messages_in"),
             "log_writer": ("RunWriter",),
-            "mcap_container": ("MAGIC",),
+            "mcap_container": ("MAGIC", "schema_of"),
             "packed": ("pack_recording", "unpack_recording"),
             "recording": (
                 "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Pipe", "Ramp", "Recording", "Segment",

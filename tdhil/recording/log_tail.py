@@ -27,6 +27,8 @@ from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, DATA_END, Contents
 from tdhil.recording.recording import FloatArray, Stage
 
 _RECORD: Final = Struct("<BQ")
+_MESSAGE_HEAD: Final = Struct("<HIQQ")         # channel, sequence, log time, publish time
+_MESSAGE: Final = 0x05
 _NUMBERS: Final = {number: number for number in CHANNELS}
 _SKIPPED: Final = frozenset({log_format.COMMAND, log_format.CAN, log_format.MODBUS, log_format.LOG})
 MOST: Final = 2**20
@@ -55,31 +57,52 @@ class LogNews:
     closed: bool = False
 
 
+@dataclass(frozen=True)
+class LogChunks:
+    """What came, as its writer put it together: whole chunks, decompressed. ``more`` and ``closed`` as of LogNews."""
+
+    chunks: tuple[bytes, ...] = ()
+    more: bool = False
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class LoggedMessage:
+    """A message as it stands in the log: its channel's number, its time (wall clock, ns) and its bytes."""
+
+    number: int
+    log_time_ns: int
+    payload: bytes
+
+
+def messages_in(chunk: bytes) -> Iterator[LoggedMessage]:
+    """The messages of a chunk in their order; what isn't one of our channels' is left out."""
+    at = 0
+    while at + _RECORD.size <= len(chunk):
+        opcode, length = _RECORD.unpack_from(chunk, at)
+        at, end = at + _RECORD.size, at + _RECORD.size + length
+        if end > len(chunk):
+            return
+        if opcode == _MESSAGE and length >= _MESSAGE_HEAD.size:
+            number, _, log_time_ns, _ = _MESSAGE_HEAD.unpack_from(chunk, at)
+            if number in CHANNELS:
+                yield LoggedMessage(number, log_time_ns, chunk[at + _MESSAGE_HEAD.size:end])
+        at = end
+
+
 class LogTail:
-    """One reader of one file. Costs next to nothing where nothing has come."""
+    """One reader of one file. Costs next to nothing where nothing has come. ``offset``: how far it has read."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._offset = 0
+        self.offset = 0
         self._zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
         self.closed = False
 
     def read(self) -> LogNews:
         """What has come since the last time; nothing where the file isn't there yet, or can't be read now."""
-        with suppress(OSError):
-            size = self._path.stat().st_size
-            if size > self._offset and not self.closed:
-                with self._path.open("rb") as file:
-                    return self._news(file, size)
-        return LogNews(closed=self.closed)
-
-    def _news(self, file: BinaryIO, size: int) -> LogNews:
-        begin, found = self._offset, []
-        for content in self._contents(file, size):
-            found.append(content)
-            if self._offset - begin > MOST:
-                break
-        decoded = [self._decoded(one) for one in found]
+        came = self.read_chunks()
+        decoded = [self._decoded(one) for one in came.chunks]
         samples = [one.samples for one in decoded if len(one.samples)]
         return LogNews(
             np.concatenate(samples) if samples else _nothing(),
@@ -88,29 +111,42 @@ class LogTail:
             next((one.configuration for one in reversed(decoded) if one.configuration is not None), None),
             next((one.result for one in reversed(decoded) if one.result is not None), None),
             next((one.epoch_ns for one in decoded if one.epoch_ns), 0),
-            more=self._offset - begin > MOST,
-            closed=self.closed,
+            more=came.more,
+            closed=came.closed,
         )
+
+    def read_chunks(self) -> LogChunks:
+        """The same, byte for byte."""
+        begin, found = self.offset, list[bytes]()
+        with suppress(OSError):
+            size = self._path.stat().st_size
+            if size > self.offset and not self.closed:
+                with self._path.open("rb") as file:
+                    for content in self._contents(file, size):
+                        found.append(content)
+                        if self.offset - begin > MOST:
+                            break
+        return LogChunks(tuple(found), self.offset - begin > MOST, self.closed)
 
     def _contents(self, file: BinaryIO, size: int) -> Iterator[bytes]:
         """Whole chunks; the offset is behind each when it comes. Damage is stepped over where its length is known."""
-        if self._offset == 0:
+        if self.offset == 0:
             if size < len(MAGIC):
                 return
-            self._offset = len(MAGIC)
+            self.offset = len(MAGIC)
         while True:
-            head = read_at(file, self._offset, _RECORD.size)
+            head = read_at(file, self.offset, _RECORD.size)
             if len(head) < _RECORD.size:
                 return
             opcode, length = _RECORD.unpack(head)
-            end = self._offset + _RECORD.size + length
+            end = self.offset + _RECORD.size + length
             if opcode == DATA_END and length == 4:
                 self.closed = True
                 return
             if end > size:
                 return
-            chunk = chunk_head(file, self._offset, size) if opcode == CHUNK else None
-            at, self._offset = self._offset, end
+            chunk = chunk_head(file, self.offset, size) if opcode == CHUNK else None
+            at, self.offset = self.offset, end
             if chunk is not None and isinstance(inside := contents(file, at, chunk, self._zstd), Contents):
                 yield inside.data
 

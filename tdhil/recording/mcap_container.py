@@ -210,16 +210,17 @@ def _declarations() -> tuple[list[bytes], list[bytes]]:
     """The schema and channel records; a channel and its schema bear the same number."""
     schemas, channels = [], []
     for number, (topic, message) in CHANNELS.items():
-        data = _descriptor_set(CLASSES[message])
-        schemas.append(_record(Schema(id=number, name=schema_name(message), encoding="protobuf", data=data)))
+        schemas.append(_record(
+            Schema(id=number, name=schema_name(message), encoding="protobuf", data=schema_of(message))))
         channels.append(_record(
             Channel(id=number, topic=topic, message_encoding="protobuf", schema_id=number, metadata={})))
     return schemas, channels
 
 
-def _descriptor_set(message: Any) -> bytes:
-    files = FileDescriptorSet()
-    for file in (*message.DESCRIPTOR.file.dependencies, message.DESCRIPTOR.file):
+def schema_of(message: str) -> bytes:
+    """A message's schema as the log has it: a FileDescriptorSet of protobuf."""
+    described, files = CLASSES[message].DESCRIPTOR.file, FileDescriptorSet()
+    for file in (*described.dependencies, described):
         file.CopyToProto(files.file.add())
     return files.SerializeToString(deterministic=True)
 

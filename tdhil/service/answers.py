@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
 
+from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told
 from tdhil.service.store import Broken, Entry, Summary
 from tdhil.version import __version__
@@ -240,6 +241,25 @@ ROUTES: Final = (
 API: Final = "/api/v1"
 
 
+@dataclass(frozen=True)
+class Socket:
+    """A WebSocket; ``protocols``: the sub-protocols of which a client must offer one, where there are any."""
+
+    path: str
+    name: str
+    summary: str
+    role: Role
+    protocols: tuple[str, ...] = ()
+
+
+SOCKETS: Final = (
+    Socket("/live/{run}", "watch", "A run from its start and as it goes: hello, then news (JSON)", "viewer"),
+    Socket("/foxglove/{rig}", "foxglove", "The log of the rig's run as it grows, for Foxglove and Lichtblick", "viewer",
+           PROTOCOLS),
+)
+"""They stand at the root, too."""
+
+
 @cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
     """Pydantic's of a type of above."""
@@ -289,6 +309,13 @@ def document() -> dict[str, Any]:
         if route.body is not None:
             described["requestBody"] = {"content": {"application/json": {"schema": schema(route.body, "validation")}}}
         paths.setdefault(f"{API}{route.path}", {})[route.method.lower()] = described
+    for one in SOCKETS:
+        name = one.path.rpartition("{")[2][:-1]
+        paths[f"{API}{one.path}"] = {"get": {
+            "operationId": one.name, "summary": one.summary, "x-role": one.role, "x-websocket": list(one.protocols),
+            "parameters": [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}}],
+            "responses": {"101": {"description": "a WebSocket"}, "403": {"description": "refused"}},
+        }}
     return {
         "openapi": "3.1.0",
         "info": {"title": "tdhil", "version": __version__,

@@ -45,8 +45,12 @@ def require_loopback(host: str) -> None:
         )
 
 
-def serve(rigs: Path | None, data: Path, host: str, port: int, say: Say) -> int:
+def serve(
+    rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset()
+) -> int:
     """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
+
+    ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
 
     Raises UsageError for what can't be served, and LogError for a folder that can't be written.
     """
@@ -64,7 +68,7 @@ def serve(rigs: Path | None, data: Path, host: str, port: int, say: Say) -> int:
     store.prepare()
     alone = _alone(store.folder)
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
-    web = Web(supervisor, hosts=LOOPBACK | {host.lower()})
+    web = Web(supervisor, hosts=LOOPBACK | {host.lower()}, viewers=viewers)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host

@@ -39,6 +39,7 @@ from tdhil.service.answers import (
     API,
     OPTIONS,
     ROUTES,
+    SOCKETS,
     AuditView,
     CompareView,
     ErrorView,
@@ -56,6 +57,7 @@ from tdhil.service.answers import (
 )
 from tdhil.service.asking import RigFile, options_of
 from tdhil.service.feed import Feed, Feeds
+from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.states import Conflict, NotAllowed, NotThere, State, Told, now
 from tdhil.service.store import Summary, read_json, write_json
 from tdhil.service.supervisor import Supervisor
@@ -86,8 +88,8 @@ class Principal:
 class Guard:
     """Before everything: a known host, no other site's page, and the headers of every answer."""
 
-    def __init__(self, app: ASGIApp, hosts: frozenset[str]) -> None:
-        self._app, self._hosts = app, hosts
+    def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
+        self._app, self._hosts, self._viewers = app, hosts, viewers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -109,6 +111,8 @@ class Guard:
             return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
                               next_step=f"Open it as {', '.join(sorted(self._hosts))}")
         origin = connection.headers.get("origin")
+        if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
+            return None
         elsewhere = origin is not None and (
             urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
         )
@@ -169,9 +173,14 @@ def _error_response(error: BaseException) -> Response:
 
 
 class Web:
-    """The application around one supervisor. ``hosts``: by which names it may be reached."""
+    """The application around one supervisor. ``hosts``: by which names it may be reached.
 
-    def __init__(self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK) -> None:
+    ``viewers``: origins (``http://localhost:8080``) whose pages may read logs by the Foxglove protocol, and no more.
+    """
+
+    def __init__(
+        self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK, viewers: frozenset[str] = frozenset()
+    ) -> None:
         self.supervisor, self.store = supervisor, supervisor.store
         self.feeds = Feeds()
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
@@ -184,6 +193,9 @@ class Web:
         self._stopped = Counter("tdhil_stops_asked", "Stops that were asked for", registry=self._registry)
         self._live = Gauge("tdhil_runs_live", "Runs that have not ended", registry=self._registry)
         self._viewers = Gauge("tdhil_live_viewers", "Pages that watch a run", registry=self._registry)
+        self._relays = 0
+        self._relayed = Gauge("tdhil_foxglove_viewers", "Viewers that are sent a log as it grows",
+                              registry=self._registry)
         self._unsigned = Gauge("tdhil_rigs_blocked", "Rigs whose last stop nobody has signed off",
                                registry=self._registry)
         self._pages = Environment(
@@ -193,7 +205,7 @@ class Web:
         self._pages.globals["version"] = __version__
         self.app = Starlette(routes=self._routes(), lifespan=self._lifespan,
                              exception_handlers={Exception: self._failed, HTTPException: self._failed})
-        self.asgi: ASGIApp = Guard(self.app, hosts)
+        self.asgi: ASGIApp = Guard(self.app, hosts, viewers)
 
     def _routes(self) -> list[BaseRoute]:
         api = [Way(f"{API}{route.path}", self._endpoint(route), methods=[route.method]) for route in ROUTES]
@@ -209,7 +221,8 @@ class Web:
             Way("/audit", self._page("audit.html", "audit")),
             Way("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
         ]
-        sockets = [WebSocketRoute(f"{base}/live/{{run}}", self._watch) for base in (API, "")]
+        sockets = [WebSocketRoute(f"{base}{one.path}", getattr(self, f"_{one.name}")) for base in (API, "")
+                   for one in SOCKETS]
         return [*api, *at_the_root, *sockets, *pages, Mount("/static", StaticFiles(directory=HERE / "static"))]
 
     @asynccontextmanager
@@ -425,7 +438,8 @@ class Web:
         rig = (await self._off(lambda: self.store.request(run))).rig
         self.supervisor.note(who, f"downloaded {name}", run, rig)
         called = f"{rig}-{run}-{name}"
-        if name == "run.mcap" and not (await self._off(lambda: self.store.status(run))).ended:
+        grows = name == "run.mcap" and not (await self._off(lambda: self.store.status(run))).ended
+        if grows and "range" not in request.headers:
             said = {"content-disposition": f'attachment; filename="{called}"'}
             return StreamingResponse(_as_it_is(path), media_type=media, headers=said)
         return FileResponse(path, media_type=media, filename=None if shown else called)
@@ -448,6 +462,7 @@ class Web:
     async def _metrics(self, request: Request, body: Any) -> Response:
         self._live.set(len(self.supervisor.live()))
         self._viewers.set(self.feeds.viewers)
+        self._relayed.set(self._relays)
         views = await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
         self._unsigned.set(sum(one.state == "blocked" for one in views))
         return Response(generate_latest(self._registry), media_type="text/plain; version=0.0.4; charset=utf-8")
@@ -554,6 +569,39 @@ class Web:
                 if message["type"] == "websocket.disconnect":
                     break
         scope.cancel()
+
+    async def _foxglove(self, socket: WebSocket) -> None:
+        rig_id = socket.path_params["rig"]
+        protocol = next((one for one in PROTOCOLS if one in socket.scope["subprotocols"]), None)
+        try:
+            await self._off(lambda: self.supervisor.rigs.get(rig_id))
+        except NotThere:
+            await socket.close(4404, "there is no such rig")
+            return
+        if protocol is None:
+            await socket.close(1002, f"offer {' or '.join(PROTOCOLS)}")
+            return
+        await socket.accept(protocol)
+        relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes)
+        self._relays += 1
+        try:
+            async with anyio.create_task_group() as both:
+                both.start_soon(relay.run)
+                while (message := await socket.receive())["type"] != "websocket.disconnect":
+                    said = message.get("text")
+                    await relay.hear(message.get("bytes") or b"" if said is None else said)
+                both.cancel_scope.cancel()
+        except* (WebSocketDisconnect, RuntimeError):
+            pass                           # it has gone in mid-word
+        finally:
+            self._relays -= 1
+
+    def _running(self, rig: str) -> Running | None:
+        if (run := self.supervisor.run_of(rig)) is None:
+            return None
+        asked, status = self.store.request(run), self.store.status(run)
+        simulated = asked.simulated if status.simulated is None else status.simulated
+        return Running(run, self.store.place(run) / "run.mcap", simulated)
 
     # -- pages -------------------------------------------------------------------------------------------------------
 

@@ -1,9 +1,9 @@
 """Peers that are none of ours: what they need, and what happens where it is missing.
 
-The npm package `canopen` (MIT) is fetched only when somebody asks for it, into a folder of his choice::
+The npm packages (all MIT) are fetched only when somebody asks for them, into a folder of his choice::
 
-    npm install --prefix DIR canopen@6.2.1
-    TDHIL_NPM_CANOPEN=DIR python -m pytest tests/peers
+    npm install --prefix DIR canopen@6.2.1 @foxglove/ws-protocol@0.8.0 ws@8
+    TDHIL_NPM_CANOPEN=DIR TDHIL_NPM_FOXGLOVE=DIR python -m pytest tests/peers
 
 Without node or that folder the tests are skipped and say so; TDHIL_REQUIRE_PEERS=1 turns that into a failure.
 """
@@ -14,31 +14,43 @@ from pathlib import Path
 
 import pytest
 
-HOW = ("run them with: npm install --prefix DIR canopen@6.2.1 && TDHIL_NPM_CANOPEN=DIR python -m pytest tests/peers")
+PACKAGES = {"TDHIL_NPM_CANOPEN": ("canopen",), "TDHIL_NPM_FOXGLOVE": ("@foxglove/ws-protocol", "ws")}
+HOW = ("run them with: npm install --prefix DIR canopen@6.2.1 @foxglove/ws-protocol@0.8.0 ws@8 && "
+       "TDHIL_NPM_CANOPEN=DIR TDHIL_NPM_FOXGLOVE=DIR python -m pytest tests/peers")
 
 
-def what_is_missing():
-    """Why the package can't be used, or None if it can."""
+def what_is_missing(variable):
+    """Why the packages of this variable can't be used, or None if they can."""
     if shutil.which("node") is None:
         return "node is not on PATH"
-    folder = os.environ.get("TDHIL_NPM_CANOPEN")
+    folder = os.environ.get(variable)
     if not folder:
-        return "TDHIL_NPM_CANOPEN names no folder with the npm package canopen in it"
-    if not (Path(folder).expanduser() / "node_modules" / "canopen" / "package.json").is_file():
-        return f"no node_modules/canopen in {folder}"
+        return f"{variable} names no folder with the npm package {PACKAGES[variable][0]} in it"
+    for package in PACKAGES[variable]:
+        if not (Path(folder).expanduser() / "node_modules" / package / "package.json").is_file():
+            return f"no node_modules/{package} in {folder}"
     return None
+
+
+def program_of(variable):
+    missing = what_is_missing(variable)
+    if missing is not None:
+        if os.environ.get("TDHIL_REQUIRE_PEERS") == "1":
+            pytest.fail(f"{missing}, and TDHIL_REQUIRE_PEERS=1 forbids to skip", pytrace=False)
+        pytest.skip(f"{missing}; {HOW}")
+    folder = Path(os.environ[variable]).expanduser().resolve()
+    return lambda name: (("node", Path(__file__).with_name(name)), {variable: str(folder)})
 
 
 @pytest.fixture
 def node_program():
     """The command that runs one of our JavaScript files with the package at hand."""
-    missing = what_is_missing()
-    if missing is not None:
-        if os.environ.get("TDHIL_REQUIRE_PEERS") == "1":
-            pytest.fail(f"{missing}, and TDHIL_REQUIRE_PEERS=1 forbids to skip", pytrace=False)
-        pytest.skip(f"{missing}; {HOW}")
-    folder = Path(os.environ["TDHIL_NPM_CANOPEN"]).expanduser().resolve()
-    return lambda name: (("node", Path(__file__).with_name(name)), {"TDHIL_NPM_CANOPEN": str(folder)})
+    return program_of("TDHIL_NPM_CANOPEN")
+
+
+@pytest.fixture
+def foxglove_program():
+    return program_of("TDHIL_NPM_FOXGLOVE")
 
 
 @pytest.fixture(autouse=True)
@@ -53,6 +65,5 @@ def pytest_terminal_summary(terminalreporter):
     """A quiet run hides the reasons of skipped tests; this one must be seen."""
     skipped = [report for report in terminalreporter.stats.get("skipped", ()) if HOW in str(report.longrepr)]
     if skipped:
-        terminalreporter.write_line(
-            f"peers: {len(skipped)} tests SKIPPED, {what_is_missing()}; {HOW}", yellow=True, bold=True
-        )
+        missing = ", ".join(filter(None, map(what_is_missing, PACKAGES)))
+        terminalreporter.write_line(f"peers: {len(skipped)} tests SKIPPED, {missing}; {HOW}", yellow=True, bold=True)

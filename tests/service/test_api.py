@@ -17,7 +17,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from tdhil.errors import UsageError
-from tdhil.service.answers import API, ROUTES, document
+from tdhil.service.answers import API, ROUTES, SOCKETS, document
 from tdhil.service.states import State
 from tests.service.conftest import URL, Service, wait_for
 
@@ -71,8 +71,30 @@ def test_the_document_is_one(call):
     jsonschema.Draft202012Validator.check_schema({"$defs": call.document["components"]["schemas"]})
     assert call.document == document()
     names = [one["operationId"] for path in call.document["paths"].values() for one in path.values()]
-    assert sorted(names) == sorted(route.name for route in ROUTES)
+    assert sorted(names) == sorted(route.name for route in (*ROUTES, *SOCKETS))
     assert all(one["x-role"] for path in call.document["paths"].values() for one in path.values())
+
+
+THERE = (
+    "GET /rigs", "GET /rigs/{rig}", "GET /rigs/{rig}/trend", "POST /rigs/{rig}/runs", "GET /runs", "GET /runs/{run}",
+    "GET /runs/compare", "POST /runs/{run}/confirm", "POST /runs/{run}/stop", "POST /rigs/{rig}/stop",
+    "GET /runs/{run}/log.mcap", "GET /runs/{run}/report.html", "GET /runs/{run}/report.pdf",
+    "GET /runs/{run}/result.json", "POST /runs/{run}/replays", "GET /live/{run}", "GET /foxglove/{rig}", "GET /metrics",
+    "GET /healthz", "GET /audit",
+)
+
+
+@pytest.mark.parametrize("route", THERE)
+def test_what_others_build_on_is_there_and_described(call, client, route):
+    method, _, path = route.partition(" ")
+    described = call.document["paths"][f"{API}{path}"][method.lower()]
+    assert described["x-role"]
+    if "101" in described["responses"]:
+        return
+    answer = client.request(method, f"{API}{path.format(rig='no-rig', run='no-run')}")
+    assert answer.status_code in {int(code) for code in described["responses"]}, answer.text
+    if answer.status_code != 200:
+        assert answer.json()["error"]["what"] != "Not Found"
 
 
 def test_rigs_say_what_they_are(call):
@@ -110,6 +132,16 @@ def test_downloads_come_in_pieces(client, call, service):
     assert answer.headers["content-range"] == "bytes 5-8/100"
     call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
     call("GET", f"/runs/{run}/report.html", 404)
+
+
+def test_a_log_that_grows_comes_in_pieces_too(client, call, service):
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    path = service.store.place(run) / "run.mcap"
+    wait_for("the log", lambda: path.exists() and path.stat().st_size == 100)
+    answer = client.get(f"{API}/runs/{run}/log.mcap", headers={"Range": "bytes=95-"})
+    assert (answer.status_code, answer.content, answer.headers["content-range"]) == (206, b"56789", "bytes 95-99/100")
+    assert client.get(f"{API}/runs/{run}/log.mcap").content == b"0123456789" * 10
 
 
 PLAN = {"excitation": "sine", "expected_half_width": None}

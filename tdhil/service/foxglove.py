@@ -1,0 +1,206 @@
+"""The Foxglove WebSocket protocol, to read only: the log of a rig's run as it grows, for Foxglove and Lichtblick.
+
+A viewer gets the log's own bytes under the log's own schemas, each channel from the start of the run, whenever it is
+subscribed to. Every viewer reads the file at its own pace, so that none holds anything up and none needs a queue: the
+log is what it waits in. Who stays behind for longer than `LATE_S` gets no more of what comes in every cycle until he
+has caught up, and is told how much that was. Source: github.com/foxglove/ws-protocol, docs/spec.md.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from base64 import b64encode
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from struct import Struct
+from typing import Any, Final
+
+import anyio
+
+from tdhil.recording import (
+    CAN,
+    CHANNELS,
+    COMMAND,
+    MODBUS,
+    SAMPLE,
+    LogChunks,
+    LogTail,
+    messages_in,
+    schema_name,
+    schema_of,
+)
+
+PROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+"""The sub-protocols; what is spoken of them is the same."""
+EVERY_S: Final = 0.1
+LOOK_S: Final = 1.0
+"""So often it is looked whether a run that says nothing is still the rig's."""
+LATE_S: Final = 10.0
+FIRST_S: Final = 60.0
+"""What may be needed for all that was logged before one came."""
+_EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, CAN, MODBUS})
+_DATA: Final = Struct("<BIQ")              # opcode 1, subscription, log time in ns; then the message
+_INFO, _WARNING, _ERROR = 0, 1, 2
+_WAITS: Final = "run"
+
+
+@dataclass(frozen=True)
+class Running:
+    """The run that a rig has."""
+
+    run: str
+    log: Path
+    simulated: bool
+
+
+@dataclass
+class _Reader:
+    """Of some channels that were subscribed to together; joins the others where it has caught up with them."""
+
+    tail: LogTail
+    wanted: dict[int, int]                 # channel: subscription
+    until_s: float                         # monotonic; behind for longer than that is too slow
+    left_out: int = 0
+
+
+@dataclass
+class Relay:
+    """What one viewer of one rig is told. ``current``: the rig's run, looked up in a thread."""
+
+    rig: str
+    current: Callable[[], Running | None]
+    send_text: Callable[[str], Awaitable[None]]
+    send_bytes: Callable[[bytes], Awaitable[None]]
+    clock: Callable[[], float] = time.monotonic
+    _wanted: dict[int, int] = field(default_factory=dict)
+    _new: set[int] = field(default_factory=set)            # channels that no reader has yet
+    _readers: list[_Reader] = field(default_factory=list)
+
+    async def hear(self, said: str | bytes) -> None:
+        """Something that the viewer says: what it wants and no longer wants; everything else is refused in words."""
+        try:
+            asked: Any = json.loads(said) if isinstance(said, str) else {"op": "a binary message"}
+            if asked["op"] == "subscribe":
+                for one in asked["subscriptions"]:
+                    await self._subscribe(int(one["id"]), int(one["channelId"]))
+            elif asked["op"] == "unsubscribe":
+                self._unsubscribe({int(one) for one in asked["subscriptionIds"]})
+            else:
+                await self._status(_ERROR, f"{str(asked['op'])[:40]}: here one can only read")
+        except (ValueError, TypeError, KeyError, RecursionError):
+            await self._status(_ERROR, "this is no message of the protocol")
+
+    async def run(self) -> None:
+        """Tell, until it is cancelled."""
+        running = await anyio.to_thread.run_sync(self.current)
+        await self._introduce(running)
+        while True:
+            if running is not None:
+                await self._follow(running)
+                await self._status(_INFO, f"rig {self.rig}: the run has ended, the next one is waited for", _WAITS)
+            running = await self._next(running)
+            await self._say({"op": "removeStatus", "statusIds": [_WAITS]})
+            await self._introduce(running)
+
+    # -- what the viewer wants ---------------------------------------------------------------------------------------
+
+    async def _subscribe(self, subscription: int, channel: int) -> None:
+        if channel not in CHANNELS or not 0 <= subscription < 2**32:
+            await self._status(_ERROR, f"there is no channel {channel}")
+        elif channel in self._wanted:
+            await self._status(_WARNING, f"channel {channel} is subscribed to already")
+        else:
+            self._wanted[channel] = subscription
+            self._new.add(channel)
+
+    def _unsubscribe(self, gone: set[int]) -> None:
+        for channel in [one for one, subscription in self._wanted.items() if subscription in gone]:
+            del self._wanted[channel]
+            self._new.discard(channel)
+            for reader in self._readers:
+                reader.wanted.pop(channel, None)
+
+    # -- what it is told ---------------------------------------------------------------------------------------------
+
+    async def _introduce(self, running: Running | None) -> None:
+        """Who speaks; a session of its own for each run, so that a viewer begins anew with it."""
+        simulated = " SIMULATED" if running is not None and running.simulated else ""
+        run = None if running is None else running.run
+        metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower()}
+        await self._say({"op": "serverInfo", "name": f"tdhil, rig {self.rig}{simulated}", "capabilities": [],
+                         "metadata": metadata, "sessionId": run or "no run"})
+        await self._say({"op": "advertise", "channels": _channels()})
+        if running is None:
+            await self._status(_INFO, f"rig {self.rig} has no run: the channels wait for one", _WAITS)
+
+    async def _next(self, before: Running | None) -> Running:
+        while True:
+            found: Running | None = await anyio.to_thread.run_sync(self.current)
+            if found is not None and (before is None or found.run != before.run):
+                return found
+            await anyio.sleep(2.0 * EVERY_S)
+
+    async def _follow(self, running: Running) -> None:
+        """The run's log, until it is closed, or the rig has this run no more and nothing is left to read."""
+        self._readers, self._new = [], set(self._wanted)
+        looked_s, gone = self.clock(), False
+        while True:
+            if self._new:
+                wanted, self._new = {one: self._wanted[one] for one in self._new}, set()
+                self._readers.append(_Reader(LogTail(running.log), wanted, self.clock() + FIRST_S))
+            more = False
+            for reader in self._readers:
+                more |= await self._forward(reader)
+            self._join()
+            if not more and not self._new:
+                ended = bool(self._readers) and all(one.tail.closed for one in self._readers)
+                if ended or gone:
+                    return
+                if self.clock() - looked_s >= LOOK_S:
+                    found = await anyio.to_thread.run_sync(self.current)
+                    looked_s, gone = self.clock(), found is None or found.run != running.run
+                await anyio.sleep(EVERY_S)
+
+    async def _forward(self, reader: _Reader) -> bool:
+        """What has come in its channels; is there more at once?"""
+        looked_s = self.clock()
+        came: LogChunks = await anyio.to_thread.run_sync(reader.tail.read_chunks)
+        for chunk in came.chunks:
+            late = self.clock() > reader.until_s
+            for message in messages_in(chunk):
+                subscription = reader.wanted.get(message.number)
+                if subscription is None:
+                    continue
+                if late and message.number in _EACH_CYCLE:
+                    reader.left_out += 1
+                    continue
+                await self.send_bytes(_DATA.pack(1, subscription, message.log_time_ns) + message.payload)
+        if not came.more:
+            reader.until_s = max(reader.until_s, looked_s + LATE_S)
+            if reader.left_out:
+                await self._status(_WARNING, f"too slow: {reader.left_out} messages of every cycle were left out")
+                reader.left_out = 0
+        return came.more
+
+    def _join(self) -> None:
+        self._readers = [one for one in self._readers if one.wanted]
+        for one in self._readers[1:]:
+            if one.tail.offset == self._readers[0].tail.offset:
+                self._readers[0].wanted |= one.wanted
+                self._readers.remove(one)
+
+    async def _status(self, level: int, text: str, name: str | None = None) -> None:
+        await self._say({"op": "status", "level": level, "message": text} | ({} if name is None else {"id": name}))
+
+    async def _say(self, message: dict[str, Any]) -> None:
+        await self.send_text(json.dumps(message))
+
+
+def _channels() -> list[dict[str, Any]]:
+    return [
+        {"id": number, "topic": topic, "encoding": "protobuf", "schemaName": schema_name(message),
+         "schema": b64encode(schema_of(message)).decode(), "schemaEncoding": "protobuf"}
+        for number, (topic, message) in CHANNELS.items()
+    ]

@@ -1,0 +1,46 @@
+"""The npm package `@foxglove/ws-protocol`, the protocol's own client: it gets what the log holds, byte for byte.
+
+How to get it and run these: tests/peers/conftest.py.
+"""
+
+import json
+import subprocess
+from base64 import b64decode
+
+import pytest
+
+from tests.path.path_runs import HANGS_S, process
+from tests.service.conftest import wait_for
+from tests.service.test_foxglove import by_topic, declared, logged
+from tests.service.test_serve import QUICK, served
+
+
+@pytest.mark.parametrize("protocol", ["foxglove.websocket.v1", "foxglove.sdk.v1"])
+def test_the_protocol_s_own_client_gets_what_the_log_holds(foxglove_program, tmp_path, protocol):
+    """A simulated run from its request to its result, watched from before it begins."""
+    command, environment = foxglove_program("foxglove_client.mjs")
+    data, said = tmp_path / "data", tmp_path / "said.txt"
+    with served(data) as server, said.open("wb") as out:
+        url = f"{server.url.replace('http', 'ws')}/foxglove/simulated-canopen"
+        with process(*command, url, protocol, env=environment, stdin=subprocess.PIPE, stdout=out,
+                     stderr=subprocess.PIPE) as client:
+            wait_for("the channels", lambda: b"/modbus" in said.read_bytes())
+            run = server.client.start("simulated-canopen", **QUICK)["id"]
+            assert server.client.wait(run, timeout_s=HANGS_S)["state"] == "done"
+            wait_for("the end", lambda: b"the run has ended" in said.read_bytes())
+            client.stdin.close()
+            assert client.wait(HANGS_S) == 0, client.stderr.read()
+    told = [json.loads(line) for line in said.read_text().splitlines()]
+    assert told[0] == {"open": protocol}
+    path = data / "runs" / run / "run.mcap"
+    channels = [one["channel"] for one in told if "channel" in one]
+    assert {one["topic"]: (one["schemaName"], b64decode(one["schema"])) for one in channels} == declared(path)
+    assert [one["info"]["sessionId"] for one in told if "info" in one] == ["no run", run]
+    assert [one["info"]["name"] for one in told if "info" in one][1].endswith("SIMULATED")
+    got = [(topic, int(time_ns), bytes.fromhex(data)) for topic, time_ns, data in (
+        one["message"] for one in told if "message" in one)]
+    wanted = logged(path)
+    print(f"{protocol}: {len(got)} messages, {sum(len(payload) for *_, payload in got)} bytes")
+    assert by_topic(got) == by_topic(wanted)
+    assert len(got) == len(wanted) > 10_000
+    assert not [one for one in told if "status" in one and one["status"][0] > 0]

@@ -1,0 +1,307 @@
+"""The Foxglove protocol: the log's own bytes, to whoever reads at his own pace, and nothing that he could change."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import threading
+from base64 import b64decode
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+from mcap.reader import make_reader
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.sync.client import connect
+
+from tdhil.recording import RunWriter, Stage
+from tdhil.recording.log_format import Event
+from tdhil.service import foxglove
+from tdhil.service.answers import API
+from tdhil.service.foxglove import PROTOCOLS, Relay, Running
+from tdhil.service.web import Web
+from tests.recording.test_log_tail import COMMAND, sample, write
+from tests.service.conftest import HANGS_S, URL, wait_for
+
+SOCKET = URL.replace("http", "ws")
+Message = tuple[str, int, bytes]           # topic, log time in ns, payload
+
+
+def logged(path: Path) -> list[Message]:
+    """By mcap's own reader, in the order of the file."""
+    with path.open("rb") as file:
+        return [(channel.topic, message.log_time, message.data)
+                for _, channel, message in make_reader(file).iter_messages(log_time_order=False)]
+
+
+def declared(path: Path) -> dict[str, tuple[str, bytes]]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    return {one.topic: (summary.schemas[one.schema_id].name, summary.schemas[one.schema_id].data)
+            for one in summary.channels.values()}
+
+
+def by_topic(messages: list[Message]) -> dict[str, list[tuple[int, bytes]]]:
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    for topic, time_ns, payload in messages:
+        found.setdefault(topic, []).append((time_ns, payload))
+    return found
+
+
+class Viewer:
+    """A small client of the protocol: decodes by the specification, shares nothing with the relay."""
+
+    def __init__(self, send: Callable[[str], Any]) -> None:
+        self._send = send
+        self.told: list[dict[str, Any]] = []
+        self.channels: dict[int, dict[str, Any]] = {}
+        self.topics: dict[int, str] = {}
+        self.messages: list[Message] = []
+
+    def subscribe(self, *topics: str) -> None:
+        wanted = {one["id"]: one["topic"] for one in self.channels.values() if not topics or one["topic"] in topics}
+        self.topics |= {1000 + channel: topic for channel, topic in wanted.items()}
+        self._send(json.dumps({"op": "subscribe", "subscriptions": [
+            {"id": 1000 + channel, "channelId": channel} for channel in wanted]}))
+
+    def take(self, message: str | bytes) -> None:
+        if isinstance(message, bytes):
+            opcode, subscription, time_ns = struct.unpack_from("<BIQ", message)
+            assert opcode == 1
+            self.messages.append((self.topics[subscription], time_ns, message[13:]))
+            return
+        said = json.loads(message)
+        self.told.append(said)
+        if said["op"] == "advertise":
+            self.channels = {one["id"]: one for one in said["channels"]}
+
+    def statuses(self) -> list[str]:
+        return [one["message"] for one in self.told if one["op"] == "status"]
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
+    """Over a real socket, by `websockets`: every message of a growing log, byte for byte, under the log's schemas."""
+    config = uvicorn.Config(service.web.asgi, port=0, log_level="error", ws="websockets-sansio", ws_max_size=4096)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    wait_for("the server", lambda: server.started)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    try:
+        with connect(f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol]) as socket:
+            assert socket.subprotocol == protocol
+            viewer = Viewer(socket.send)
+            while not viewer.statuses():
+                viewer.take(socket.recv(HANGS_S))
+            assert viewer.told[0]["name"] == "tdhil, rig a"
+            assert viewer.told[0]["capabilities"] == []
+            viewer.subscribe()
+            run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
+            service.wait(run, "moving")
+            path = service.store.place(run) / "run.mcap"
+            path.unlink(missing_ok=True)
+            write(path)
+            wanted = logged(path)
+            while len(viewer.messages) < len(wanted):
+                viewer.take(socket.recv(HANGS_S))
+            said = [one for one in viewer.told if one["op"] == "serverInfo"]
+            assert said[-1]["sessionId"] == run
+            assert said[-1]["name"] == "tdhil, rig a SIMULATED"
+            assert said[-1]["metadata"]["simulated"] == "true"
+    finally:
+        server.should_exit = True
+        thread.join(10.0)
+    assert by_topic(viewer.messages) == by_topic(wanted)
+    assert len(wanted) > 400
+    assert {one["topic"]: (one["schemaName"], b64decode(one["schema"])) for one in viewer.channels.values()} == (
+        declared(path))
+    assert {(one["encoding"], one["schemaEncoding"]) for one in viewer.channels.values()} == {("protobuf", "protobuf")}
+
+
+# -- one relay, without a socket -------------------------------------------------------------------------------------
+
+
+class Bench:
+    """A relay whose viewer is the test: what it sends is taken at once, and may cost time."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(foxglove, "EVERY_S", 0.001)
+        monkeypatch.setattr(foxglove, "LOOK_S", 0.0)
+        self.now_s, self.costs_s = 0.0, 0.0
+        self.running: Running | None = Running("one", path, False)
+        self.relay = Relay("a", lambda: self.running, self._text, self._bytes, clock=lambda: self.now_s)
+        self.said: list[str] = []
+        self.viewer = Viewer(self.said.append)
+
+    async def _text(self, text: str) -> None:
+        self.viewer.take(text)
+
+    async def _bytes(self, data: bytes) -> None:
+        self.now_s += self.costs_s
+        self.viewer.take(data)
+
+    async def subscribe(self, *topics: str) -> None:
+        self.viewer.subscribe(*topics)
+        await self.relay.hear(self.said.pop())
+
+    def play(self, what: Callable[[], Any]) -> None:
+        async def played() -> None:
+            telling = asyncio.create_task(self.relay.run())
+            await self.until(lambda: self.viewer.channels)
+            await asyncio.wait_for(what(), HANGS_S)
+            telling.cancel()
+
+        asyncio.run(played())
+
+    @staticmethod
+    async def until(happens: Callable[[], Any]) -> None:
+        while not happens():
+            await asyncio.sleep(0.001)
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    return Bench(tmp_path / "run.mcap", monkeypatch)
+
+
+def test_who_subscribes_late_gets_it_from_its_start_and_once(bench, tmp_path):
+    writer = RunWriter(tmp_path / "run.mcap", epoch_ns=10**18, block=True)
+
+    def grow(first: int, last: int) -> None:
+        for number in range(first, last):
+            writer.command(0.01 * number, COMMAND)
+            writer.sample(sample(number))
+        writer.event(Event(0.01 * last, "plan", f"up to {last}"))
+        writer.stage(Stage(f"up to {last}", 0.0, 0.01 * last, "ok"))
+
+    async def played() -> None:
+        grow(0, 100)
+        await bench.subscribe("/sample")
+        await bench.until(lambda: len(bench.viewer.messages) == 100)
+        await bench.subscribe("/event", "/stage")
+        await bench.until(lambda: len(bench.viewer.messages) == 102)
+        await bench.until(lambda: len(bench.relay._readers) == 1)
+        await bench.relay.hear(json.dumps({"op": "unsubscribe", "subscriptionIds": [1004]}))
+        grow(100, 200)
+        await bench.until(lambda: len(bench.viewer.messages) == 203)
+        writer.close()
+        await bench.until(lambda: "ended" in str(bench.viewer.statuses()))
+
+    bench.play(played)
+    found, wanted = by_topic(bench.viewer.messages), by_topic(logged(tmp_path / "run.mcap"))
+    assert found["/sample"] == wanted["/sample"]
+    assert found["/event"] == wanted["/event"]
+    assert found["/stage"] == wanted["/stage"][:1]         # unsubscribed before the second
+    assert sorted(found) == ["/event", "/sample", "/stage"]
+
+
+def test_the_next_run_is_a_session_of_its_own(bench, tmp_path):
+    write(tmp_path / "run.mcap")
+    write(tmp_path / "two.mcap", 50)
+
+    async def played() -> None:
+        await bench.subscribe("/result", "/event")
+        await bench.until(lambda: "ended" in str(bench.viewer.statuses()))
+        bench.running = None
+        first = len(bench.viewer.messages)
+        bench.running = Running("two", tmp_path / "two.mcap", True)
+        await bench.until(lambda: len(bench.viewer.messages) == 2 * first)
+
+    bench.play(played)
+    sessions = [one["sessionId"] for one in bench.viewer.told if one["op"] == "serverInfo"]
+    assert sessions == ["one", "two"]
+    assert [topic for topic, *_ in bench.viewer.messages] == ["/event", "/result"] * 2
+
+
+def test_a_run_that_died_is_let_go_of(bench, tmp_path):
+    write(tmp_path / "whole.mcap")
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(data[:-1000])
+
+    async def played() -> None:
+        await bench.subscribe()
+        await bench.until(lambda: bench.viewer.messages)
+        bench.running = None
+        await bench.until(lambda: "ended" in str(bench.viewer.statuses()))
+
+    bench.play(played)
+
+
+def test_who_is_too_slow_loses_what_comes_every_cycle_and_is_told(bench, tmp_path):
+    """It is sent at a second each: what was there before it came for a minute, then stages, events and results."""
+    write(tmp_path / "run.mcap")
+
+    async def played() -> None:
+        bench.costs_s = 1.0
+        await bench.subscribe()
+        await bench.until(lambda: "too slow" in str(bench.viewer.statuses()))
+
+    bench.play(played)
+    found, wanted = by_topic(bench.viewer.messages), by_topic(logged(tmp_path / "run.mcap"))
+    for topic in ("/stage", "/event", "/configuration", "/result", "/log"):
+        assert found[topic] == wanted[topic]
+    missing = sum(len(wanted[topic]) - len(found[topic]) for topic in ("/sample", "/command"))
+    assert missing > 100
+    (told,) = [one for one in bench.viewer.statuses() if "too slow" in one]
+    assert told == f"too slow: {missing} messages of every cycle were left out"
+
+
+@pytest.mark.parametrize(("said", "answer"), [
+    ('{"op": "advertise", "channels": []}', "advertise: here one can only read"),
+    ('{"op": "setParameters", "parameters": []}', "here one can only read"),
+    (b"\x01\0\0\0\0nonsense", "here one can only read"),
+    ('{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 99}]}', "no channel 99"),
+    ('{"op": "subscribe", "subscriptions": [{"id": 5000000000, "channelId": 1}]}', "no channel"),
+    ('{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1}, {"id": 2, "channelId": 1}]}', "already"),
+    ('{"op": "subscribe"}', "no message of the protocol"),
+    ("[]", "no message of the protocol"),
+    ("7", "no message of the protocol"),
+    ("[" * 4000, "no message of the protocol"),
+    ("<script>", "no message of the protocol"),
+])
+def test_a_viewer_can_only_read(bench, said, answer):
+    bench.running = None
+
+    async def played() -> None:
+        await bench.relay.hear(said)
+
+    bench.play(played)
+    assert answer in bench.viewer.statuses()[-1]
+
+
+# -- the road to it --------------------------------------------------------------------------------------------------
+
+
+def test_a_rig_that_is_none_and_a_protocol_that_is_none_are_refused(service):
+    with TestClient(service.web.asgi, base_url=URL) as client:
+        for path, protocols, code in (("/foxglove/none", PROTOCOLS[:1], 4404), ("/foxglove/a", ["foxglove.v9"], 1002),
+                                      (f"{API}/foxglove/a", [], 1002)):
+            with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect(
+                    f"{SOCKET}{path}", subprotocols=protocols):
+                pass
+            assert refused.value.code == code
+        with client.websocket_connect(f"{SOCKET}{API}/foxglove/a", subprotocols=list(PROTOCOLS)[::-1]) as socket:
+            assert socket.receive_json()["op"] == "serverInfo"
+            assert "tdhil_foxglove_viewers 1.0" in client.get("/metrics").text
+
+
+def test_a_viewer_in_a_browser_reads_where_its_origin_is_named_and_does_nothing_else(service):
+    origin = {"origin": "http://localhost:8080", "sec-fetch-site": "cross-site"}
+    web = Web(service.supervisor, viewers=frozenset({origin["origin"]}))
+    for asgi, path, may in ((web.asgi, "/foxglove/a", True), (service.web.asgi, "/foxglove/a", False),
+                            (web.asgi, "/live/20260101-000000-aaaaaa", False)):
+        client = TestClient(asgi, base_url=URL, headers=origin)
+        if may:
+            with client.websocket_connect(f"{SOCKET}{path}", subprotocols=list(PROTOCOLS)) as socket:
+                assert socket.receive_json()["op"] == "serverInfo"
+        else:
+            with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect(
+                    f"{SOCKET}{path}", subprotocols=list(PROTOCOLS)):
+                pass
+            assert refused.value.code == 4403
+    assert TestClient(web.asgi, base_url=URL, headers=origin).post(f"{API}/rigs/a/runs", json={}).status_code == 403
