@@ -21,6 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--viewer", action="append", metavar="ORIGIN", default=[],
                         help="where Foxglove or Lichtblick come from in a browser, such as http://localhost:8080:"
                         " that page may read logs as they grow, and nothing else; more than one by repeating it")
+    parser.add_argument("--mqtt", metavar="URL",
+                        help="tell a broker the rigs' states and results, mqtt[s]://host:port/prefix; user and password"
+                        " from TDHIL_MQTT_USER and TDHIL_MQTT_PASSWORD_FILE (extra mqtt)")
     parser.set_defaults(run=run)
 
 
@@ -37,4 +40,5 @@ def run(namespace: argparse.Namespace) -> int:
         print(text, file=sys.stderr, flush=True)  # noqa: T201
 
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
-    return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers)
+    return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
+                 mqtt=namespace.mqtt)

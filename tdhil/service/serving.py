@@ -46,11 +46,13 @@ def require_loopback(host: str) -> None:
 
 
 def serve(
-    rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset()
+    rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
+    mqtt: str | None = None,
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
+    ``mqtt``: the address of a broker that is told states and results.
 
     Raises UsageError for what can't be served, and LogError for a folder that can't be written.
     """
@@ -60,15 +62,18 @@ def serve(
         raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
 
     from tdhil.service.asking import Rigs
+    from tdhil.service.mqtt import Broker, Publisher
     from tdhil.service.store import Audit, Index, Store
     from tdhil.service.supervisor import Supervisor
     from tdhil.service.web import LOOPBACK, Web
 
+    broker = None if mqtt is None else Broker.of(mqtt)
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
     web = Web(supervisor, hosts=LOOPBACK | {host.lower()}, viewers=viewers)
+    publisher = None if broker is None else Publisher(broker, web.told, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
@@ -76,9 +81,13 @@ def serve(
     if supervisor.rigs.built_in:
         say("No rig file is there: two simulated rigs to play with. Nothing real moves.")
     say("A stop over HTTP is no emergency stop: keep the hard-wired one within reach. Ctrl-C brakes what moves.")
+    if publisher is not None:
+        publisher.start()
     try:
         _uvicorn(web.asgi, listening, supervisor.brake, say)
     finally:
+        if publisher is not None:
+            publisher.close()
         listening.close()
         alone.close()
     left = supervisor.live()

@@ -17,7 +17,7 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import anyio
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -535,6 +535,24 @@ class Web:
             status.verdict, self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
             lives(folder),
         )
+
+    def told(self) -> dict[str, Any]:
+        """What is told to a broker, by topic: of each rig its state, and the latest result that it has."""
+        found: dict[str, Any] = {}
+        for rig in self.supervisor.rigs.all():
+            view, run = self.rig_view(rig), None
+            if view.run is not None:
+                with suppress(NotThere):
+                    status = self.store.status(view.run)
+                    run = {"id": view.run, "state": status.state.value, "stage": status.stage, "since": status.at}
+            here = f"rigs/{quote(rig.id, safe='')}"
+            found[f"{here}/state"] = {
+                "rig": rig.id, "name": view.name, "state": view.state, "simulated": view.simulated,
+                "holder": view.holder, "blocked_by": view.blocked_by, "run": run,
+            }
+            if view.last is not None:
+                found[f"{here}/result"] = asdict(view.last)
+        return found
 
     # -- live --------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,185 @@
+"""States and results of the rigs for others on the site, by MQTT. Nothing is subscribed to: no command comes in here.
+
+::
+
+    <prefix>/status                  online; offline when the service has gone, which the broker says by itself
+    <prefix>/rigs/<rig>/state        what the rig is doing, and its run's state and stage
+    <prefix>/rigs/<rig>/result       its latest result, as in the list of runs
+
+JSON, retained, QoS 1. Only the latest counts, so that nothing is queued: a broker that was away is told everything
+anew. It has threads of its own; nothing else waits for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import ssl
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import unquote, urlsplit
+
+from tdhil.errors import UsageError
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client
+
+EVERY_S: Final = 1.0
+"""So often it is looked what has changed."""
+RETRY_S: Final = (1, 60)
+"""Between two tries to reach a broker, at first and at most."""
+PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
+USER, PASSWORD, PASSWORD_FILE, CA_FILE = (
+    f"TDHIL_MQTT_{name}" for name in ("USER", "PASSWORD", "PASSWORD_FILE", "CA_FILE"))
+ONLINE, OFFLINE = "online", "offline"
+_KEEPALIVE_S, _CONNECT_S, _GOODBYE_S = 30, 5.0, 1.0
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Broker:
+    """Where, and under which topic. ``password`` is shown nowhere."""
+
+    host: str
+    port: int
+    tls: bool
+    prefix: str
+    user: str | None = None
+    password: str | None = field(default=None, repr=False)
+    ca_file: str | None = None
+
+    @staticmethod
+    def of(url: str, environment: Mapping[str, str] = os.environ) -> Broker:
+        """From ``mqtt[s]://[user@]host[:port][/prefix]``. Raises UsageError, and never shows what may be a password."""
+        try:
+            parts = urlsplit(url)
+            port, host = parts.port, parts.hostname
+        except ValueError:
+            raise UsageError("is no address", where="--mqtt", next_step="Such as mqtt://host:1883/site") from None
+        if parts.password is not None:
+            raise UsageError("a password doesn't belong on a command line, which everybody can read", where="--mqtt",
+                             next_step=f"Put it into a file, and name that in {PASSWORD_FILE}")
+        if parts.scheme not in PORTS or not host or parts.query or parts.fragment:
+            raise UsageError("must be mqtt:// or mqtts://, a host, and no more than a port and a prefix",
+                             where="--mqtt", next_step="Such as mqtt://host:1883/site")
+        prefix = unquote(parts.path).strip("/") or "tdhil"
+        if set(prefix) & set("+#\0") or prefix.startswith("$") or "//" in prefix:
+            raise UsageError("+, #, // and a $ at its beginning have no place in a prefix", where=f"--mqtt …/{prefix}")
+        user = unquote(parts.username) if parts.username else environment.get(USER)
+        return Broker(host, port or PORTS[parts.scheme], parts.scheme == "mqtts", prefix, user,
+                      _password(environment), environment.get(CA_FILE))
+
+    def __str__(self) -> str:
+        return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}/{self.prefix}"
+
+
+def _password(environment: Mapping[str, str]) -> str | None:
+    if (name := environment.get(PASSWORD_FILE)) is None:
+        return environment.get(PASSWORD)
+    try:
+        return Path(name).read_text(encoding="utf-8").rstrip("\r\n")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"can't be read ({getattr(error, 'strerror', None) or 'no text'})",
+                         where=f"{PASSWORD_FILE} {name}",
+                         next_step="It holds the password alone, and its owner only may read it") from None
+
+
+class Publisher:
+    """Tells a broker what ``look`` gives, topic by topic, whenever it has changed; from `start` to `close`.
+
+    Raises UsageError where the extra is missing, or what TLS needs can't be read.
+    """
+
+    def __init__(self, broker: Broker, look: Callable[[], Mapping[str, Any]], say: Say = lambda text: None) -> None:
+        if find_spec("paho") is None:
+            raise UsageError("--mqtt needs paho-mqtt, not installed here",
+                             next_step="Install: pip install 'tdhil[mqtt]'")
+        self._broker, self._look, self._say = broker, look, say
+        self._told: dict[str, str] = {}
+        self._connected, self._end = threading.Event(), threading.Event()
+        self._silent = False               # it was said that the broker can't be reached
+        self._client = self._make()
+        self._thread = threading.Thread(target=self._run, name="mqtt", daemon=True)
+
+    def _make(self) -> Client:
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        found = Client(CallbackAPIVersion.VERSION2)
+        found.connect_timeout = _CONNECT_S
+        found.reconnect_delay_set(*RETRY_S)
+        found.will_set(f"{self._broker.prefix}/status", OFFLINE, qos=1, retain=True)
+        if self._broker.user is not None:
+            found.username_pw_set(self._broker.user, self._broker.password)
+        if self._broker.tls:
+            try:
+                found.tls_set(self._broker.ca_file)
+            except (OSError, ssl.SSLError) as error:
+                raise UsageError(f"can't be taken ({getattr(error, 'strerror', None) or error})",
+                                 where=f"{CA_FILE} {self._broker.ca_file}") from None
+        found.on_connect = self._on_connect
+        found.on_connect_fail = lambda client, data: self._away("can't be reached")
+        found.on_disconnect = lambda client, data, flags, reason, properties: self._away(str(reason))
+        return found
+
+    def start(self) -> None:
+        """Begin to tell; comes back at once, whether or not the broker is there."""
+        if self._broker.password is not None and not self._broker.tls:
+            self._say("MQTT: the password goes to the broker unencrypted; mqtts:// wouldn't do that")
+        self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S)
+        self._client.loop_start()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Say goodbye, if the broker is there to hear it; within a second."""
+        self._end.set()
+        if self._connected.is_set():
+            with suppress(RuntimeError, ValueError):
+                self._publish("status", OFFLINE).wait_for_publish(_GOODBYE_S)
+        self._client.disconnect()
+
+    # -- in paho's thread --------------------------------------------------------------------------------------------
+
+    def _on_connect(self, client: Client, data: Any, flags: Any, reason: Any, properties: Any) -> None:
+        if reason.is_failure:
+            self._away(str(reason))
+            return
+        self._silent = False
+        self._told.clear()                 # whatever the broker has kept may be from before
+        self._connected.set()
+        self._say(f"MQTT: {self._broker} is told states and results")
+
+    def _away(self, why: str) -> None:
+        self._connected.clear()
+        if not self._silent and not self._end.is_set():
+            self._silent = True
+            self._say(f"MQTT: {self._broker}: {why}; it is tried again, and nothing waits for it")
+
+    # -- in its own --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._end.wait(EVERY_S):
+            if self._connected.is_set():
+                try:
+                    self._tell()
+                except Exception as error:     # of one look: the next one tells
+                    self._say(f"MQTT: {type(error).__name__}: {error}")
+
+    def _tell(self) -> None:
+        news = {"status": ONLINE} | {
+            topic: json.dumps(plain, allow_nan=False) for topic, plain in self._look().items()}
+        gone = dict.fromkeys(self._told.keys() - news.keys(), "")      # an empty one takes a retained one away
+        for topic, text in (news | gone).items():
+            if self._told.get(topic) != text and self._connected.is_set():
+                self._publish(topic, text)
+                self._told[topic] = text
+        for topic in gone:
+            self._told.pop(topic, None)
+
+    def _publish(self, topic: str, text: str) -> Any:
+        return self._client.publish(f"{self._broker.prefix}/{topic}", text, qos=1, retain=True)
