@@ -31,23 +31,4 @@ if TYPE_CHECKING:
         BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "clock": ("Clock", "LOWER_THE_RATE", "MonotonicClock", "SteppedClock", "quantile"),
-            "drive": (
-                "Check", "Command", "Counters", "Drive", "DriveLimits", "FrameTap", "Identity", "KeptAlive",
-                "Mode", "Outcome", "Paced", "Polled", "PositionReading", "Positioned", "PowerState", "Preflight",
-                "RawFrame", "Rehearsed", "ReportingFilters", "Sample", "StopsFeeding", "Telling", "Timed",
-            ),
-            "errors": (
-                "CommandRejected", "CommunicationLost", "DataFileError", "DriveFault", "LimitHit",
-                "ModeNotConfirmed", "ObjectRefused", "PreflightRefused", "Problem", "StopNotConfirmed",
-                "TdhilError",
-            ),
-            "preflight": (
-                "ACCEPTED_BY", "ANY_CLIENT", "NOTHING_STOPS_IT", "NO_WATCHDOG_FLAG", "SHARED_FLAG", "Table",
-            ),
-            "quick_stop": ("BareStopReport", "Ended", "Target", "bare_stop"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

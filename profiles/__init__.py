@@ -35,26 +35,4 @@ if TYPE_CHECKING:
     )
     from profiles.yaml_tree import read_tree as read_tree
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "eds_import": ("begin_profile",),
-            "eds_reader": ("read_eds",),
-            "entry": ("Confidence", "DriveProfile", "Entry", "Require", "SpeedControllerParameters"),
-            "errors": ("DataFileError", "Problem", "TdhilError"),
-            "face": ("lazy_face",),
-            "library": (
-                "Profile", "eds_path", "load_canopen_profile", "load_modbus_profile", "load_profile",
-                "matching_names", "profile_names",
-            ),
-            "model": ("DataModel", "Finding", "NonNegative", "Positive", "Validated", "one_of", "refuse_if"),
-            "simulator_marker": (
-                "CYCLES_END", "CYCLE_ANSWER", "CYCLE_ASKED", "CYCLE_ID", "CYCLE_OVER", "LAST_CYCLE_OVER",
-                "MARKER_INDEX", "MARKER_REGISTER", "MARKER_REGISTERS", "MARKER_STAGE", "MARKER_STAGE_REGISTER",
-                "MARKER_TEXT", "STAGE_NUMBERS",
-            ),
-            "visible_text": ("visible",),
-            "yaml_loader": ("Conversion", "load_model", "load_with_lines", "messages_of", "parse_model"),
-            "yaml_tree": ("read_tree",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -9,11 +9,4 @@ if TYPE_CHECKING:
     from sim_bus.params import RigParams as RigParams
     from sim_bus.trace import check_trace_path as check_trace_path
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "command": ("add_kinds",),
-            "params": ("RigParams",),
-            "trace": ("check_trace_path",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -13,15 +13,4 @@ if TYPE_CHECKING:
     from drivers.canopen.sdo import Objects as Objects, name as name
     from drivers.canopen.state_machine import State as State, decode as decode
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "bus": ("CanLink",),
-            "drive": ("Cia402Drive",),
-            "limits": ("check_parameters",),
-            "preflight": ("find_units",),
-            "quick_stop": ("Cia402Target",),
-            "sdo": ("Objects", "name"),
-            "state_machine": ("State", "decode"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

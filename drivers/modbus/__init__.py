@@ -23,22 +23,4 @@ if TYPE_CHECKING:
     from drivers.modbus.state_machine import decode as decode, power_state as power_state, seen as seen
     from drivers.modbus.tcp import TcpLink as TcpLink
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "access": ("Access",),
-            "codec": ("from_words", "settle"),
-            "drive": ("ModbusDrive",),
-            "identity": ("read_marker",),
-            "link": ("EmbeddedLink", "Link"),
-            "parameters": (
-                "Parameters", "check_name_plate", "check_required", "find_filters", "find_rated_torque",
-                "read_parameters",
-            ),
-            "pdu": ("BadReply", "NoReply", "READ_HOLDING", "READ_INPUT", "read"),
-            "quick_stop": ("ModbusTarget",),
-            "rtu": ("RtuLink",),
-            "state_machine": ("decode", "power_state", "seen"),
-            "tcp": ("TcpLink",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -10,12 +10,4 @@ if TYPE_CHECKING:
     from sim_bus.canopen.inline import InlineSimulator as InlineSimulator
     from sim_bus.canopen.simulator import EmbeddedSimulator as EmbeddedSimulator, Simulator as Simulator
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "command": ("add_arguments", "run"),
-            "faults": ("listing", "parse_all"),
-            "inline": ("InlineSimulator",),
-            "simulator": ("EmbeddedSimulator", "Simulator"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -13,11 +13,4 @@ if TYPE_CHECKING:
     from sim_bus.modbus.embedded import EmbeddedModbusDrive as EmbeddedModbusDrive
     from sim_bus.modbus.faults import listing as listing, parse_all as parse_all
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "command": ("add_arguments", "run"),
-            "embedded": ("EmbeddedModbusDrive",),
-            "faults": ("listing", "parse_all"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

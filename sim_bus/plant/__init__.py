@@ -14,11 +14,4 @@ if TYPE_CHECKING:
     )
     from sim_bus.plant.rigid import Params as Params, State as State
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "batch": ("FixedStep", "LARGEST_BRISTLE_STEP", "SPEED", "Shafts", "white_torque"),
-            "kinds": ("AnyPlantParams", "MotorState", "PLANTS", "build"),
-            "rigid": ("Params", "State"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -16,17 +16,4 @@ if TYPE_CHECKING:
         simulated_default_rig as simulated_default_rig,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "options": ("Origin", "RunOptions", "Setting", "resolve"),
-            "registry": (
-                "BUSES", "DEFAULT_BUS", "DEFAULT_EXCITATION", "EXCITATIONS", "MODELS", "has_plateaus", "imported",
-                "load",
-            ),
-            "rig": (
-                "DriveData", "Limits", "Modbus", "Registered", "Rig", "bit_rate_problem", "load_rig",
-                "require_limits", "simulated_default_rig",
-            ),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

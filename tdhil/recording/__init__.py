@@ -28,21 +28,4 @@ if TYPE_CHECKING:
     from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "csv": ("Bench", "USUAL", "parse_columns", "read_recording"),
-            "log_format": ("CAN", "CHANNELS", "CLASSES", "COMMAND", "EXCITATION", "MODBUS", "SAMPLE", "schema_name"),
-            "log_reader": ("read_cycles", "read_frames", "read_run"),
-            "log_tail": ("LogChunks", "LogNews", "LogTail", "LoggedMessage", "messages_in"),
-            "log_writer": ("RunWriter",),
-            "mcap_container": ("MAGIC", "schema_of"),
-            "packed": ("pack_recording", "unpack_recording"),
-            "recording": (
-                "BoolArray", "Excitation", "FloatArray", "LagPrior", "Level", "Pipe", "Ramp", "Recording", "Segment",
-                "Stage", "SteppedSetpoint", "aborted_stage", "before_abort",
-            ),
-            "run_log": ("Ended", "RunLog", "find_ended"),
-            "salvage": ("Salvage", "examine", "write_copy"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -23,16 +23,4 @@ if TYPE_CHECKING:
         tuning_document as tuning_document, write_tuning_report as write_tuning_report,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "card": ("card_html", "card_text", "minutes", "print_card"),
-            "console": ("PlainConsole",),
-            "document": ("SIMULATED", "result_document"),
-            "html": ("check_report_path", "write_report"),
-            "live": ("LiveDisplay", "stderr_console"),
-            "page": ("STYLE", "has_extra", "inline_svg", "install_command", "repeatable_figures", "require_extra"),
-            "plots": ("draw_run",),
-            "tuning": ("TunedFor", "print_tuning", "showcase_of", "tuning_document", "write_tuning_report"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -34,21 +34,7 @@ if TYPE_CHECKING:
         Display as Display, Idle as Idle, RunOutcome as RunOutcome, STAGES as STAGES, Task as Task,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "design": ("Knowledge", "assumed_noise", "interval_confidence"),
-            "guard": ("Guard",),
-            "planning": ("NOTHING_TO_EXPECT", "NOT_PREDICTED", "Planned", "plan_acquisition", "refuse_hopeless"),
-            "preconditions": ("precondition_warnings", "refuse_by_plan"),
-            "runner": ("Runner",),
-            "settings": ("ControlAssumptions", "ExcitationRequest", "MachineLimits", "StopRequest"),
-            "speed_check": ("speed_warnings",),
-            "stage_log": ("stage_warnings",),
-            "stop": ("not_confirmed",),
-            "task": ("Display", "Idle", "RunOutcome", "STAGES", "Task"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)
 
 
 class _Room(ModuleType):

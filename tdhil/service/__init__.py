@@ -13,11 +13,4 @@ if TYPE_CHECKING:
     from tdhil.service.serving import HOST as HOST, PORT as PORT, serve as serve
     from tdhil.service.states import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "client": ("Client", "ServiceError"),
-            "serving": ("HOST", "PORT", "serve"),
-            "states": ("Conflict", "NotAllowed", "NotThere"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -40,22 +40,4 @@ if TYPE_CHECKING:
         machine_limits as machine_limits, stated_lags as stated_lags,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "conclusion": ("conclude",),
-            "confirm": ("AskingAttendant", "TerminalAttendant", "motion_summary"),
-            "connection": (
-                "Connection", "PeerPlan", "bus_kind", "bus_kinds", "connection_of", "simulated_connection",
-            ),
-            "consent": ("UNVERIFIED_FLAG", "check_names", "doubtful", "is_accepted"),
-            "holder": ("DriveHeld", "Holder", "address_of", "hold", "holder_of"),
-            "log_place": ("check_different_files", "check_log_path", "is_live", "make_room"),
-            "opening": ("open_drive", "plan_peer", "with_faults"),
-            "plan_ahead": ("BEFORE_ACQUIRE_S", "Figure", "plan_document", "plan_dry"),
-            "recorded": ("RunRecord", "is_log", "read"),
-            "run_session": ("Attendant", "Consent", "RunRequest", "RunSession"),
-            "stop_signals": ("stop_on_signals",),
-            "task": ("bench_of", "excitation_request", "facts", "machine_limits", "stated_lags"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

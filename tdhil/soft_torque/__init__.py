@@ -31,27 +31,4 @@ if TYPE_CHECKING:
         recipe_with as recipe_with, string_modes_hz as string_modes_hz, tune as tune,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "drill_string": (
-                "BitFriction", "Bottom", "DrillString", "Line", "Section", "StringFile", "load_string", "string_of",
-            ),
-            "controller": (
-                "ClosedSystem", "DERIVATIVE_FILTER_S", "Margins", "Mode", "SpeedController", "TopDrive", "control_law",
-                "impedance", "inner_lags", "margins", "reflection", "reflection_at", "softest_allowed",
-                "stiff_controller", "tuned_controller",
-            ),
-            "own_units": ("DriveSetting", "drive_settings"),
-            "roots": ("RootsLost", "count_in", "roots_in"),
-            "simulation": (
-                "Begin", "CriticalSpeeds", "Grid", "RPM", "Search", "Trace", "critical_speeds", "grid_of",
-                "lowest_turning", "onset_speeds", "simulate",
-            ),
-            "tuning": (
-                "BAND_HZ", "Interval", "TUNING_REFUSED", "TuneCase", "Tuned", "Tuning", "TuningRefused",
-                "WrongInertia", "figures_at", "largest_stable_share", "least_damping", "recipe_with",
-                "string_modes_hz", "tune",
-            ),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from tdhil.estimation.cross_checks.friction_by_speed import Inertia as Inertia, friction_curve as friction_curve
     from tdhil.estimation.cross_checks.second_opinion import cross_checked as cross_checked
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "friction_by_speed": ("Inertia", "friction_curve"),
-            "second_opinion": ("cross_checked",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

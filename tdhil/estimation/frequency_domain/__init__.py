@@ -35,23 +35,4 @@ if TYPE_CHECKING:
         pooled_lines as pooled_lines,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "friction_levels": ("Levels", "ViscousConstraint", "measure_levels", "tie_viscous", "warming_warning"),
-            "identify": ("clear_lines", "identify_lines", "measured"),
-            "inference": (
-                "fisher_tail", "profile_edge", "rejects", "student_quantile", "torque_scale_line",
-                "widened_most_by_scale", "with_total",
-            ),
-            "model": ("GaussianPrior", "Model"),
-            "optimiser": ("Box", "Fit"),
-            "rigid": ("fit_inertia", "known_of", "lag_priors", "refuse_count", "simultaneous"),
-            "shafts": ("VISCOUS", "shaft_model"),
-            "signal_filters": (
-                "AVERAGE", "LAG_BOUND_S", "SHAPE_BOUND", "SKEW", "SKEW_BOUND_S", "SPEED_LAG", "SPEED_SHAPE",
-                "TORQUE_LAG", "TORQUE_SHAPE", "shared_lag", "unseen_lag",
-            ),
-            "spectrum": ("ComplexArray", "Line", "PeriodLines", "period_lines", "pooled_lines"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

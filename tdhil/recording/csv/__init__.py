@@ -8,10 +8,4 @@ if TYPE_CHECKING:
     from tdhil.recording.csv.layout import USUAL as USUAL, parse_columns as parse_columns
     from tdhil.recording.csv.reader import Bench as Bench, read_recording as read_recording
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "layout": ("USUAL", "parse_columns"),
-            "reader": ("Bench", "read_recording"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

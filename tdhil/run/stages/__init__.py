@@ -12,14 +12,4 @@ if TYPE_CHECKING:
     from tdhil.run.stages.speed import Course as Course, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.run.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "acquire": ("run_plan",),
-            "brake_test": ("NOT_YET", "slow_down"),
-            "hold": ("MeanSpeedControl", "run_hold"),
-            "setup": ("measure_offsets", "probe_sign"),
-            "speed": ("Course", "SpeedResult", "run_speed"),
-            "torque": ("TorqueResult", "run_torque"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -7,9 +7,4 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.studies.coverage.study import COVERAGE as COVERAGE, normal_quantile as normal_quantile
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "study": ("COVERAGE", "normal_quantile"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

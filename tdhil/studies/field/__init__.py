@@ -9,11 +9,4 @@ if TYPE_CHECKING:
     from tdhil.studies.field.registry import field_studies as field_studies
     from tdhil.studies.field.tone import tidy as tidy
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "bench": ("FieldRun", "RunProgress"),
-            "registry": ("field_studies",),
-            "tone": ("tidy",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

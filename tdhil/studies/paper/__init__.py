@@ -20,13 +20,4 @@ if TYPE_CHECKING:
         DesignStudy as DesignStudy, Table6Settings as Table6Settings, Table7Settings as Table7Settings,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "figures": ("EffectStudy", "ScatterStudy", "SignalStudy"),
-            "loop": ("SYMBOLS", "full_name"),
-            "sweep_statements": ("figure10", "figure12", "figure13", "figure9"),
-            "sweeps": ("FrequencySweep", "InertiaSweep", "KiSweepSettings", "KpSweepSettings", "SweepStudy"),
-            "tables": ("DesignStudy", "Table6Settings", "Table7Settings"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -7,9 +7,4 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.studies.soft_torque.study import SOFT_TORQUE as SOFT_TORQUE
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "study": ("SOFT_TORQUE",),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)
