@@ -28,8 +28,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tdhil.fleet import FleetRequest, FleetRow, Settings, TaskLimits, run_fleet  # noqa: E402
-from tdhil.fleet.pool import Pool  # noqa: E402
+from tdhil.fleet import FleetRequest, FleetRow, Settings, run_fleet  # noqa: E402
+from tdhil.process_pool import Pool, TaskLimits  # noqa: E402
 from tests.fleet import poison  # noqa: E402
 from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
 from tests.recording.test_damage import bomb  # noqa: E402
@@ -107,7 +107,7 @@ def processes(of: int, word: bytes) -> list[int]:
 
 
 def pool_processes(of: int) -> list[int]:
-    return processes(of, b"tdhil.fleet.pool")
+    return processes(of, b"tdhil.process_pool")
 
 
 def cluster_processes(workers_too: bool) -> list[int]:

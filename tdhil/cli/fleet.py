@@ -139,7 +139,8 @@ def _tell(row: FleetRow, as_json: bool) -> None:
 
 
 def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -> FleetRequest:
-    from tdhil.fleet import FleetRequest, Settings, TaskLimits
+    from tdhil.fleet import FleetRequest, Settings
+    from tdhil.process_pool import TaskLimits
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
         raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")

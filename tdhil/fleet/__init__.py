@@ -13,7 +13,6 @@ if TYPE_CHECKING:
         FleetRequest as FleetRequest, FleetSummary as FleetSummary, Progress as Progress, find_logs as find_logs,
         run_fleet as run_fleet,
     )
-    from tdhil.fleet.pool import TaskLimits as TaskLimits
     from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings, row_of as row_of
     from tdhil.fleet.table import read_table as read_table
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
@@ -22,15 +21,4 @@ if TYPE_CHECKING:
         trend_document as trend_document,
     )
 else:
-    __getattr__, __dir__ = lazy_face(
-        __name__,
-        {
-            "changes": ("Difference", "History", "Measured", "difference", "history"),
-            "fleet": ("FleetRequest", "FleetSummary", "Progress", "find_logs", "run_fleet"),
-            "pool": ("TaskLimits",),
-            "rows": ("FleetRow", "Settings", "row_of"),
-            "table": ("read_table",),
-            "task": ("Done", "LogTask", "identify_log"),
-            "trend": ("Compared", "compare_document", "identified", "trend_document"),
-        },
-    )
+    __getattr__, __dir__ = lazy_face(__name__)

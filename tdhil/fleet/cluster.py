@@ -16,7 +16,7 @@ from importlib import metadata
 from typing import Any, Final, TypeVar
 
 from tdhil.errors import TdhilError, UsageError
-from tdhil.fleet.pool import Loss, Pool, TaskLimits
+from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.version import __version__
 
 Task = TypeVar("Task")

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from tdhil.errors import LogError, TdhilError, UsageError
-from tdhil.fleet.pool import Loss, Pool, TaskLimits
 from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
 from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, remote, sidecar_of, told_of
+from tdhil.process_pool import Loss, Pool, TaskLimits
 
 _SLOWEST: Final = 5
 _GOOD: Final = ("valid", "valid_wide")

@@ -2,17 +2,16 @@
 that the pool's processes and a cluster's find it by name.
 """
 
-import ctypes
 import os
-import signal
 import time
 from dataclasses import replace
 from pathlib import Path
 
 from tdhil.fleet.rows import FleetRow, failure_row
 from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, local_copy
+from tests.process_pool.poison import EATS, HANGS, KILLS, OUTSIDE, act
 
-KILLS, HANGS, EATS, OUTSIDE = b"poison: kills", b"poison: hangs", b"poison: eats", b"poison: outside"
+__all__ = ["EATS", "HANGS", "KILLS", "OUTSIDE", "act"]
 
 
 def head_of(path):
@@ -21,17 +20,6 @@ def head_of(path):
             return file.read(32)
     except OSError:
         return b""
-
-
-def act(head):
-    if head.startswith(KILLS):
-        ctypes.string_at(0)                            # SIGSEGV, as a library at fault would
-    if head.startswith(HANGS):
-        time.sleep(3600)
-    if head.startswith(EATS):
-        bytearray(4_000_000_000)
-    if head.startswith(OUTSIDE):
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def identify(task: LogTask) -> Done:
@@ -60,18 +48,3 @@ def quick_anywhere(task: LogTask) -> Done:
     """The same of a log behind an address."""
     with local_copy(task.log) as path:
         return replace(done := quick(replace(task, log=str(path))), row=replace(done.row, log=task.log))
-
-
-def work(task):
-    """For the pool alone: what a number or a word asks for."""
-    if isinstance(task, bytes):
-        act(task)
-    if task == "raise":
-        raise ValueError("as asked")
-    if task == "print":
-        print("not an answer")
-    if task == "much":
-        return b"x" * 3_000_000
-    if isinstance(task, float):
-        time.sleep(task)
-    return task

@@ -14,8 +14,9 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.fleet import FleetRequest, LogTask, Settings, TaskLimits, find_logs, identify_log, read_table, run_fleet
+from tdhil.fleet import FleetRequest, LogTask, Settings, find_logs, identify_log, read_table, run_fleet
 from tdhil.fleet import cluster as cluster_module
+from tdhil.process_pool import TaskLimits
 from tests.fleet import poison
 
 pytestmark = pytest.mark.one_worker("fleet")
@@ -128,7 +129,7 @@ def test_killed_at_random_and_nothing_is_lost_or_twice(tmp_path, calls):
         def done(self, row):
             if len(pools) < 10 and rng.random() < 0.4:
                 children = [int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()]
-                victims = [pid for pid in children if b"fleet.pool" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+                victims = [pid for pid in children if b"process_pool" in Path(f"/proc/{pid}/cmdline").read_bytes()]
                 if victims:
                     os.kill(rng.choice(victims), signal.SIGKILL)
                     pools.append(1)

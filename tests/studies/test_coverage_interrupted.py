@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.studies.coverage import study
+from tdhil.errors import TdhilError
+from tdhil.studies.coverage import simulate, study
+from tdhil.studies.coverage.plants import FLEET
 from tdhil.studies.coverage.simulate import SimulatedRun
 from tdhil.studies.coverage.study import COVERAGE, CoverageSettings
 from tdhil.studies.output import StudyBar
@@ -130,3 +132,13 @@ def read_some(descriptor):
     except OSError:                # the other end is closed
         time.sleep(0.05)
     return b""
+
+
+def dies(task):
+    os.abort()
+
+
+def test_a_process_that_dies_ends_the_benchmark(monkeypatch):
+    monkeypatch.setattr(simulate, "run_task", dies)
+    with pytest.raises(TdhilError, match=r"process .* died.*SIGABRT.*fewer of them"):
+        list(simulate.run_all([simulate.Task(FLEET[0], 0, 1, 1, 2, 0.95)], 2))

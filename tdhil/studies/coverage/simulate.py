@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.errors import TdhilError
 from tdhil.estimation import Options, identify
+from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.recording import Excitation, Recording, Segment
 from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
-from tdhil.studies.coverage.workers import results
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What the shaft is asked to do: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
@@ -363,4 +364,16 @@ def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[SimulatedRun, 
     """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
     if processes <= 1:
         return map(run_task, wanted)
-    return results(run_task, wanted, processes)
+    return _by_several(wanted, processes)
+
+
+def _by_several(wanted: list[Task], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
+    """Raises TdhilError where a process died with a task: a benchmark with a hole in it is none."""
+    with Pool(run_task, min(processes, len(wanted)), TaskLimits(None, None)) as pool:
+        for task, result in pool.run(wanted):
+            if isinstance(result, Loss):
+                raise TdhilError(
+                    f"a process that worked for it died: {result.text}", where=f"plant {task.plant.name}",
+                    next_step="If memory was short, let fewer of them work at a time, such as --set processes=1",
+                )
+            yield result

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from tdhil.errors import TdhilError
-from tdhil.fleet.pool import Loss, Pool, TaskLimits
-from tests.fleet import poison
+from tdhil.process_pool import Loss, Pool, TaskLimits
+from tests.process_pool import poison
 
 LIMITS = TaskLimits(60.0, 500_000_000)
 
@@ -49,8 +49,14 @@ def test_memory_is_limited():
 
 
 def test_a_mistake_of_the_function_is_raised_here():
-    with Pool(poison.work, 1, LIMITS) as pool, pytest.raises(ValueError, match="as asked"):
+    with Pool(poison.work, 1, LIMITS) as pool, pytest.raises(ValueError, match="as asked") as caught:
         list(pool.run(["raise"]))
+    assert "In a process of its own" in caught.value.__notes__[0]
+
+
+def test_without_limits():
+    with Pool(poison.work, 2, TaskLimits(None, None)) as pool:
+        assert sorted(task for task, _ in pool.run(range(7))) == list(range(7))
 
 
 def test_processes_killed_at_random():
@@ -74,21 +80,25 @@ def test_processes_that_never_begin_end_the_pool(monkeypatch):
         list(pool.run(range(50)))
 
 
-def test_the_processes_end_with_their_host():
-    """Also one that is in the middle of a task, when the host is killed."""
-    script = (
-        "import os, sys\n"
-        "from tests.fleet import poison\n"
-        "from tdhil.fleet.pool import Pool, TaskLimits\n"
-        "pool = Pool(poison.work, 1, TaskLimits())\n"
-        "tasks = iter([1, poison.HANGS])\n"
-        "for one in pool.run(tasks):\n"
-        "    print(*pool.pids(), flush=True)\n"
-    )
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True,
-                          cwd=Path(__file__).parents[2]) as host:
+HOST = """
+from tests.process_pool import poison
+from tdhil.process_pool import Pool, TaskLimits
+with Pool(poison.work, 1, TaskLimits()) as pool:
+    for _ in pool.run([1, poison.HANGS]):
+        print(*pool.pids(), flush=True)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_the_processes_end_with_their_host(how):
+    """Also one in the middle of a task; of a Ctrl-C, which goes to the host's whole group, it sees nothing."""
+    with subprocess.Popen([sys.executable, "-c", HOST], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                          cwd=Path(__file__).parents[2], start_new_session=True) as host:
         pid = int(host.stdout.readline())
-        host.kill()
+        os.killpg(host.pid, how)
+        said = host.stderr.read()
+    assert host.returncode == -how
+    assert said.count(b"Traceback") == (how == signal.SIGINT)      # the host's own, and none of the process
     for _ in range(200):
         try:
             os.kill(pid, 0)

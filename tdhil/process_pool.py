@@ -8,13 +8,14 @@ A task has a limit of time, which the host keeps by killing, and one of memory, 
 ends its process or hangs is tried once more, after all others, and then set aside as a `Loss`. Where something from
 outside killed the process (SIGKILL, SIGTERM), that isn't held against the task until it happens `_KILLS` times.
 
-Not `concurrent.futures` (one dead process breaks the pool, and every task in it) and not joblib (the same): tried with
-a log that kills its process among twenty, they finished 7 and none.
+Not `concurrent.futures` (one dead process breaks the pool, and every task in it; after an interruption it does all
+that waits) and not joblib (the same): tried with a log that kills its process among twenty, they finished 7 and none.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import os
 import pickle
 import queue
@@ -23,6 +24,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -37,7 +39,7 @@ from tdhil.errors import TdhilError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.fleet.pool import serve; serve({memory!r})"
+_PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.process_pool import serve; serve({memory!r})"
 _LENGTH: Final = Struct("<Q")
 _TRIES: Final = 2
 _KILLS: Final = 5
@@ -49,10 +51,12 @@ _ALONE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_T
 
 @dataclass(frozen=True)
 class TaskLimits:
-    """``time_s``: wall time; ``memory_bytes``: on top of what a fresh process has, where the system can limit it."""
+    """``time_s``: wall time; ``memory_bytes``: on top of what a fresh process has, where the system can limit it. None:
+    as much as it takes.
+    """
 
-    time_s: float = 120.0
-    memory_bytes: int = 1_500_000_000
+    time_s: float | None = 120.0
+    memory_bytes: int | None = 1_500_000_000
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,8 @@ class Pool(Generic[Task, Result]):
                     return
                 now_s = time.monotonic()
                 next_s = min((worker.deadline_s for worker in busy), default=now_s + 1.0)
-                ready = {key.data for key, _ in answers.select(max(0.0, next_s - now_s))}
+                wait_s = None if math.isinf(next_s) else max(0.0, next_s - now_s)
+                ready = {key.data for key, _ in answers.select(wait_s)}
                 now_s = time.monotonic()
                 for worker in ready.difference(busy):
                     answers.unregister(worker.stdout)      # an idle one that has ended
@@ -122,7 +127,7 @@ class Pool(Generic[Task, Result]):
                     loss, outside = worker.bury(late, self._limits)
                     stillborn = 0 if worker.awake else stillborn + 1
                     if stillborn > _STARTS * self._jobs:
-                        raise TdhilError(f"the processes end before they begin: {loss.text}", where="fleet",
+                        raise TdhilError(f"the processes end before they begin: {loss.text}", where="process pool",
                                          next_step="Look for memory and for `ulimit -v`")
                     job.kills += outside
                     job.faults += not outside
@@ -190,7 +195,8 @@ class _Worker:
         self._stdin, self.stdout = self._process.stdin, self._process.stdout
         self.pid = self._process.pid
 
-    def give(self, function: Callable[[Any], Any], job: _Job[Any], time_s: float) -> None:
+    def give(self, function: Callable[[Any], Any], job: _Job[Any], limit_s: float | None) -> None:
+        time_s = math.inf if limit_s is None else limit_s
         self.job, self._time_s = job, time_s
         self.deadline_s = time.monotonic() + (time_s if self.awake else max(time_s, _START_S))
         with suppress(BrokenPipeError):        # dead: the end of its stdout says so, too
@@ -253,11 +259,11 @@ def _signal_name(number: int) -> str:
 # In a worker
 
 
-def serve(memory_bytes: int) -> None:
+def serve(memory_bytes: int | None) -> None:
     """One task after the other, until the host closes the pipe or is gone."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)                               # whatever else is printed is no answer
-    limited = False
+    limited = memory_bytes is None
     tasks: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(sys.stdin.buffer, tasks), daemon=True).start()
     with suppress(BrokenPipeError):
@@ -265,12 +271,13 @@ def serve(memory_bytes: int) -> None:
         answers.flush()
         while True:
             function, task = pickle.loads(tasks.get())
-            if not limited:                    # once what the function needs is loaded
+            if memory_bytes is not None and not limited:       # once what the function needs is loaded
                 _limit_memory(memory_bytes)
                 limited = True
             try:
                 answer = pickle.dumps((False, function(task)))
             except Exception as error:
+                error.add_note("In a process of its own:\n" + traceback.format_exc())
                 answer = pickle.dumps((True, error))
             answers.write(_LENGTH.pack(len(answer)) + answer)
             answers.flush()
