@@ -211,20 +211,27 @@ class _Worker:
         if not more:
             return _DEAD
         self._buffer += more
-        if len(self._buffer) < _LENGTH.size:
-            return _PART
-        (length,) = _LENGTH.unpack_from(self._buffer)
-        if len(self._buffer) < _LENGTH.size + length:
-            return _PART
-        data = bytes(self._buffer[_LENGTH.size:_LENGTH.size + length])
-        del self._buffer[:_LENGTH.size + length]
-        if not self.awake:                    # its first word is that it is there
+        data = self._whole()
+        if data is not None and not self.awake:        # its first word is that it is there; more may have come with it
             self.awake, self.deadline_s = True, time.monotonic() + self._time_s
+            data = self._whole()
+        if data is None:
             return _PART
         failed, answer = pickle.loads(data)
         if failed:
             raise answer
         return answer
+
+    def _whole(self) -> bytes | None:
+        """The first of what has come, where all of it is there."""
+        if len(self._buffer) < _LENGTH.size:
+            return None
+        end = _LENGTH.size + _LENGTH.unpack_from(self._buffer)[0]
+        if len(self._buffer) < end:
+            return None
+        data = bytes(self._buffer[_LENGTH.size:end])
+        del self._buffer[:end]
+        return data
 
     def bury(self, late: bool, limits: TaskLimits) -> tuple[Loss, bool]:
         """What to say of its end, and was it killed from outside?"""

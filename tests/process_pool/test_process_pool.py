@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tdhil import process_pool
 from tdhil.errors import TdhilError
 from tdhil.process_pool import Loss, Pool, TaskLimits
 from tests.process_pool import poison
@@ -28,6 +29,21 @@ def test_every_task_is_answered_once():
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_an_answer_that_comes_with_the_first_word_is_not_waited_for(monkeypatch):
+    """Both in one read: nothing more comes, and the task would have been lost when its time was over."""
+    begun = process_pool._Worker.__init__
+
+    def slowly(worker, limits):
+        begun(worker, limits)
+        worker.give(poison.work, process_pool._Job(7), 30.0)
+        time.sleep(0.5)
+
+    monkeypatch.setattr(process_pool._Worker, "__init__", slowly)
+    worker = process_pool._Worker(LIMITS)
+    assert worker.take() == 7
+    worker.kill()
 
 
 def test_what_ends_its_process_or_hangs_is_set_aside_and_the_rest_goes_on():
