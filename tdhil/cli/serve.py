@@ -24,12 +24,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mqtt", metavar="URL",
                         help="tell a broker the rigs' states and results, mqtt[s]://host:port/prefix; user and password"
                         " from TDHIL_MQTT_USER and TDHIL_MQTT_PASSWORD_FILE (extra mqtt)")
+    parser.add_argument("--check-idle", action="store_true",
+                        help="serve nothing: exit 0 where no run of --data lives and no tdhil here holds a drive,"
+                        " else 4 (before an upgrade)")
     parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Until Ctrl-C or SIGTERM, which brake what moves."""
-    from tdhil.service import serve
+    from tdhil.service import check_idle, serve
 
     if not 0 <= namespace.port <= 65535:
         from tdhil.errors import UsageError
@@ -39,6 +42,8 @@ def run(namespace: argparse.Namespace) -> int:
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)  # noqa: T201
 
+    if namespace.check_idle:
+        return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
                  mqtt=namespace.mqtt)

@@ -97,6 +97,22 @@ def serve(
     return int(ExitCode.OK)
 
 
+def check_idle(data: Path, say: Say) -> int:
+    """May the program be replaced now? Exit code 4, and who is in the way, where a run of this folder lives, or
+    whatever tdhil of this computer holds a drive. Asks files and locks; neither the web nor a drive.
+    """
+    from tdhil.service.store import Store
+    from tdhil.service.wire import lives
+    from tdhil.session import holders
+
+    store = Store(data.resolve())
+    busy = [f"run {run} has not ended" for run in store.ids() if lives(store.place(run))]
+    busy += [f"a drive is held by {one}" for one in holders()]
+    for one in busy:
+        say(f"not idle: {one}")
+    return int(ExitCode.REFUSED if busy else ExitCode.OK)
+
+
 def _uvicorn(app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say) -> None:
     import uvicorn
 

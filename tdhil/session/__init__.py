@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     )
     from tdhil.session.holder import (
         DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
+        holders as holders,
     )
     from tdhil.session.log_place import (
         check_different_files as check_different_files, check_log_path as check_log_path, is_live as is_live,

@@ -92,12 +92,22 @@ def hold(address: str | None) -> Iterator[None]:
 
 def holder_of(address: str | None) -> Holder | None:
     """Who holds the drive now; None where nobody does, or where this system can't tell."""
-    if address is None or sys.platform == "win32":
+    return None if address is None else _holder(_path(address))
+
+
+def holders() -> list[Holder]:
+    """Who holds any drive on this computer now."""
+    found = (_holder(path) for path in sorted(_folder().glob(_name("*"))))
+    return [one for one in found if one is not None]
+
+
+def _holder(path: Path) -> Holder | None:
+    if sys.platform == "win32":
         return None
     import fcntl
 
     try:
-        descriptor = os.open(_path(address), os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except OSError:
         return None
     try:
@@ -144,16 +154,23 @@ def _command() -> str:
     return shlex.join((Path(name).name, *rest))[:300]
 
 
+def _name(key: str) -> str:
+    return f"tdhil-{key}.lock"
+
+
 def _path(address: str) -> Path:
-    name = f"tdhil-{hashlib.sha256(address.encode()).hexdigest()[:24]}.lock"
+    return _folder() / _name(hashlib.sha256(address.encode()).hexdigest()[:24])
+
+
+def _folder() -> Path:
     for folder in map(Path, FOLDERS):
         with suppress(OSError):
             mode = folder.stat().st_mode
             if stat.S_ISDIR(mode) and mode & stat.S_ISVTX and mode & stat.S_IWOTH:
-                return folder / name
+                return folder
     import tempfile
 
-    return Path(tempfile.gettempdir()) / name
+    return Path(tempfile.gettempdir())
 
 
 def _open(path: Path) -> int:

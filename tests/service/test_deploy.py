@@ -1,0 +1,166 @@
+"""What is given to who installs it: the unit, the container, the upgrade that is refused while something moves."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tdhil.cli.main import build_parser, main
+from tdhil.errors import ExitCode
+from tdhil.service import supervisor
+from tdhil.session import hold, holder_of, holders
+from tdhil.session.holder import FOLDERS
+from tdhil.session.real_time import PRIORITY
+from tests.service.conftest import wait_for
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+
+
+# -- is anything moving?
+
+
+def idle(data: Path) -> int:
+    return main(["serve", "--check-idle", "--data", str(data)])
+
+
+def test_a_run_that_lives_is_in_the_way_of_an_upgrade_with_or_without_its_web(service, capsys):
+    assert idle(service.store.folder) == ExitCode.OK
+    run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
+    assert idle(service.store.folder) == ExitCode.REFUSED                  # as soon as it was asked for
+    assert f"run {run} has not ended" in capsys.readouterr().err
+    service.wait(run, "moving")
+    service.supervisor.close()
+    assert idle(service.store.folder) == ExitCode.REFUSED
+    service.supervisor.stop(run, "test")
+    wait_for("the end", lambda: idle(service.store.folder) == ExitCode.OK)
+
+
+def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys, monkeypatch):
+    locks = tmp_path / "lock"
+    locks.mkdir()
+    locks.chmod(0o1777)
+    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (str(locks),))
+    assert holders() == []
+    with hold("modbus 127.0.0.1:1 unit 1"), hold("modbus 127.0.0.1:2 unit 1"):
+        assert holders() == [holder_of("modbus 127.0.0.1:1 unit 1"), holder_of("modbus 127.0.0.1:2 unit 1")]
+        assert idle(tmp_path / "none") == ExitCode.REFUSED
+        assert f"a drive is held by process {os.getpid()}" in capsys.readouterr().err
+    assert idle(tmp_path / "none") == ExitCode.OK
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.fixture
+def host(tmp_path):
+    """An installation whose commands only note down that they were called; tdhil answers what ``codes`` says."""
+    home, called = tmp_path / "home", tmp_path / "called.txt"
+    (home / "bin").mkdir(parents=True)
+
+    def command(name: str, body: str = "") -> None:
+        path = home / "bin" / name
+        path.write_text(f'#!/bin/sh\necho "{name} $*" >>"{called}"\n{body}\n')
+        path.chmod(0o755)
+
+    def upgrade(*codes: int, pip: int = 0) -> tuple[int, list[str]]:
+        (tmp_path / "codes").write_text("".join(f"{one}\n" for one in codes))
+        command("tdhil", f'code=$(head -n1 "{tmp_path}/codes"); sed -i 1d "{tmp_path}/codes"; exit "$code"')
+        command("systemctl")
+        command("pip", f"exit {pip}")
+        environment = {"PATH": f"{home / 'bin'}:{os.environ['PATH']}", "TDHIL_HOME": str(home), "TDHIL_DATA": "/d"}
+        done = subprocess.run([DEPLOY / "upgrade", "tdhil.whl"], env=environment, capture_output=True, text=True)
+        return done.returncode, [line.replace("serve --check-idle --data /d", "idle?")
+                                 for line in called.read_text().splitlines()]
+
+    return upgrade
+
+
+@pytest.mark.parametrize(("codes", "pip", "exits", "did"), [
+    ((0, 0), 0, 0, ["tdhil idle?", "systemctl stop tdhil.service", "tdhil idle?", "pip install --upgrade tdhil.whl",
+                    "systemctl start tdhil.service"]),
+    ((4,), 0, 4, ["tdhil idle?"]),
+    ((0, 4), 0, 4, ["tdhil idle?", "systemctl stop tdhil.service", "tdhil idle?", "systemctl start tdhil.service"]),
+    ((0, 0), 1, 1, ["tdhil idle?", "systemctl stop tdhil.service", "tdhil idle?", "pip install --upgrade tdhil.whl",
+                    "systemctl start tdhil.service"]),
+])
+def test_an_upgrade_while_something_moves_is_refused(host, codes, pip, exits, did):
+    assert host(*codes, pip=pip) == (exits, did)
+
+
+# -- systemd
+
+
+def settings() -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for line in (DEPLOY / "tdhil.service").read_text().splitlines():
+        if re.match(r"\w+=", line):
+            name, _, value = line.partition("=")
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def test_the_unit_stops_as_the_service_does():
+    unit = settings()
+    assert unit["KillMode"] == ["process"]                 # runs outlive their web, and brake in peace
+    assert unit["KillSignal"] == ["SIGTERM"]
+    assert float(unit["TimeoutStopSec"][0]) > supervisor.STOP_S + 10.0
+    assert "ExecStop" not in unit
+    assert "ExecStartPre" not in unit                      # whatever moves, a web that died comes back
+    assert unit["RestartPreventExitStatus"] == [str(int(ExitCode.USAGE))]
+
+
+def test_the_unit_allows_what_a_run_needs():
+    unit = settings()
+    assert int(unit["LimitRTPRIO"][0]) >= PRIORITY
+    assert unit["LimitMEMLOCK"] == ["infinity"]
+    assert unit["ReadWritePaths"] == [f"-{FOLDERS[0]}"]     # one lock for terminals and service
+    assert {"AF_UNIX", "AF_INET", "AF_INET6", "AF_CAN"} <= set(unit["RestrictAddressFamilies"][0].split())
+    program, *words = shlex.split(unit["ExecStart"][0].replace("$TDHIL_OPTIONS", "--mqtt mqtts://broker.example/site"))
+    assert program == "/opt/tdhil/bin/tdhil"
+    options = build_parser("serve").parse_args(words)
+    assert options.data == Path("/var/lib") / unit["StateDirectory"][0]
+    assert options.rigs.parent == Path("/etc") / unit["ConfigurationDirectory"][0]
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here (apt-get install systemd)")
+def test_systemd_takes_the_unit(tmp_path):
+    copy = tmp_path / "tdhil.service"
+    copy.write_text((DEPLOY / "tdhil.service").read_text().replace("/opt/tdhil/bin/tdhil", sys.executable))
+    done = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True)
+    assert (done.returncode, done.stderr + done.stdout) == (0, "")
+    done = subprocess.run(["systemd-analyze", "security", "--offline=true", "--threshold=30", "--no-pager", copy],
+                          capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-300:] + done.stderr
+
+
+# -- a container
+
+
+def test_the_container_s_recipe_names_what_there_is_and_nobody_s_registry():
+    text = (DEPLOY / "Dockerfile").read_text()
+    steps = [line.split(maxsplit=1) for line in text.replace("\\\n", " ").splitlines() if re.match(r"[A-Z]+ ", line)]
+    images = [rest.split()[0] for word, rest in steps if word == "FROM"]
+    assert images
+    assert not [one for one in images if re.search(r"[./].*/|@", one)]
+    assert not re.search(r"--(extra-)?index-url|https://", text)
+    copied = [part for word, rest in steps if word == "COPY" and not rest.startswith("--from")
+              for part in rest.split()[:-1]]
+    assert [one for one in copied if not (ROOT / one).exists()] == []
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    built = needed["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert {*built["packages"], *built["force-include"]} <= set(copied)
+    extras = re.search(r"'\.\[([\w,]+)\]'", text).group(1).split(",")
+    assert set(extras) <= set(needed["project"]["optional-dependencies"])
+    (entry,) = [rest for word, rest in steps if word == "ENTRYPOINT"]
+    assert build_parser("serve").parse_args(re.findall(r'"([^"]+)"', entry)[1:]).data == Path("/data")
+    (check,) = [rest for word, rest in steps if word == "HEALTHCHECK"]
+    compile(re.findall(r'"([^"]+)"', check)[2], "HEALTHCHECK", "exec")
+    assert ("STOPSIGNAL", signal.SIGTERM.name) in [tuple(one) for one in steps]
