@@ -64,12 +64,15 @@ class UsageError(TdhilError):
 
 
 class Interrupted(TdhilError):
-    """Somebody, or the system, asked the program to end; raised once the shaft has been taken care of."""
+    """Somebody, or the system, asked the program to end; raised once the shaft has been taken care of.
 
-    def __init__(self, number: int, *, next_step: str = "") -> None:
+    ``why``: who or what it was, where more is known of it than a signal's name.
+    """
+
+    def __init__(self, number: int, why: str = "", *, next_step: str = "") -> None:
         self.signal = signal.Signals(number)
         how = "Ctrl-C" if self.signal is signal.SIGINT else self.signal.name
-        super().__init__(f"interrupted by {how}", next_step=next_step)
+        super().__init__(f"interrupted: {why}" if why else f"interrupted by {how}", next_step=next_step)
 
     @property
     def exit_code(self) -> ExitCode:

@@ -27,6 +27,7 @@ _COMMANDS = {
     "recover": "say what a damaged log still holds, and make a clean copy of it",
     "stop": "stop a drive from outside of any run: best effort, no emergency stop",
     "serve": "rigs, runs and live pages in a browser, on this computer",
+    "attend": "show the codes that let shafts of tdhil serve move, on this terminal",
     "simulate": "run the simulated rig as a process of its own",
     "rig": "write a rig.yaml to fill in, with no drive at hand",
     "support": "put a log and what is around it into one archive, for a support case",
@@ -127,6 +128,8 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.cli.doctor import add_arguments
     elif name == "serve":
         from tdhil.cli.serve import add_arguments
+    elif name == "attend":
+        from tdhil.cli.attend import add_arguments
     else:
         from tdhil.cli.simulate import add_arguments
     return add_arguments

@@ -272,7 +272,8 @@ class Service(DataModel):
     """What `tdhil serve` may do with this bench."""
 
     motion: Literal["never", "attended", "watched"] = Field(
-        default="never", description="who may move it from afar: nobody, or with a code from whoever stands there"
+        default="never",
+        description="who may move it from afar: nobody, with a code from whoever stands there, or watched as well",
     )
 
 

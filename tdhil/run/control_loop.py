@@ -7,7 +7,6 @@ from threading import Event
 from typing import Any, Protocol, TypeVar
 
 from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
-from tdhil.errors import Interrupted
 from tdhil.run.background import Background, Reckoner
 from tdhil.run.guard import Guard
 from tdhil.run.settings import StopRequest
@@ -65,8 +64,7 @@ class ControlLoop:
 
     def cycle(self, command: Command) -> Sample:
         """One exchange. Raises Interrupted when a stop was asked for, and whatever guard, drive and log raise."""
-        if self._stop_request.signum is not None:
-            raise Interrupted(self._stop_request.signum)
+        self._stop_request.check()
         self.guard.check_command(command)
         sample = self.drive.exchange(command)
         self.log.cycle(command, sample)
@@ -181,7 +179,6 @@ class ControlLoop:
 
     def _wait_alive(self, ended: Event) -> None:
         """Wait for a moment, or until it is done; then the sign of life, of a drive that knows one."""
-        if self._stop_request.signum is not None:
-            raise Interrupted(self._stop_request.signum)
+        self._stop_request.check()
         if not ended.wait(ALIVE_S) and isinstance(self.drive, KeptAlive):
             self.drive.keep_alive()

@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import asdict, replace
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
-from tdhil.errors import Interrupted
 from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
@@ -262,8 +261,7 @@ class Runner:
         """Load and start whatever would hold the loop up later; why there is no process for arithmetic, if so."""
         stop_request = self._stop_request
         self._reckoner, why = begin(quieten, lambda: stop_request.signum is not None)
-        if stop_request.signum is not None:
-            raise Interrupted(stop_request.signum)
+        stop_request.check()
         return why
 
     def _choose_rate(self) -> None:
@@ -273,8 +271,7 @@ class Runner:
             return
 
         def cycle() -> Sample:
-            if self._stop_request.signum is not None:
-                raise Interrupted(self._stop_request.signum)
+            self._stop_request.check()
             return drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
 
         choice = choose_rate(drive, drive.rates_hz, cycle)

@@ -4,6 +4,7 @@ import signal
 from dataclasses import dataclass, replace
 
 from tdhil.config import DEFAULT_EXCITATION
+from tdhil.errors import Interrupted
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,17 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signum: int | None = None
+        self.why = ""
         self.count = 0
 
-    def ask(self, signum: int = signal.SIGINT) -> None:
-        """Ask for the stop; the run sees it in its next cycle, and ends as on that signal."""
+    def ask(self, signum: int = signal.SIGINT, why: str = "") -> None:
+        """Ask for the stop; the run sees it in its next cycle, and ends as on that signal. ``why``: for people."""
         self.count += 1
         if self.signum is None:
+            self.why = why
             self.signum = int(signum)
+
+    def check(self, *, next_step: str = "") -> None:
+        """Raises Interrupted where a stop was asked for."""
+        if self.signum is not None:
+            raise Interrupted(self.signum, self.why, next_step=next_step)

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from pydantic import TypeAdapter
 
 from tdhil.service.foxglove import PROTOCOLS
-from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told
+from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.store import Broken, Entry, Summary
 from tdhil.version import __version__
 
@@ -73,6 +73,8 @@ class RunView:
     identity: str
     safe_action: str
     confirmation: Confirmation | None
+    motion: str
+    watch: Watch | None
     stop: Stop
     error: Told | None
     exit_code: int | None
@@ -120,6 +122,15 @@ class StoppedView:
 
 
 @dataclass(frozen=True)
+class LeaseView:
+    """Who watches a watched run, for so many seconds more if nothing is heard of his page."""
+
+    run: str
+    watch: Watch
+    lease_s: float
+
+
+@dataclass(frozen=True)
 class AuditView:
     """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold."""
 
@@ -150,10 +161,23 @@ class ErrorView:
 
 @dataclass(frozen=True)
 class ConfirmBody:
-    """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it."""
+    """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it.
+
+    ``lease``: where the rig is watched, a random key of 16 to 200 characters, which only its sender knows and renews.
+    """
 
     code: str
     binding: str | None = None
+    lease: str | None = None
+
+
+@dataclass(frozen=True)
+class LeaseBody:
+    """The page with this key is seen; or how it goes. ``new_key``: from now on that one, and the old one is void."""
+
+    key: str
+    new_key: str | None = None
+    gone: Literal["hidden", "closed"] | None = None
 
 
 @dataclass(frozen=True)
@@ -216,6 +240,8 @@ ROUTES: Final = (
     Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
     Route("POST", "/runs/{run}/confirm", "confirm", "Let it move, with the code shown at the rig", "operator",
           {200: RunView}, ConfirmBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/lease", "renew", "Say, once a second, that the page of a watched run is seen",
+          "operator", {200: LeaseView}, LeaseBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/stop", "stop", "Have it brake. This is no emergency stop", "viewer", {200: RunView},
           Nothing, (403, 404, 503)),
     Route("POST", "/runs/{run}/sign-off", "sign_off", "Take a stop that wasn't confirmed upon oneself", "engineer",

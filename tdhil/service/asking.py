@@ -188,14 +188,19 @@ def require_motion(rig: RigFile) -> None:
     """May anybody ask for motion of this rig over HTTP? Raises UsageError and NotAllowed."""
     if rig.rig is None:
         raise UsageError(rig.problem, where=rig.path.name, next_step="Mend the rig's file")
-    if rig.simulated or rig.motion == "attended":
+    if rig.simulated or rig.motion != "never":
         return
     where = rig.rig.source("service.motion") or rig.path.name
-    if rig.motion == "watched":
-        raise NotAllowed("motion: watched isn't there yet", where=where,
-                         next_step="Take attended: a code is shown where tdhil serve runs")
     raise NotAllowed("this rig is never moved from afar (service.motion: never)", where=where,
                      next_step="Run it at the rig: tdhil identify. Or say service: {motion: attended} in its file")
+
+
+def require_unwatched(rig: RigFile) -> None:
+    """Of who hasn't said who he is. Raises NotAllowed."""
+    if rig.motion == "watched" and not rig.simulated:
+        where = (rig.rig and rig.rig.source("service.motion")) or rig.path.name
+        raise NotAllowed("this rig moves only while somebody who has logged in watches it (service.motion: watched)",
+                         where=where, next_step="Take motion: attended where nobody logs in")
 
 
 def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None = None) -> RunRequest:

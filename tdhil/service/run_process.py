@@ -18,17 +18,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Preflight, PreflightRefused
+from profiles import visible
 from tdhil.service.asking import binding_of, plan_of, read_rig, refuse_changed, run_request
-from tdhil.service.attending import EXPECTED_S, Board, Confirming, ServiceAttendant, Watcher
-from tdhil.service.states import State, Status, Told, end_of, now, way_to
+from tdhil.service.attending import (
+    EXPECTED_S,
+    LEASE_S,
+    WATCHED,
+    Board,
+    Confirming,
+    ServiceAttendant,
+    Watcher,
+    tell,
+)
+from tdhil.service.states import State, Status, Told, Watch, end_of, now, way_to
 from tdhil.service.store import Request, Store, read_json, write_json
 from tdhil.service.wire import STOP_FILE, Listener
 
 if TYPE_CHECKING:
-    from tdhil.run import RunOutcome, StopRequest
+    from tdhil.run import RunOutcome
 
 NICE: Final = 5
 """Of a simulated run in stepped time, which takes all the processor that it gets."""
+UNWATCHED: Final = "nobody watched"
+"""Who asked for the stop of a watched run whose page was gone."""
 
 
 class RunProcess:
@@ -40,21 +52,24 @@ class RunProcess:
         self.request: Request = self.store.request(self.folder.name)
         self.board = Board(self.store, replace(self.store.status(self.request.id), pid=os.getpid(),
                                                expected_s=EXPECTED_S))
-        self.watcher = Watcher(self.board)
-        self.attendant = ServiceAttendant(self.board, self.watcher, self.folder, self._bind)
         self._plan: dict[str, Any] = {}
+        from tdhil.run import StopRequest
+
+        self.stop = StopRequest()
+        self.watcher = Watcher(self.board, self.stop)
+        self.watched = self.request.motion == "watched"
+        self.attendant = ServiceAttendant(self.board, self.watcher, self.folder, self._bind, watched=self.watched,
+                                          unwatched=self._unwatched)
 
     def serve(self) -> int:
         """Run it; the exit code, as of `tdhil identify`."""
-        from tdhil.run import StopRequest
         from tdhil.session import stop_on_signals
 
-        stop = StopRequest()
-        with stop_on_signals(stop), Listener(self.folder, lambda asked: self.answer(asked, stop)):
+        with stop_on_signals(self.stop), Listener(self.folder, self.answer):
             try:
                 if (early := read_json(self.folder / STOP_FILE)) is not None:
-                    self.answer({"do": "stop", "by": early.get("by", "somebody")}, stop)
-                code = self._run(stop)
+                    self.answer({"do": "stop", "by": early.get("by", "somebody")})
+                code = self._run()
             except BaseException as error:
                 code = self._failed(error)
             self.board.close()
@@ -62,21 +77,24 @@ class RunProcess:
 
     # -- the socket ----------------------------------------------------------------------------------------------
 
-    def answer(self, asked: Mapping[str, Any], stop: StopRequest) -> dict[str, Any]:
+    def answer(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         """One request's. Called in a thread of the socket."""
         what, who = asked.get("do"), str(asked.get("by", "somebody"))[:80]
         if what == "stop":
-            stop.ask(signal.SIGTERM)           # first of all; the control loop sees it in its next cycle
-            self.watcher.look_for_the_stop()
-            at = now()
-            self.board.change(lambda one: self._asked_to_stop(one, at, who))
+            self._stop(f"{visible(who)} asked for a stop", who)
             return {"status": self.board.status.plain()}
+        if what == "lease":
+            if (lease := self.attendant.lease) is None:
+                raise PreflightRefused("nobody watches this run", where="lease")
+            watch = lease.renew(str(asked.get("key", "")), who, new_key=str(asked.get("new_key") or ""),
+                                gone=str(asked.get("gone") or ""))
+            return {"watch": asdict(watch)}
         if what == "confirm":
             confirming = self.attendant.confirming
             if confirming is None:
                 raise PreflightRefused("there is nothing to confirm", where="run",
                                        next_step="A simulated rig asks nobody; a real one asks after its preflight")
-            confirming.take(str(asked.get("code", "")), asked.get("binding"), who)
+            confirming.take(str(asked.get("code", "")), asked.get("binding"), who, str(asked.get("lease") or ""))
             return {"status": self.board.status.plain()}
         if what == "code":
             confirming = self.attendant.confirming
@@ -86,11 +104,12 @@ class RunProcess:
             return {"code": confirming.code, "left_s": confirming.left_s, "binding": confirming.binding}
         return {"status": self.board.status.plain()}
 
-    @staticmethod
-    def _asked_to_stop(status: Status, at: str, who: str) -> Status:
-        if status.stop.asked is None and not status.ended:
-            status = replace(status, stop=replace(status.stop, asked=at, by=who))
-        return status.to(State.STOPPING, at) if status.state is State.MOVING else status
+    def _stop(self, why: str, who: str) -> None:
+        self.stop.ask(signal.SIGTERM, why)     # first of all; the control loop sees it in its next cycle
+        self.watcher.asked_to_stop(who)
+
+    def _unwatched(self, watch: Watch) -> None:
+        self._stop(f"nobody watched the run for {LEASE_S:g} s ({WATCHED[watch.how]})", UNWATCHED)
 
     # -- the run -------------------------------------------------------------------------------------------------
 
@@ -98,11 +117,18 @@ class RunProcess:
         checks = [[one.name, one.wanted, one.found, one.outcome.value, one.where] for one in preflight.checks]
         found = {"identity": asdict(preflight.identity), "checks": checks}
         binding = binding_of(self._asked, self.request.rig_sha256, found, self._plan)
-        path = Path(self.request.rig_file)
-        return Confirming(binding, lambda: refuse_changed(path, self.request.rig_sha256))
+        return Confirming(binding, self._refuse_changed, watched=self.watched)
 
-    def _run(self, stop: StopRequest) -> int:
-        from tdhil.errors import Interrupted
+    def _refuse_changed(self) -> None:
+        """Rig file and profile are what they were. Raises PreflightRefused."""
+        path = Path(self.request.rig_file)
+        refuse_changed(path, self.request.rig_sha256)
+        _, connection = read_rig(path).way(self.request.options)
+        if connection.profile != self._asked.connection.profile:
+            raise PreflightRefused("the drive's profile was changed after the run was asked for",
+                                   where=connection.profile.name, next_step="Ask for it again; nothing has moved")
+
+    def _run(self) -> int:
         from tdhil.report import has_extra
         from tdhil.session import RunSession
 
@@ -110,8 +136,7 @@ class RunProcess:
         path = Path(self.request.rig_file)
         refuse_changed(path, self.request.rig_sha256)
         rig = read_rig(path)
-        if stop.signum is not None:
-            raise Interrupted(stop.signum, next_step="Nothing has moved")
+        self.stop.check(next_step="Nothing has moved")
         self.board.to(State.PREFLIGHT)
         self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
         if asked.peer.stepped:
@@ -121,11 +146,13 @@ class RunProcess:
             self._plan = plan_of(rig, self.request.options)
             write_json(self.folder / "plan.json", self._plan)
         report = has_extra()
-        if stop.signum is not None:
-            raise Interrupted(stop.signum, next_step="Nothing has moved")
+        self.stop.check(next_step="Nothing has moved")
         session = RunSession(asked, self.attendant, report=report)
+        self.watcher.log = session.log
         try:
-            outcome = session.move(stop)
+            outcome = session.move(self.stop)
+            if self.attendant.lease is not None:
+                self.attendant.lease.end()
             if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
                 session.abandon()
                 return self._ended(outcome)
@@ -151,7 +178,7 @@ class RunProcess:
             row = row_of(self.request.id, document, settings=Settings(), torque_scale_rel_sd=torque_scale_rel_sd)
             write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
         except Exception as error:             # the result stands without it
-            print(f"the history can't be written: {error}", file=sys.stderr)  # noqa: T201
+            tell(f"the history can't be written: {error}")
 
     def _report(self, document: Mapping[str, Any], recording: Any) -> None:
         from tdhil.errors import UsageError
@@ -160,7 +187,7 @@ class RunProcess:
         try:
             write_report(document, recording, Path("report.html"))
         except (UsageError, OSError) as error:
-            print(f"the report can't be written: {error}", file=sys.stderr)  # noqa: T201
+            tell(f"the report can't be written: {error}")
 
     def _ended(self, outcome: RunOutcome) -> int:
         from tdhil.errors import ExitCode, exit_code

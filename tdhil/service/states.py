@@ -115,6 +115,21 @@ class Confirmation:
 
 
 @dataclass(frozen=True)
+class Watch:
+    """Who watches a run that brakes as soon as nobody does.
+
+    ``gone``: since when its page has not been seen, by what itself or its silence said (``how``: hidden, closed,
+    silent); None while it is there. ``lost``: when it was too long, and the run was made to brake.
+    """
+
+    by: str
+    since: str
+    gone: str | None = None
+    how: str | None = None
+    lost: str | None = None
+
+
+@dataclass(frozen=True)
 class Entered:
     """A state (of `moving` with its stage) and when it began."""
 
@@ -138,6 +153,7 @@ class Status:
     safe_action: str = ""
     expected_half_width: float | None = None
     confirmation: Confirmation | None = None
+    watch: Watch | None = None
     stop: Stop = Stop()
     error: Told | None = None
     exit_code: int | None = None
@@ -181,7 +197,9 @@ class Status:
         history = tuple(Entered(State(one["state"]), one["at"], one.get("stage")) for one in known.pop("history"))
         if not history:
             raise ValueError("a run without a state")
-        for name, kind in (("stop", Stop), ("error", Told), ("confirmation", Confirmation)):
+        for name, kind in (
+            ("stop", Stop), ("error", Told), ("confirmation", Confirmation), ("watch", Watch),
+        ):
             if known.get(name) is not None:
                 known[name] = kind(**known[name])
         known["preflight"] = tuple(Check(**one) for one in known.get("preflight", ()))

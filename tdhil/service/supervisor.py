@@ -14,14 +14,15 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from drivers import CommunicationLost
 from tdhil.errors import ExitCode
 from tdhil.service.asking import RigFile, Rigs, options_of, require_motion
-from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, blocking, now, way_to
+from tdhil.service.console import Console
+from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, Watch, blocking, now, way_to
 from tdhil.service.store import Audit, Index, Request, Store, write_json
 from tdhil.service.wire import STOP_FILE, Refused, ask, lives, signal_stop, take_life
 from tdhil.session import Holder, holder_of
@@ -57,7 +58,8 @@ class Supervisor:
         self._command = command or (lambda folder: [sys.executable, "-m", "tdhil.service.run_process", str(folder)])
         self._asking = threading.Lock()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
-        self._live: dict[str, str | None] = {}         # run: the code that was shown
+        self._live: dict[str, None] = {}               # in the order in which they began
+        self._console = Console(store, say)
         self._lost: set[str] = set()
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
         self._unindexed: set[str] = set()
@@ -171,19 +173,31 @@ class Supervisor:
         found = blocking(statuses, [one.id for one in statuses if self.store.signed_off(one.id) is not None])
         return None if found is None else found.id
 
-    def confirm(self, run: str, code: str, binding: str | None, who: str) -> Status:
-        """Hand the code on. Raises NotThere, Conflict (there is nothing to confirm; it isn't the code; it is void)."""
-        status = self.store.status(run)
-        if status.ended or self.store.request(run).simulated:
+    def confirm(self, run: str, code: str, binding: str | None, who: str, lease: str | None = None) -> Status:
+        """Hand the code on. Raises NotThere, Conflict (there is nothing to confirm; it isn't the code; it is void).
+
+        ``lease``: the key of a page that will renew it, where the rig is watched.
+        """
+        status, request = self.store.status(run), self.store.request(run)
+        if status.ended or (request.simulated and request.motion != "watched"):
             raise Conflict(f"there is nothing to confirm: the run is {status.state}", where=f"run {run}",
                            next_step="A simulated rig asks for no confirmation")
         try:
-            found = ask(self.store.place(run), {"do": "confirm", "code": code, "binding": binding, "by": who})
+            found = ask(self.store.place(run),
+                        {"do": "confirm", "code": code, "binding": binding, "by": who, "lease": lease})
         except (Refused, CommunicationLost) as error:
             self.note(who, "confirmation refused", run, status.rig, why=str(error))
             raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
         self.note(who, "confirmed", run, status.rig, binding=binding)
         return Status.of_plain(found["status"])
+
+    def renew(self, run: str, key: str, who: str, *, new_key: str | None, gone: str | None) -> Watch:
+        """The page that confirmed a watched run is there, or goes. Raises NotThere, Conflict, CommunicationLost."""
+        asked = {"do": "lease", "key": key, "new_key": new_key, "gone": gone, "by": who}
+        try:
+            return Watch(**ask(self.store.place(run), asked)["watch"])
+        except Refused as error:
+            raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
 
     def stop(self, run: str, who: str) -> Status:
         """Have the run brake. By the socket; where that doesn't answer, by SIGTERM; both return at once.
@@ -214,9 +228,7 @@ class Supervisor:
     def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
         """`tdhil stop` on a rig that has no run of this service: its exit code, and what was seen."""
         self.note(who, "stop asked", None, rig.id)
-        if rig.simulated:
-            return int(ExitCode.OK), "nothing turns: the rig is simulated, and has no run"
-        return _tdhil_stop(rig.path)
+        return _stop_drive(rig.path, simulated=rig.simulated)
 
     def sign_off(self, run: str, who: str, note: str) -> None:
         """Take a stop that wasn't confirmed upon oneself. Raises NotThere and Conflict."""
@@ -277,17 +289,7 @@ class Supervisor:
                 self._lost.add(run)
                 self._in_background(lambda: self._settle(run, self._died(run, status)))
         elif status.state is State.AWAITING:
-            self._show_code(run, status)
-
-    def _show_code(self, run: str, status: Status) -> None:
-        with suppress(Refused, CommunicationLost):
-            found = ask(self.store.place(run), {"do": "code"})
-            code = found.get("code")
-            if code and self._live.get(run) != code:
-                self._live[run] = code
-                text = status.confirmation.text if status.confirmation is not None else ""
-                self._say(f"{text}\nTo let it move, type this code into the page within {found['left_s']:.0f} s"
-                          f" (run {run}):   {code[:3]} {code[3:]}\n")
+            self._console.show(run, status)
 
     def _settle(self, run: str, status: Status) -> None:
         if status.state is State.STOP_NOT_CONFIRMED:
@@ -297,13 +299,15 @@ class Supervisor:
             with suppress(subprocess.TimeoutExpired):
                 child.wait(0.05)
         self._live.pop(run, None)
-        self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code)
+        self._console.forget(run)
+        watched = {} if status.watch is None else {"watch": asdict(status.watch)}
+        self.note("service", f"ended: {status.state}", run, status.rig, exit_code=status.exit_code, **watched)
 
     def _died(self, run: str, status: Status) -> Status:
         """The run's process is gone. First the shaft, then the rest."""
         request = self.store.request(run)
         self._say(f"run {run}: its process is gone; stopping the drive")
-        code, said = self._stop_drive(request)
+        code, said = _stop_drive(Path(request.rig_file), simulated=request.simulated)
         seen = code == ExitCode.OK
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
         what = f"the process of the run was lost while it was {status.state}; {said}"
@@ -316,12 +320,6 @@ class Supervisor:
         self._say(f"run {run}: {what}")
         self._in_background(lambda: self._recover(run))
         return status
-
-    def _stop_drive(self, request: Request) -> tuple[int, str]:
-        """`tdhil stop` on the rig's drive, in a process of its own; a simulated drive has ended with its process."""
-        if request.simulated:
-            return int(ExitCode.OK), "the simulated drive ended with it"
-        return _tdhil_stop(Path(request.rig_file))
 
     def _recover(self, run: str) -> None:
         """What the log of a lost run still holds, as a clean copy and as a result."""
@@ -393,8 +391,10 @@ class Supervisor:
         return False
 
 
-def _tdhil_stop(rig_file: Path) -> tuple[int, str]:
-    """In a process of its own, since the web opens no bus."""
+def _stop_drive(rig_file: Path, *, simulated: bool) -> tuple[int, str]:
+    """`tdhil stop` on a rig's drive, in a process of its own (the web opens no bus): exit code, and what was seen."""
+    if simulated:
+        return int(ExitCode.OK), "nothing turns: the drive is simulated, and ended with its run"
     command = [sys.executable, "-m", "tdhil", "stop", "--rig", str(rig_file), "--json"]
     try:
         done = subprocess.run(command, capture_output=True, timeout=STOP_S, check=False,

@@ -44,6 +44,7 @@ from tdhil.service.answers import (
     CompareView,
     ErrorView,
     HealthView,
+    LeaseView,
     PlanView,
     ReplayView,
     RigView,
@@ -55,7 +56,8 @@ from tdhil.service.answers import (
     document,
     plain,
 )
-from tdhil.service.asking import RigFile, options_of
+from tdhil.service.asking import RigFile, options_of, require_unwatched
+from tdhil.service.attending import LEASE_S
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.states import Conflict, NotAllowed, NotThere, State, Told, now
@@ -184,6 +186,7 @@ class Web:
         self.supervisor, self.store = supervisor, supervisor.store
         self.feeds = Feeds()
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
+        self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
         self._works = anyio.CapacityLimiter(1)         # arithmetic, one piece at a time
         self._waiting: dict[tuple[str, str], ReplayView] = {}
         self._made = threading.Lock()
@@ -313,8 +316,10 @@ class Web:
         key = request.headers.get("idempotency-key")
         if key is not None and not 1 <= len(key) <= 200:
             raise UsageError("must have 1 to 200 characters", where="Idempotency-Key")
-        rig, who = request.path_params["rig"], principal(request).name
-        asked = await self._off(lambda: self.supervisor.start_run(rig, body, who, key))
+        rig, who = request.path_params["rig"], principal(request)
+        if who == Principal():
+            await self._off(lambda: require_unwatched(self.supervisor.rigs.get(rig)))
+        asked = await self._off(lambda: self.supervisor.start_run(rig, body, who.name, key))
         if asked.new:
             self._asked.inc()
         return 201 if asked.new else 200, await self._off(lambda: self.run_view(asked.request.id))
@@ -350,8 +355,16 @@ class Web:
     async def _confirm(self, request: Request, body: Any) -> RunView:
         run, who = request.path_params["run"], principal(request).name
         code = body.code.replace(" ", "")
-        await self._off(lambda: self.supervisor.confirm(run, code, body.binding, who))
+        _require_key(body.lease, "lease")
+        await self._off(lambda: self.supervisor.confirm(run, code, body.binding, who, body.lease))
         return await self._off(lambda: self.run_view(run))
+
+    async def _renew(self, request: Request, body: Any) -> LeaseView:
+        run, who = request.path_params["run"], principal(request).name
+        _require_key(body.key, "key")
+        _require_key(body.new_key, "new_key")
+        renew = partial(self.supervisor.renew, run, body.key, who, new_key=body.new_key, gone=body.gone)
+        return LeaseView(run, await anyio.to_thread.run_sync(renew, limiter=self._leases), LEASE_S)
 
     async def _stop(self, request: Request, body: Any) -> RunView:
         run, who = request.path_params["run"], principal(request).name
@@ -531,8 +544,9 @@ class Web:
             request.id, request.rig, rig_name, status.state, status.stage, status.at,
             request.asked, request.asked_by, request.simulated if status.simulated is None else status.simulated,
             dict(request.options), list(status.history), dict(status.expected_s), list(status.preflight),
-            status.identity, status.safe_action, status.confirmation, status.stop, status.error, status.exit_code,
-            status.verdict, self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
+            status.identity, status.safe_action, status.confirmation, request.motion, status.watch, status.stop,
+            status.error, status.exit_code, status.verdict,
+            self.store.result(run), found, self.replays(run), read_json(folder / "signed_off.json"),
             lives(folder),
         )
 
@@ -684,6 +698,11 @@ async def _body(request: Request, route: Route) -> Any:
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(first["msg"], where=".".join(map(str, first["loc"])) or "body") from None
+
+
+def _require_key(key: str | None, where: str) -> None:
+    if key is not None and not 16 <= len(key) <= 200:
+        raise UsageError("must have 16 to 200 characters", where=where, next_step="Take a random one")
 
 
 def _no_number(name: str) -> Any:

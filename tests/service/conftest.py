@@ -63,6 +63,7 @@ def rigs(tmp_path: Path) -> Path:
     (folder / "real.yaml").write_text(real + "service: {motion: attended}\n")
     (folder / "never.yaml").write_text(real)
     (folder / "watched.yaml").write_text(real + "service: {motion: watched}\n")
+    (folder / "rehearsed.yaml").write_text("run: {simulate: true}\nservice: {motion: watched}\n")
     (folder / "broken.yaml").write_text("speed: <script>alert(1)</script>\n")
     return folder
 

@@ -1,6 +1,7 @@
 """A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
 
-``done`` | ``hold`` (moves until it is stopped) | ``ask`` (wants the code first) | ``die`` (killed while it moves)
+``done`` | ``hold`` (moves until it is stopped) | ``ask`` (wants the code first; where its rig is watched, it then moves
+until it is stopped, or watched no more) | ``frozen`` (hears no stop) | ``die`` (killed while it moves)
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ import os
 import signal
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
-from tdhil.service.attending import Board, Confirming
+from drivers import PreflightRefused
+from tdhil.service import attending
+from tdhil.service.attending import Board, Confirming, Lease
 from tdhil.service.states import Confirmation, State, Stop, now, way_to
 from tdhil.service.store import Store, write_json
 from tdhil.service.wire import STOP_FILE, Listener
@@ -28,21 +31,33 @@ def main(folder: Path) -> None:
     what = str(request.options.get("note", "done"))
     board = Board(store, replace(store.status(request.id), pid=os.getpid(), simulated=request.simulated))
     stop = SimpleNamespace(asked=False)
-    confirming = Confirming("b" * 64, lambda: None)
+    watched = request.motion == "watched"
+    confirming = Confirming("b" * 64, lambda: None, watched=watched)
+    leases: list[Lease] = []
+    attending.LEASE_S, attending.SILENT_S = 2.5, 1.5   # nobody has the time
     confirming.code = "123456"
 
     def answer(asked):
-        if asked.get("do") == "stop":
+        if asked.get("do") == "stop" and what == "frozen":
+            time.sleep(3600.0)
+        elif asked.get("do") == "stop":
             stop.asked = True
             at = now()
             board.know(stop=Stop(asked=at, by=asked["by"], seen=at))
         elif asked.get("do") == "confirm":
-            confirming.take(asked["code"], asked["binding"], asked["by"])
+            confirming.take(asked["code"], asked["binding"], asked["by"], asked.get("lease") or "")
+        elif asked.get("do") == "lease":
+            if not leases:
+                raise PreflightRefused("nobody watches this run")
+            found = leases[0].renew(asked["key"], asked["by"], new_key=asked["new_key"] or "",
+                                    gone=asked["gone"] or "")
+            return {"watch": asdict(found)}
         elif asked.get("do") == "code":
             return {"code": confirming.code, "left_s": confirming.left_s}
         return {"status": board.status.plain()}
 
-    signal.signal(signal.SIGTERM, lambda number, frame: setattr(stop, "asked", True))
+    heard = signal.SIG_IGN if what == "frozen" else lambda number, frame: setattr(stop, "asked", True)
+    signal.signal(signal.SIGTERM, heard)
     listener = Listener(folder, answer)
     with listener:
         if (folder / STOP_FILE).exists():
@@ -57,13 +72,19 @@ def main(folder: Path) -> None:
                     end(board, State.REFUSED, 4)
                     return
                 time.sleep(0.01)
+        if watched and not stop.asked:
+            leases.append(Lease(
+                confirming.lease_key, confirming.confirmed_by or "", change=lambda one: board.know(watch=one),
+                lost=lambda one: setattr(stop, "asked", True), needed=lambda: not stop.asked))
+            leases[0].start()
+            what = "hold"
         if not stop.asked:
-            board.to(State.MOVING, "setup")
+            board.to(State.MOVING, "setup", confirmation=None)
             (folder / "run.mcap").write_bytes(b"0123456789" * 10)
         if what == "die":
             time.sleep(0.3)
             os.kill(os.getpid(), signal.SIGKILL)
-        while what in ("hold", "deaf") and not stop.asked:
+        while what in ("hold", "deaf", "frozen") and not stop.asked:
             time.sleep(0.01)
         if stop.asked:
             end(board, State.STOPPED, 143)

@@ -100,7 +100,8 @@ def test_what_others_build_on_is_there_and_described(call, client, route):
 def test_rigs_say_what_they_are(call):
     found = {one["id"]: one for one in call("GET", "/rigs", 200)}
     assert {name: one["state"] for name, one in found.items()} == {
-        "a": "free", "b": "free", "real": "free", "never": "free", "watched": "free", "broken": "unusable"}
+        "a": "free", "b": "free", "real": "free", "never": "free", "watched": "free", "rehearsed": "free",
+        "broken": "unusable"}
     assert [found[name]["simulated"] for name in ("a", "real")] == [True, False]
     assert found["a"]["limits"]["torque_nm"] == 400.0
     assert "broken.yaml:1" in found["broken"]["problem"]
@@ -238,7 +239,7 @@ def test_the_pdf_is_made_when_it_is_first_asked_for(call, service, monkeypatch):
 
 def test_health_and_metrics(client, call, service):
     assert call("GET", "/healthz", 200)["status"] == "ok"
-    assert client.get("/healthz").json()["rigs"] == 6
+    assert client.get("/healthz").json()["rigs"] == 7
     run = call.start(what="hold")
     service.wait(run["id"], "moving")
     assert "tdhil_runs_live 1.0" in client.get("/metrics").text
@@ -347,6 +348,30 @@ def test_another_plan_or_three_wrong_codes_void_it(call, service, sent):
     call("POST", f"/runs/{run}/confirm", 409, json={"code": "123456", "binding": "b" * 64})
 
 
+def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(call, service):
+    assert "logged in" in call.start("watched", expect=403)["error"]["what"]       # a real one, and nobody has
+    run = call.start("rehearsed", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    key, later = "k" * 16, "n" * 16
+    code = {"code": "123456", "binding": "b" * 64}
+    call("POST", f"/runs/{run}/lease", 409, json={"key": key})
+    assert "only while the page" in call("POST", f"/runs/{run}/confirm", 409, json=code)["error"]["what"]
+    call("POST", f"/runs/{run}/confirm", 422, json={**code, "lease": "short"})
+    call("POST", f"/runs/{run}/confirm", 200, json={**code, "lease": key})
+    service.wait(run, "moving")
+    assert call("GET", f"/runs/{run}", 200)["motion"] == "watched"
+    found = call("POST", f"/runs/{run}/lease", 200, json={"key": key, "new_key": later})
+    assert (found["watch"]["by"], found["lease_s"]) == ("local", 5.0)
+    assert "another page" in call("POST", f"/runs/{run}/lease", 409, json={"key": key})["error"]["what"]
+    assert call("POST", f"/runs/{run}/lease", 200, json={"key": later, "gone": "hidden"})["watch"]["how"] == "hidden"
+    call("POST", f"/runs/{run}/lease", 422, json={"key": later, "gone": "bored"})
+    service.wait(run, "stopped")                       # nobody renewed it
+    watch = call("GET", f"/runs/{run}", 200)["watch"]
+    assert watch["how"] == "hidden"
+    assert watch["lost"] is not None
+    call("POST", f"/runs/{run}/lease", 503, json={"key": later})
+
+
 def test_a_code_of_one_run_is_no_code_of_another(call, service):
     run = call.start(what="hold")["id"]
     service.wait(run, "moving")
@@ -356,12 +381,10 @@ def test_a_code_of_one_run_is_no_code_of_another(call, service):
 # -- what may not be
 
 
-@pytest.mark.parametrize(("rig", "words"), [
-    ("never", "never moved from afar"), ("watched", "isn't there yet")])
-def test_a_rig_that_may_not_move_from_here(call, rig, words):
-    refused = call.start(rig, expect=403)["error"]
-    assert words in refused["what"]
-    assert f"{rig}.yaml" in refused["where"]
+def test_a_rig_that_may_not_move_from_here(call):
+    refused = call.start("never", expect=403)["error"]
+    assert "never moved from afar" in refused["what"]
+    assert "never.yaml" in refused["where"]
 
 
 @pytest.mark.parametrize(("options", "status", "words"), [

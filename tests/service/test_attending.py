@@ -8,9 +8,20 @@ from types import SimpleNamespace
 import pytest
 
 from drivers import Check, Command, Identity, Mode, Outcome, PowerState, PreflightRefused, Sample
+from tdhil.errors import Interrupted
 from tdhil.recording import Stage
-from tdhil.run import ExcitationRequest, MachineLimits, Task
-from tdhil.service.attending import CODE_S, TRIES, Board, Confirming, ServiceAttendant, Watcher
+from tdhil.run import ExcitationRequest, MachineLimits, StopRequest, Task
+from tdhil.service.attending import (
+    CODE_S,
+    LEASE_S,
+    SILENT_S,
+    TRIES,
+    Board,
+    Confirming,
+    Lease,
+    ServiceAttendant,
+    Watcher,
+)
 from tdhil.service.states import State, Status, now
 from tdhil.service.store import Store
 from tests.service.conftest import wait_for
@@ -91,8 +102,8 @@ def test_so_it_is_for_another_plan_a_changed_file_and_after_three_tries():
         assert confirming.confirmed_by is None
 
 
-def attendant(board: Board, tmp_path, confirming: Confirming) -> ServiceAttendant:
-    return ServiceAttendant(board, Watcher(board), tmp_path, lambda found: confirming)
+def attendant(board: Board, tmp_path, confirming: Confirming, **more) -> ServiceAttendant:
+    return ServiceAttendant(board, Watcher(board), tmp_path, lambda found: confirming, **more)
 
 
 def test_a_real_shaft_waits_for_the_code_and_is_fed_meanwhile(board, tmp_path):
@@ -149,7 +160,134 @@ def test_a_speed_that_somebody_would_have_to_see_is_refused(board, tmp_path):
         there.confirm_speed(1.0, "no angle", pytest.fail)
 
 
+# -- the lease of a watched run
+
+
+KEY = "k" * 16
+
+
+class Watched:
+    """A lease on a clock that is set, and what it told."""
+
+    def __init__(self) -> None:
+        self.clock, self.told, self.lost, self.needed = Clock(), [], [], True
+        self.lease = Lease(KEY, "who", change=self.told.append, lost=self.lost.append, needed=lambda: self.needed,
+                           clock=self.clock)
+
+    def at(self, now_s: float) -> Lease:
+        self.clock.now_s = now_s
+        return self.lease
+
+
+def test_a_lease_holds_as_long_as_it_is_renewed_and_is_lost_for_good_5_s_after():
+    watched = Watched()
+    for second in range(1, 8):
+        watched.at(second).renew(KEY, "who")
+        watched.at(second + 0.9).look()
+    watched.at(7 + LEASE_S - 0.01).look()
+    assert watched.lost == []
+    watched.at(7 + LEASE_S).look()
+    (lost,) = watched.lost
+    assert (lost.by, lost.how) == ("who", "silent")
+    assert lost.since <= lost.gone <= lost.lost
+    for key in (KEY, "x" * 16):
+        with pytest.raises(PreflightRefused, match="nothing brings it back"):
+            watched.lease.renew(key, "who")
+    watched.at(100.0).look()
+    assert len(watched.lost) == 1
+
+
+def test_a_renewal_that_comes_too_late_is_none_even_where_nobody_looked_at_the_clock():
+    watched = Watched()
+    with pytest.raises(PreflightRefused, match="nothing brings it back"):
+        watched.at(LEASE_S + 0.01).renew(KEY, "who")
+    assert len(watched.lost) == 1
+
+
+def test_a_page_that_goes_is_named_and_may_come_back_in_time():
+    watched = Watched()
+    watched.at(1.0).renew(KEY, "who", gone="hidden")
+    watched.at(2.5).look()
+    watched.at(3.0).renew(KEY, "who")
+    watched.at(3.0 + SILENT_S).look()
+    watched.at(5.5).renew(KEY, "who", gone="closed")
+    watched.at(5.5).renew(KEY, "who", gone="hidden")   # as closing has it, in either order
+    watched.at(3.0 + LEASE_S).look()                   # what a page says when it goes renews nothing
+    assert [(one.how, one.lost is not None) for one in watched.told] == [
+        (None, False), ("hidden", False), (None, False), ("silent", False), ("closed", False), ("closed", True)]
+
+
+def test_a_page_that_is_loaded_anew_takes_the_lease_with_it():
+    watched = Watched()
+    watched.lease.renew(KEY, "who", new_key="n" * 16)
+    watched.lease.renew(KEY, "who", new_key="n" * 16)  # its answer was lost
+    with pytest.raises(PreflightRefused, match="another page"):
+        watched.lease.renew(KEY, "who")                # the page before, or a copy of it
+    with pytest.raises(PreflightRefused, match="another page"):
+        watched.lease.renew("n" * 16, "somebody else")
+    with pytest.raises(PreflightRefused, match="another page"):
+        watched.lease.renew("ä", "who", gone="closed")
+    watched.lease.renew("n" * 16, "who")
+    assert watched.lost == []
+
+
+def test_where_nothing_moves_any_more_nothing_is_lost():
+    watched = Watched()
+    watched.needed = False
+    watched.at(100.0).look()
+    assert watched.lost == []
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_watched_shaft_waits_for_a_page_that_stays_and_brakes_without(board, tmp_path, simulated):
+    confirming = Confirming("b" * 64, lambda: None, watched=True)
+    lost = []
+    there = attendant(board, tmp_path, confirming, watched=True, unwatched=lost.append)
+    board.to(State.PREFLIGHT)
+
+    def idle() -> None:
+        if board.status.confirmation is not None:
+            with pytest.raises(PreflightRefused, match="only while the page"):
+                confirming.take(confirming.code, None, "who")
+            confirming.take(confirming.code, None, "who", KEY)
+
+    there.confirm(TASK, preflight(simulated=simulated), idle, ())
+    assert board.status.state is State.MOVING
+    assert board.status.watch.by == "who"
+    there.lease._clock = lambda: 1e9                   # its own thread sees it
+    wait_for("the end of the lease", lambda: lost)
+    wait_for("the status", lambda: board.status.watch.lost)
+    there.lease.end()
+
+
+def test_the_log_is_told_of_it_by_the_control_loop_alone(board):
+    watcher, told = Watcher(board), []
+    watcher.log = SimpleNamespace(event=lambda *said: told.append(said))
+    watcher.remark("its page is hidden")
+    assert told == []
+    watcher.cycle(COMMAND, SAMPLE)
+    watcher.cycle(COMMAND, SAMPLE)
+    assert told == [(SAMPLE.time_s, "watch", "its page is hidden")]
+
+
 # -- the board and what it is told
+
+
+def test_a_stop_by_a_signal_is_told_of_too_and_one_by_the_socket_by_who_asked(board):
+    stop = StopRequest()
+    watcher = Watcher(board, stop)
+    stop.ask(15)
+    watcher.cycle(COMMAND, SAMPLE._replace(state=PowerState.QUICK_STOP))
+    assert board.status.stop.by == "a signal"
+    assert board.status.stop.seen is not None
+    other = StopRequest()
+    watcher = Watcher(board, other)
+    board.know(stop=type(board.status.stop)())
+    other.ask(15, "somebody asked")
+    watcher.cycle(COMMAND, SAMPLE)
+    assert board.status.stop.asked is None             # whoever asked notes it himself
+    with pytest.raises(Interrupted, match="interrupted: somebody asked"):
+        other.check()
 
 
 def test_stages_go_by_and_a_stop_has_its_times(board):
@@ -163,7 +301,7 @@ def test_stages_go_by_and_a_stop_has_its_times(board):
     assert (board.status.stage, board.status.expected_s["speed"]) == ("speed", 40.0)
     watcher.cycle(COMMAND, SAMPLE)
     assert board.status.stop.seen is None
-    watcher.look_for_the_stop()
+    watcher.asked_to_stop("who")
     watcher.cycle(COMMAND, SAMPLE)
     assert board.status.stop.seen is None
     watcher.cycle(COMMAND, SAMPLE._replace(state=PowerState.QUICK_STOP))

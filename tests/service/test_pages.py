@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import signal
 import socket
 import threading
 from collections.abc import Iterator
@@ -181,6 +182,94 @@ def test_the_code_is_asked_for_and_a_wrong_one_said(page, served):
     field.fill("123 456")
     field.press("Enter")
     served.service.wait(run, "done")
+
+
+def watched_run(page: Any, served: Served) -> str:
+    """It moves, and this page holds its lease."""
+    run = begin(served, "ask", "rehearsed")
+    page.goto(f"/runs/{run}/live")
+    page.get_by_label("The six digits").fill("123 456")
+    page.get_by_role("button", name="Let it move").click()
+    page.get_by_text("You watch this run").wait_for()
+    return run
+
+
+def lost(served: Served, run: str) -> Any:
+    """How the run's page went, once the run was made to brake for it."""
+    served.service.wait(run, "stopped")
+    watch = served.service.store.status(run).watch
+    assert watch.lost is not None
+    return watch.how
+
+
+HIDE = """hidden => {
+    const get = () => hidden ? "hidden" : "visible";
+    Object.defineProperty(document, "visibilityState", { configurable: true, get });
+    document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+@pytest.mark.parametrize(("way", "how"), [("hidden", "hidden"), ("closed", "closed"), ("offline", "silent")])
+def test_a_watched_run_brakes_once_its_page_is_gone(page, served, way, how):
+    run = watched_run(page, served)
+    if way == "closed":
+        other = page.context.new_page()
+        other.goto(f"/runs/{run}/live")
+        other.get_by_text("watches this run on another page").wait_for()
+        page.close()
+        other.get_by_text("Nobody watched this run: it was braked").wait_for()     # to look is not to hold
+    elif way == "offline":
+        page.context.set_offline(True)
+        page.get_by_text("The run hears nothing of this page").wait_for()
+        page.get_by_text("It brakes once nobody watches it").wait_for()
+    else:
+        page.evaluate(HIDE, True)
+    assert lost(served, run) == how
+
+
+def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_moment(page, served):
+    run = watched_run(page, served)
+    page.reload()
+    page.get_by_text("You watch this run").wait_for()
+    page.evaluate(HIDE, True)
+    page.wait_for_timeout(1000)
+    page.evaluate(HIDE, False)
+    page.wait_for_timeout(3000)            # longer than a lease, as these runs have it
+    status = served.service.store.status(run)
+    assert (status.state, status.watch.gone) == ("moving", None)
+    copy = page.context.new_page()         # a tab that is copied has what the first had kept: the later one holds
+    copy.goto("/")
+    copy.evaluate("kept => sessionStorage.setItem(...kept)", page.evaluate("Object.entries(sessionStorage)[0]"))
+    copy.goto(f"/runs/{run}/live")
+    copy.get_by_text("You watch this run").wait_for()
+    page.get_by_text("watches this run on another page").wait_for()
+    copy.close()
+    assert lost(served, run) == "closed"
+
+
+def test_a_run_that_hears_no_stop_is_not_called_stopped(page, served):
+    """Its process is frozen: SIGTERM reaches it, and does nothing."""
+    run = begin(served, "frozen")
+    page.goto(f"/runs/{run}/live")
+    with page.expect_response("**/stop") as answered:
+        page.get_by_role("button", name="Stop", exact=True).click()
+    assert answered.value.ok
+    page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    page.wait_for_timeout(500)
+    assert page.get_by_text("NOT DELIVERED: use the hard-wired stop").is_visible()
+    os.kill(served.service.store.status(run).pid, signal.SIGKILL)
+    served.service.supervisor.start()
+    served.service.wait(run, "interrupted")
+
+
+def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.reload()
+    page.get_by_text("asked ").wait_for()
+    page.get_by_text("seen by the drive").wait_for()
+    assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
 def test_what_a_rig_is_called_is_text_on_every_page(page, served):

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,8 +20,10 @@ from drivers import CommunicationLost
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, UsageError
 from tdhil.recording import read_run
+from tdhil.service import attend
 from tdhil.service.client import ServiceError
 from tdhil.service.serving import require_loopback
+from tdhil.service.store import Store
 from tests.service.conftest import HANGS_S, wait_for
 
 QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
@@ -113,6 +116,47 @@ def test_its_end_brakes_what_moves(tmp_path):
     stop = status["stop"]
     assert stop["asked"] <= stop["seen"] <= stop["at_rest"]
     assert stop["confirmed"] is True
+
+
+@pytest.mark.heavy
+def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_its_web_is_killed(tmp_path):
+    """The run's own process counts: there is no web any more that could tell it."""
+    rigs, data = tmp_path / "rigs", tmp_path / "data"
+    rigs.mkdir()
+    (rigs / "rig.yaml").write_text("rate_hz: 20\nrun: {simulate: true}\nservice: {motion: watched}\n")
+    with served(data, "--rigs", str(rigs)) as server:
+        with pytest.raises(UsageError, match="no runs of a service"):
+            attend(tmp_path, print)
+        shown: list[str] = []
+        going = threading.Event()
+        threading.Thread(target=attend, args=(data, shown.append, lambda: not going.is_set()), daemon=True).start()
+        run = server.client.start("rig", real_time=True)["id"]
+        (code,) = wait_for("the code", lambda: [one for text in shown for one in re.findall(r"(\d{3} \d{3})\n", text)])
+        wait_for("the same on the other terminal", lambda: code in server.said())
+        assert "somebody watches the page" in shown[-1]
+        key, post = "k" * 16, server.client._object
+        binding = server.client.run(run)["confirmation"]["binding"]
+        post("POST", f"/runs/{run}/confirm", {"code": code.replace(" ", ""), "binding": binding, "lease": key})
+        wait_for("motion", lambda: post("POST", f"/runs/{run}/lease", {"key": key})["watch"]
+                 and server.client.run(run)["stage"] == "speed")
+        post("POST", f"/runs/{run}/lease", {"key": key})
+        server.process.kill()
+        server.process.wait()
+        status = wait_for("its end", lambda: (
+            found if (found := Store(data).status(run)).ended else None))
+        going.set()
+    assert (status.state, status.exit_code) == ("stopped", ExitCode.TERMINATED)
+    assert status.stop.confirmed is True
+    assert status.stop.by == "nobody watched"
+    assert (status.watch.by, status.watch.how) == ("local", "silent")
+    log = read_run(data / "runs" / run / "run.mcap")
+    told = [one.text for one in log.events if one.kind == "watch"]
+    assert told[:2] == ["its page is there", "nothing is heard of its page"]
+    assert status.error.what == "interrupted: nobody watched the run for 5 s (nothing is heard of its page)"
+    assert [one.text for one in log.events if one.kind == "interrupted"] == [status.error.what]
+    assert abs(log.recording.speed_rad_s[-1]) < 0.1
+    assert max(log.recording.speed_rad_s) > 0.5
+    wait_for("what became of it", lambda: any(f"run {run}: moving" in one for one in shown))
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "rig.example", ""])

@@ -3,6 +3,7 @@
 (() => {
   const API = "/api/v1";
   const SILENT_MS = 2000;      // without an answer for so long a stop counts as not delivered, and values as old
+  const UNDELIVERED = "NOT DELIVERED: use the hard-wired stop";
   const ENDED = ["done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"];
   const STATES = {
     requested: "asked for", preflight: "looking at the drive", awaiting_confirmation: "waits for the code",
@@ -27,12 +28,12 @@
 
   class Refused extends Error {}
 
-  async function call(method, path, body, headers = {}, withinMs = 15000) {
+  async function call(method, path, body, headers = {}, withinMs = 15000, keepalive = false) {
     const abort = new AbortController();
     const timer = setTimeout(() => abort.abort(), withinMs);
     try {
       const answer = await fetch(API + path, {
-        method, signal: abort.signal, headers: body === undefined ? headers : { "Content-Type": "application/json", ...headers },
+        method, keepalive, signal: abort.signal, headers: body === undefined ? headers : { "Content-Type": "application/json", ...headers },
         body: body === undefined ? undefined : JSON.stringify(body),
       });
       const found = await answer.json();
@@ -65,7 +66,7 @@
     setInterval(() => {
       const silent = Date.now() - last > ms + SILENT_MS;
       document.body.classList.toggle("stale", silent);
-      if (silent) away("No answer from tdhil serve: what you see is old. A run that moves goes on, guarded; the hard-wired stop works.");
+      if (silent && !byId("away").textContent.includes(UNDELIVERED)) away("No answer from tdhil serve: what you see is old. A run that moves goes on, guarded, and one that is watched brakes; the hard-wired stop works.");
       else if (byId("away").textContent.startsWith("No answer")) away("");
     }, 500);
   }
@@ -92,10 +93,10 @@
 
   function rigCard(rig) {
     const said = {
-      free: rig.simulated || rig.motion === "attended" ? "free" : `free; not moved from here (service.motion: ${rig.motion})`,
+      free: rig.simulated || rig.motion !== "never" ? "free" : `free; not moved from here (service.motion: ${rig.motion})`,
       busy: "a run has it", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
     }[rig.state];
-    const mayStart = rig.state === "free" && (rig.simulated || rig.motion === "attended");
+    const mayStart = rig.state === "free" && (rig.simulated || rig.motion !== "never");
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
@@ -109,14 +110,15 @@
   }
 
   async function stopRig(rig) {
-    const late = setTimeout(() => away(`Stop of ${rig.name} NOT DELIVERED: use the hard-wired stop`), SILENT_MS);
+    const late = setTimeout(() => away(`Stop of ${rig.name} ${UNDELIVERED}`), SILENT_MS);
     try {
       const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, 10000);
-      clearTimeout(late);
+      if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
     } catch (error) {
+      away(`Stop of ${rig.name} ${UNDELIVERED}`);
+    } finally {
       clearTimeout(late);
-      away(`Stop of ${rig.name} NOT DELIVERED: use the hard-wired stop`);
     }
   }
 
@@ -239,9 +241,9 @@
   }
 
   function livePage() {
-    const run = document.body.dataset.run;
+    const run = document.body.dataset.run, watched = document.body.dataset.motion === "watched";
     const samples = [[], [], []];
-    let status = null, limits = null, message = 0, age = null, timeS = null, dirty = false, asking = null, stopAnswered = null;
+    let status = null, limits = null, message = 0, age = null, timeS = null, dirty = false, asking = null, undelivered = false, unseen = null;
     const speed = plotOf(byId("plot-speed"), "--speed", (one) => [one.speed_min_rad_s, one.speed_max_rad_s]);
     const torque = plotOf(byId("plot-torque"), "--torque", (one) => [-one.torque_nm, one.torque_nm]);
 
@@ -300,6 +302,7 @@
       byId("confirm").hidden = !confirm;
       if (confirm) byId("confirm-text").textContent = status.confirmation.text;
       stopTimes();
+      watching();
     }
 
     function stopTimes() {
@@ -313,31 +316,92 @@
       show(byId("stop-times"), ...steps);
     }
 
+    /** Nobody has acknowledged the stop; or the run has, and its drive doesn't brake. */
+    function stopAlarm() {
+      const stop = (status && status.stop) || {}, over = status && ENDED.includes(status.state);
+      if (stop.asked || over) undelivered = false;
+      const waits = stop.asked && !stop.seen && !stop.at_rest && !over && status.history.some((one) => one.state === "moving");
+      unseen = waits ? unseen || Date.now() : null;
+      const text = undelivered ? UNDELIVERED : unseen && Date.now() - unseen > SILENT_MS ? "NOT SEEN BY THE DRIVE: use the hard-wired stop" : "";
+      byId("undelivered").hidden = !text;
+      if (text && byId("undelivered").textContent !== text) byId("undelivered").textContent = text;
+    }
+
     byId("stop").addEventListener("click", async () => {
       asking = Date.now();
-      stopAnswered = false;
-      byId("undelivered").hidden = true;
       stopTimes();
-      const late = setTimeout(() => { if (!stopAnswered) byId("undelivered").hidden = false; }, SILENT_MS);
+      const late = setTimeout(() => { undelivered = true; stopAlarm(); }, SILENT_MS);
       try {
         const found = await call("POST", `/runs/${run}/stop`, {}, {}, 10000);
-        stopAnswered = true;
-        byId("undelivered").hidden = true;
-        if (status) { status = { ...status, stop: found.stop, state: found.state, stage: found.stage }; state(); }
+        if (found.stop.asked || found.state === "requested" || ENDED.includes(found.state)) {
+          clearTimeout(late);
+          undelivered = false;
+        }
+        if (status) { status = { ...status, stop: found.stop, state: found.state, stage: found.stage, history: found.history }; state(); }
       } catch (error) {
-        byId("undelivered").hidden = false;
+        undelivered = true;
       } finally {
-        clearTimeout(late);
         asking = null;
+        stopAlarm();
       }
     });
+
+    // -- the lease of a watched run: held by the page that confirmed it, as long as it is seen
+
+    const heldAs = `tdhil-lease-${run}`;
+    let key = null, newKey = null, renewing = false, mine = false, heard = 0;
+    try { key = sessionStorage.getItem(heldAs); } catch (error) { /* then a page that is loaded anew has lost it */ }
+    mine = key !== null;
+    if (key) newKey = crypto.randomUUID();       // of two pages with one key, the later one has it
+    function hold(found) {
+      key = found;
+      mine = true;
+      try { sessionStorage.setItem(heldAs, key); } catch (error) { /* as above */ }
+    }
+
+    async function renew(gone) {
+      if (!key || !status || !status.watch || status.watch.lost || ENDED.includes(status.state)) return;
+      if (!gone && (renewing || document.visibilityState !== "visible")) return;
+      renewing = true;
+      try {
+        await call("POST", `/runs/${run}/lease`, gone ? { key, gone } : { key, new_key: newKey }, {}, 1500, Boolean(gone));
+        if (gone) return;
+        if (newKey) { hold(newKey); newKey = null; }
+        heard = Date.now();
+        mine = true;
+      } catch (error) {
+        if (error instanceof Refused) mine = false;
+      } finally {
+        renewing = false;
+      }
+      watching();
+    }
+
+    function watching() {
+      const watch = status && status.watch, where = byId("watch");
+      const over = !watch || (!watch.lost && !["awaiting_confirmation", "moving"].includes(status.state));
+      where.hidden = Boolean(over);
+      if (over) return;
+      const unheard = mine && Date.now() - heard > SILENT_MS;
+      where.className = watch.lost || watch.gone || unheard ? "alarm" : "";
+      const text = watch.lost ? `Nobody watched this run: it was braked at ${clock(watch.lost)}.`
+        : unheard ? "The run hears nothing of this page: it brakes 5 s after the last word."
+        : mine ? "You watch this run: once this page is hidden or closed for 5 s, the shaft brakes."
+        : `${watch.by} watches this run on another page${watch.gone ? `, which is ${watch.how} since ${clock(watch.gone)}` : ""}: it brakes 5 s after that is gone.`;
+      if (where.textContent !== text) where.textContent = text;
+    }
+
+    setInterval(() => renew(""), 1000);
+    document.addEventListener("visibilitychange", () => renew(document.visibilityState === "visible" ? "" : "hidden"));
+    addEventListener("pagehide", () => renew("closed"));
 
     byId("confirm-form").addEventListener("submit", async (event) => {
       event.preventDefault();
       const field = event.target.elements.code, said = byId("confirm-said");
       said.hidden = true;
       try {
-        await call("POST", `/runs/${run}/confirm`, { code: field.value.replace(/\s/g, ""), binding: status.confirmation.binding });
+        if (watched && !key) hold(crypto.randomUUID());
+        await call("POST", `/runs/${run}/confirm`, { code: field.value.replace(/\s/g, ""), binding: status.confirmation.binding, lease: watched ? key : null });
       } catch (error) {
         said.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
         said.hidden = false;
@@ -358,9 +422,11 @@
       const real = age === null ? null : age + (now - message) / 1000;
       const old = silent || (running && ["moving", "stopping"].includes(status.state) && real !== null && real > SILENT_MS / 1000);
       document.body.classList.toggle("stale", Boolean(old && (running || silent)));
-      if (silent && message) away("No connection to tdhil serve: what you see is old. The run goes on, guarded; the hard-wired stop works.");
+      if (silent && message) away(`No connection to tdhil serve: what you see is old. ${watched ? "It brakes once nobody watches it" : "The run goes on, guarded"}; the hard-wired stop works.`);
       else if (!silent) away("");
       byId("age").textContent = real === null ? "–" : running || silent ? (real < 10 ? `${real.toFixed(1)} s` : span(real)) : "ended";
+      stopAlarm();
+      watching();
       const left = leftS();
       byId("left").textContent = left === null ? "" : `· about ${span(left)} left`;
       if (status && status.confirmation && !byId("confirm").hidden) {

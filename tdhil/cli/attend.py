@@ -1,0 +1,26 @@
+"""`tdhil attend`: the code that lets a shaft move, on the terminal of whoever stands there."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of attend."""
+    parser.add_argument("--data", type=Path, metavar="DIR", default=Path("tdhil-data"),
+                        help="the folder of tdhil serve (default: tdhil-data)")
+    parser.set_defaults(run=run)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Until Ctrl-C, which ends no run."""
+    from tdhil.service import attend
+
+    def say(text: str) -> None:
+        print(text, flush=True)  # noqa: T201
+
+    with suppress(KeyboardInterrupt):
+        attend(namespace.data, say)
+    return 0

@@ -1,0 +1,85 @@
+"""The rig's own console: shows whoever stands there the code of a run that waits for it.
+
+The code comes by the run's socket, which belongs to one user of this computer; over HTTP there is no way to it.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from drivers import CommunicationLost
+from profiles import visible
+from tdhil.errors import UsageError
+from tdhil.service.states import State, Status
+from tdhil.service.store import Store
+from tdhil.service.wire import SOCKET, Refused, ask, lives
+
+EVERY_S: Final = 0.25
+NEWEST: Final = 50
+"""So many runs back one may wait: a rig has one at a time."""
+
+
+class Console:
+    """Shows each code once. ``say`` takes a text."""
+
+    def __init__(self, store: Store, say: Callable[[str], None]) -> None:
+        self._store, self._say = store, say
+        self._shown: dict[str, str] = {}
+
+    def show(self, run: str, status: Status) -> None:
+        """The code of a run that waits for it, if it is another one than was shown last."""
+        with suppress(Refused, CommunicationLost):
+            found = ask(self._store.place(run), {"do": "code"})
+            code = found.get("code")
+            if code and self._shown.get(run) != code:
+                self._shown[run] = code
+                text = status.confirmation.text if status.confirmation is not None else ""
+                self._say(f"{text}\nTo let it move, type this code into the page within {found['left_s']:.0f} s"
+                          f" (run {run}):   {code[:3]} {code[3:]}\n")
+
+    def forget(self, run: str) -> bool:
+        """Was its code shown?"""
+        return self._shown.pop(run, None) is not None
+
+    def look(self) -> None:
+        """Show what waits now, and say what became of what waited."""
+        for run in islice(self._store.ids(), NEWEST):
+            with suppress(Exception):          # being made, or gone
+                self._look_at(run)
+
+    def _look_at(self, run: str) -> None:
+        folder = self._store.place(run)
+        if run not in self._shown and not lives(folder):
+            return
+        status = self._store.status(run)
+        if status.state is State.AWAITING and lives(folder):
+            if run not in self._shown and not os.access(folder / SOCKET, os.W_OK):
+                self._shown[run] = ""
+                self._say(f"run {run} waits for its code, which only the user of tdhil serve may see")
+            elif run not in self._shown:
+                self.show(run, status)
+        elif self.forget(run):
+            why = "" if status.error is None else f": {status.error.message}"
+            self._say(visible(f"run {run}: {status.state}{why}"))
+
+
+def attend(data: Path, say: Callable[[str], None], going: Callable[[], bool] = lambda: True) -> None:
+    """Show the codes of the service that has this folder, in another terminal than its own.
+
+    Raises UsageError where the folder is none of a service, or can't be read.
+    """
+    store = Store(data.resolve())
+    if not store.runs.is_dir() or not os.access(store.runs, os.R_OK | os.X_OK):
+        raise UsageError("there are no runs of a service here that this user may read", where=f"--data {data}",
+                         next_step="Name the folder of tdhil serve, and be its user (sudo -u USER tdhil attend)")
+    say(f"The codes of {store.folder} are shown here. Ctrl-C ends this, and no run.")
+    console = Console(store, say)
+    while going():
+        console.look()
+        time.sleep(EVERY_S)
