@@ -587,8 +587,8 @@ class Web:
                     await socket.send_text(json.dumps(message, allow_nan=False))
                 await socket.close(1013, "too slow: come again")
                 both.cancel_scope.cancel()
-        except (WebSocketDisconnect, RuntimeError):
-            pass
+        except* (WebSocketDisconnect, RuntimeError):
+            pass                           # it has gone in mid-word
         finally:
             feed.leave(queue)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
 
 from tdhil.recording import LogNews
 from tdhil.service.answers import API
@@ -81,3 +83,27 @@ def test_a_viewer_gets_all_of_it_from_the_start(service):
     assert events == ["half of it"]
     assert seen[0] == 0.0
     assert len(seen) >= 40
+
+
+class Gone:
+    """A WebSocket whose other end goes while it is written to."""
+
+    def __init__(self, **names: str) -> None:
+        self.path_params, self.scope = names, {"subprotocols": ["foxglove.sdk.v1"]}
+
+    async def accept(self, protocol: str | None = None) -> None: ...
+
+    async def receive(self) -> None:
+        await asyncio.sleep(3600.0)
+
+    async def send_text(self, text: str) -> None:
+        raise WebSocketDisconnect(1006)
+
+    send_bytes = send_text
+
+
+@pytest.mark.parametrize("road", ["watch", "foxglove"])
+def test_a_viewer_that_goes_in_mid_word_is_no_mistake_of_ours(service, road):
+    run = service.supervisor.start_run("a", {}, "test").request.id
+    asyncio.run(getattr(service.web, f"_{road}")(Gone(run=run, rig="a")))
+    assert service.web.feeds.viewers == 0
