@@ -1,10 +1,12 @@
-"""`tdhil serve`: rigs, runs and live pages in a browser, on this computer."""
+"""`tdhil serve`: rigs, runs and live pages in a browser; and who may do what there."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from pathlib import Path
+
+DATA = Path("tdhil-data")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -13,10 +15,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("--rigs", type=Path, metavar="DIR",
                         help="a rig.yaml for each rig (default: two that are simulated)")
-    parser.add_argument("--data", type=Path, metavar="DIR", default=Path("tdhil-data"),
-                        help="where runs, audit and index go (default: tdhil-data)")
+    parser.add_argument("--data", type=Path, metavar="DIR", default=DATA,
+                        help=f"where runs, accounts, audit and index go (default: {DATA})")
     parser.add_argument("--host", default=HOST, metavar="ADDRESS",
-                        help=f"where to listen (default {HOST}; this computer only)")
+                        help=f"where to listen (default {HOST}: this computer only; others need users and TLS)")
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default {PORT}; 0: any that is free")
     parser.add_argument("--viewer", action="append", metavar="ORIGIN", default=[],
                         help="where Foxglove or Lichtblick come from in a browser, such as http://localhost:8080:"
@@ -27,17 +29,50 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check-idle", action="store_true",
                         help="serve nothing: exit 0 where no run of --data lives and no tdhil here holds a drive,"
                         " else 4 (before an upgrade)")
+    parser.add_argument("--tls-cert", type=Path, metavar="PEM", help="the certificate, with its chain")
+    parser.add_argument("--tls-key", type=Path, metavar="PEM", help="its key, without a password")
+    parser.add_argument("--allowed-host", action="append", default=[], metavar="NAME",
+                        help="another name that browsers know this host by; again for more")
     parser.set_defaults(run=run)
+    kinds = parser.add_subparsers(dest="kind", metavar="users|tokens")
+    _add_accounts(kinds, "users", "people, who log in with a password", passwd=True)
+    _add_accounts(kinds, "tokens", "machines, which send a token", passwd=False)
+
+
+def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], kind: str, what: str, *, passwd: bool,
+                  ) -> None:
+    from tdhil.service import ROLES
+
+    parser = kinds.add_parser(kind, help=what, description=what[0].upper() + what[1:] + ".", allow_abbrev=False)
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    added = actions.add_parser("add", allow_abbrev=False,
+                               help="add one; a password is asked for, or read from stdin" if passwd
+                               else "make one; it is shown this once")
+    listed = actions.add_parser("list", allow_abbrev=False, help="who there is")
+    removed = actions.add_parser("remove", allow_abbrev=False, help="take one out; what is open ends within a second")
+    changed = [actions.add_parser("passwd", allow_abbrev=False, help="another password; ends what is open")
+               ] if passwd else []
+    for one in (added, removed, *changed):
+        one.add_argument("name", metavar="NAME")
+    added.add_argument("--role", choices=ROLES, required=True,
+                       help="viewer: look, download, stop; operator: runs, replays; engineer: what nobody verified,"
+                            " signatures; admin: accounts, audit")
+    for one in (added, listed, removed, *changed):
+        one.add_argument("--data", type=Path, metavar="DIR", default=argparse.SUPPRESS,
+                         help=f"the service's folder (default: {DATA})")
+        one.set_defaults(run=run_accounts)
 
 
 def run(namespace: argparse.Namespace) -> int:
     """Until Ctrl-C or SIGTERM, which brake what moves."""
-    from tdhil.service import check_idle, serve
+    from tdhil.errors import UsageError
+    from tdhil.service import Tls, check_idle, serve
 
     if not 0 <= namespace.port <= 65535:
-        from tdhil.errors import UsageError
-
         raise UsageError("must be 0 to 65535", where=f"--port {namespace.port}")
+    cert, key = namespace.tls_cert, namespace.tls_key
+    if (cert is None) != (key is None):
+        raise UsageError("needs the other one, too", where="--tls-cert" if key is None else "--tls-key")
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)  # noqa: T201
@@ -46,4 +81,48 @@ def run(namespace: argparse.Namespace) -> int:
         return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
-                 mqtt=namespace.mqtt)
+                 mqtt=namespace.mqtt, tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host)
+
+
+def run_accounts(namespace: argparse.Namespace) -> int:
+    """Add, list, remove, or set a password; a service that runs sees it within a second."""
+    from tdhil.service import AccountsFile
+
+    namespace.data.mkdir(parents=True, exist_ok=True, mode=0o750)
+    accounts = AccountsFile(namespace.data.resolve())
+    users = namespace.kind == "users"
+    first = not accounts.read()
+    if namespace.action == "list":
+        for one in (accounts.known.users if users else accounts.known.tokens).values():
+            print(f"{one.name:<33}{one.role:<10}{one.since}")  # noqa: T201
+        return 0
+    if namespace.action == "add" and users:
+        accounts.add_user(namespace.name, namespace.role, _password())
+    elif namespace.action == "add":
+        token = accounts.add_token(namespace.name, namespace.role)
+        print("It is shown this once; send it as: Authorization: Bearer …", file=sys.stderr)  # noqa: T201
+        print(token)  # noqa: T201
+    elif namespace.action == "passwd":
+        accounts.set_password(namespace.name, _password())
+    elif users:
+        accounts.remove_user(namespace.name)
+    else:
+        accounts.remove_token(namespace.name)
+    if first:
+        print("From now on tdhil serve asks for a login on this folder, and needs --tls-cert and --tls-key.",  # noqa: T201
+              file=sys.stderr)
+    return 0
+
+
+def _password() -> str:
+    """Typed in twice; or a line of stdin, where that is no terminal. Raises UsageError."""
+    import getpass
+
+    from tdhil.errors import UsageError
+
+    if sys.stdin is None or not sys.stdin.isatty():
+        return "" if sys.stdin is None else sys.stdin.readline().rstrip("\r\n")
+    given = getpass.getpass("Password: ")
+    if getpass.getpass("The same again: ") != given:
+        raise UsageError("the two are not the same", where="password", next_step="Try again")
+    return given

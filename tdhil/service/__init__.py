@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from tdhil.service.accounts import ROLES as ROLES, AccountsFile as AccountsFile
     from tdhil.service.client import Client as Client, ServiceError as ServiceError
     from tdhil.service.console import attend as attend
-    from tdhil.service.serving import HOST as HOST, PORT as PORT, check_idle as check_idle, serve as serve
+    from tdhil.service.serving import (
+        HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, serve as serve,
+    )
     from tdhil.service.states import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
 else:
     __getattr__, __dir__ = lazy_face(__name__)

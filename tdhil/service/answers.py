@@ -1,7 +1,7 @@
 """What the service answers, as types, and the document that describes them all (OpenAPI 3.1).
 
-One table of routes: the web serves what stands in it, and the document is made from it. `role` says who may: with users
-of its own the web will look at it; on loopback without any, everybody has every role.
+One table of routes: the web serves what stands in it, and the document is made from it. `role` says who may; on
+loopback without accounts, everybody has every role.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
 
+from tdhil.service.accounts import Role
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.store import Broken, Entry, Summary
@@ -149,6 +150,42 @@ class HealthView:
 
 
 @dataclass(frozen=True)
+class MeView:
+    """Who asks, as the service sees him. ``ends``: when a login does."""
+
+    name: str
+    roles: list[Role]
+    login: bool
+    ends: str | None = None
+
+
+@dataclass(frozen=True)
+class AccountView:
+    """A person or a machine. ``since``: when the password was set, or the token made."""
+
+    name: str
+    role: Role
+    since: str
+
+
+@dataclass(frozen=True)
+class AccountsView:
+    """All of them."""
+
+    users: list[AccountView]
+    tokens: list[AccountView]
+
+
+@dataclass(frozen=True)
+class TokenView:
+    """A new token. It is shown this once."""
+
+    name: str
+    role: Role
+    token: str
+
+
+@dataclass(frozen=True)
 class ErrorView:
     """What went wrong, as the error tree says it."""
 
@@ -197,24 +234,66 @@ class ReplayBody:
 
 
 @dataclass(frozen=True)
+class LoginBody:
+    """A person's."""
+
+    name: str
+    password: str
+
+
+@dataclass(frozen=True)
+class PasswordBody:
+    """One's own: the old one and the new."""
+
+    old: str
+    new: str
+
+
+@dataclass(frozen=True)
+class UserBody:
+    """Somebody new."""
+
+    name: str
+    role: Role
+    password: str
+
+
+@dataclass(frozen=True)
+class NewPasswordBody:
+    """Somebody else's, by an admin."""
+
+    password: str
+
+
+@dataclass(frozen=True)
+class TokenBody:
+    """A machine's."""
+
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True)
 class Nothing:
     """An empty object will do."""
 
 
-Role = Literal["viewer", "operator", "engineer", "admin"]
 OPTIONS: Final = "Options"
 """The body of a run that is asked for: an object with the command line's options."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """One road into the service. ``answers``: by HTTP status, a type of above, or a media type for a file."""
+    """One road into the service. ``answers``: by HTTP status, a type of above, or a media type for a file.
+
+    ``role``: the least that may; None: anybody, also without a login. Who is known may always stop.
+    """
 
     method: Literal["GET", "POST"]
     path: str
     name: str
     summary: str
-    role: Role
+    role: Role | None
     answers: Mapping[int, Any]
     body: Any = None
     errors: tuple[int, ...] = ()
@@ -259,12 +338,29 @@ ROUTES: Final = (
           {200: "application/json", 206: "application/json"}, errors=(404,)),
     Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
           query={"limit": "at most so many lines (200)"}),
-    Route("GET", "/healthz", "health", "Is it there?", "viewer", {200: HealthView}),
+    Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,
+          (401, 403, 422, 429)),
+    Route("POST", "/logout", "logout", "End the session", None, {200: MeView}, Nothing, (403, 422)),
+    Route("GET", "/me", "me", "Who asks?", None, {200: MeView}),
+    Route("POST", "/password", "password", "One's own password; ends all of one's sessions", "viewer", {200: MeView},
+          PasswordBody, (422, 429)),
+    Route("GET", "/accounts", "accounts", "People and machines", "admin", {200: AccountsView}),
+    Route("POST", "/users", "add_user", "Somebody new", "admin", {201: AccountView}, UserBody, (422,)),
+    Route("POST", "/users/{user}/password", "set_password", "Another password; ends all of his sessions", "admin",
+          {200: AccountView}, NewPasswordBody, (404, 422)),
+    Route("POST", "/users/{user}/remove", "remove_user", "Somebody less", "admin", {200: AccountsView}, Nothing,
+          (404, 422)),
+    Route("POST", "/tokens", "add_token", "A machine's token, which is shown this once", "admin", {201: TokenView},
+          TokenBody, (422,)),
+    Route("POST", "/tokens/{token}/remove", "remove_token", "A token less", "admin", {200: AccountsView}, Nothing,
+          (404, 422)),
+    Route("GET", "/healthz", "health", "Is it there?", None, {200: HealthView}),
     Route("GET", "/metrics", "metrics", "For Prometheus", "viewer", {200: "text/plain"}),
-    Route("GET", "/openapi.json", "openapi", "This document", "viewer", {200: "application/json"}),
+    Route("GET", "/openapi.json", "openapi", "This document", None, {200: "application/json"}),
 )
 
 API: Final = "/api/v1"
+CSRF_HEADER: Final = "X-CSRF-Token"
 
 
 @dataclass(frozen=True)
@@ -302,6 +398,9 @@ def document() -> dict[str, Any]:
     """The OpenAPI document."""
     schemas: dict[str, Any] = {}
 
+    def security(role: Role | None) -> dict[str, Any]:
+        return {"x-role": role or "anybody", "security": [] if role is None else [{"session": []}, {"token": []}]}
+
     def schema(kind: Any, mode: Literal["validation", "serialization"] = "serialization") -> dict[str, Any]:
         if kind == OPTIONS:
             return {"type": "object", "description": "the command line's options, such as "
@@ -320,17 +419,19 @@ def document() -> dict[str, Any]:
         for code, kind in route.answers.items():
             media, inside = (kind, {}) if isinstance(kind, str) else ("application/json", {"schema": schema(kind)})
             responses[str(code)] = {"description": route.summary, "content": {media: inside}}
-        responses |= {str(code): error for code in route.errors}
+        closed = () if route.role is None else (401, 403)
+        responses |= {str(code): error for code in sorted({*route.errors, *closed})}
         parameters = [
             {"name": part[1:-1], "in": "path", "required": True, "schema": {"type": "string"}}
             for part in route.path.split("/") if part.startswith("{")
         ]
-        for where, named in (("query", route.query), ("header", route.headers)):
+        changes = {CSRF_HEADER: "with a session: what its second cookie says"} if route.method != "GET" else {}
+        for where, named in (("query", route.query), ("header", {**route.headers, **changes})):
             parameters += [{"name": name, "in": where, "description": text, "schema": {"type": "string"}}
                            for name, text in named.items()]
         described: dict[str, Any] = {
             "operationId": route.name, "summary": route.summary, "parameters": parameters, "responses": responses,
-            "x-role": route.role,
+            **security(route.role),
         }
         if route.body is not None:
             described["requestBody"] = {"content": {"application/json": {"schema": schema(route.body, "validation")}}}
@@ -338,14 +439,21 @@ def document() -> dict[str, Any]:
     for one in SOCKETS:
         name = one.path.rpartition("{")[2][:-1]
         paths[f"{API}{one.path}"] = {"get": {
-            "operationId": one.name, "summary": one.summary, "x-role": one.role, "x-websocket": list(one.protocols),
-            "parameters": [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}}],
-            "responses": {"101": {"description": "a WebSocket"}, "403": {"description": "refused"}},
+            "operationId": one.name, "summary": one.summary, "x-websocket": list(one.protocols), **security(one.role),
+            "parameters": [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}},
+                           {"name": "token", "in": "query", "schema": {"type": "string"},
+                            "description": "a machine's, where no header can be sent: browsers"}],
+            "responses": {"101": {"description": "a WebSocket; closed with 4401 for nobody, 4403 for a lesser role"},
+                          "403": {"description": "refused"}},
         }}
     return {
         "openapi": "3.1.0",
         "info": {"title": "tdhil", "version": __version__,
                  "description": "Runs that identify a moment of inertia. A stop over HTTP is no emergency stop."},
         "paths": paths,
-        "components": {"schemas": schemas},
+        "components": {"schemas": schemas, "securitySchemes": {
+            "token": {"type": "http", "scheme": "bearer", "description": "a machine's: tdhil serve tokens add"},
+            "session": {"type": "apiKey", "in": "cookie", "name": "__Host-tdhil-8420",
+                        "description": "of POST /login; the number is the port of the address"},
+        }},
     }

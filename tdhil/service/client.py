@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import ssl
 import time
 import urllib.error
 import urllib.request
@@ -12,7 +13,7 @@ from typing import Any, Final
 from urllib.parse import quote, urlencode
 
 from drivers import CommunicationLost
-from tdhil.errors import TdhilError
+from tdhil.errors import TdhilError, UsageError
 
 _API: Final = "/api/v1"
 _ENDED: Final = frozenset({"done", "refused", "stopped", "failed", "stop_not_confirmed", "interrupted"})
@@ -34,17 +35,44 @@ class ServiceError(TdhilError):
         self.holder = body.get("holder")
 
 
+class _NowhereElse(urllib.request.HTTPRedirectHandler):
+    """A token goes to nobody else."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
 class Client:
     """One service. Answers are the documents of its API (``/api/v1/openapi.json`` describes them).
 
-    Raises ServiceError for what it refuses, and CommunicationLost where it can't be reached.
+    ``token``: of `tdhil serve tokens add`; it goes over TLS alone. ``ca``: whose certificates are believed (a PEM
+    file; None: those of the system). Raises ServiceError for what it refuses, CommunicationLost where it can't be
+    reached, and UsageError for a token that would go over an open line.
     """
 
-    def __init__(self, url: str = "http://127.0.0.1:8420", *, timeout_s: float = 120.0) -> None:
+    def __init__(
+        self, url: str = "http://127.0.0.1:8420", *, token: str | None = None, ca: str | Path | None = None,
+        timeout_s: float = 120.0,
+    ) -> None:
         self._url = url.rstrip("/")
         self._timeout_s = timeout_s
+        if token is not None and not self._url.startswith("https://"):
+            raise UsageError("a token goes over TLS alone", where=self._url[:100], next_step="Name it https://…")
+        self._headers = {"Content-Type": "application/json"}
+        if token is not None:
+            self._headers["Authorization"] = f"Bearer {token}"
         # No proxy, and no answer that leads elsewhere: the service is where it is.
-        self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        handlers: list[urllib.request.BaseHandler] = [urllib.request.ProxyHandler({}), _NowhereElse()]
+        if ca is not None:
+            try:
+                handlers.append(urllib.request.HTTPSHandler(context=ssl.create_default_context(cafile=str(ca))))
+            except OSError as error:
+                raise UsageError(f"can't be read as certificates ({error.strerror or error})", where=str(ca)) from error
+        self._opener = urllib.request.build_opener(*handlers)
+
+    def me(self) -> dict[str, Any]:
+        """Who asks, as the service sees it: ``name`` and ``roles``."""
+        return self._object("GET", "/me")
 
     def rigs(self) -> list[dict[str, Any]]:
         """The rigs, each with its ``id``, its state and who has it."""
@@ -147,7 +175,7 @@ class Client:
     ) -> Any:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(
-            f"{self._url}{_API}{path}", data, {"Content-Type": "application/json", **(headers or {})}, method=method
+            f"{self._url}{_API}{path}", data, {**self._headers, **(headers or {})}, method=method
         )
         try:
             return self._opener.open(request, timeout=self._timeout_s)

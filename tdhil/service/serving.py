@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 import signal
 import socket
+import ssl
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,60 +35,119 @@ def require_service() -> None:
                          next_step="Install: pip install 'tdhil[service]'")
 
 
-def require_loopback(host: str) -> None:
-    """Raises UsageError for any other host: there is neither login nor TLS yet."""
-    try:
-        loopback = ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        loopback = host.lower() == "localhost"
-    if not loopback:
+@dataclass(frozen=True)
+class Tls:
+    """A certificate and its key, as PEM files."""
+
+    cert: Path
+    key: Path
+
+    def context(self) -> ssl.SSLContext:
+        """Raises UsageError where they don't serve."""
+        found = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        try:
+            found.load_cert_chain(self.cert, self.key, password=_no_password)
+        except (OSError, ValueError) as error:         # ssl.SSLError is an OSError
+            raise UsageError(
+                f"certificate and key can't be used ({getattr(error, 'strerror', None) or error})",
+                where=f"--tls-cert {self.cert} --tls-key {self.key}",
+                next_step="Both are PEM, belong together, and the key has no password",
+            ) from error
+        return found
+
+
+def _no_password() -> str:
+    raise ValueError("the key has a password")
+
+
+def require_way(host: str, *, tls: bool, accounts: bool) -> None:
+    """Whoever reaches more than this computer, or has users, has TLS and a login. Raises UsageError."""
+    if _loopback(host) and not accounts:
+        return
+    if not tls:
         raise UsageError(
-            "only this computer itself is served: whoever reaches another address could move a shaft, and there is no"
-            " login and no TLS yet", where=f"--host {host}",
-            next_step="Take 127.0.0.1; from elsewhere, tunnel: ssh -L 8420:127.0.0.1:8420 HOST",
+            "there are users, and a password goes over no open line" if accounts else
+            "whoever reaches this address could move a shaft: it takes a login, and TLS", where=f"--host {host}",
+            next_step="Name --tls-cert and --tls-key" if accounts else
+            "Add a user (tdhil serve users add), name --tls-cert and --tls-key; or take 127.0.0.1 and tunnel:"
+            " ssh -L 8420:127.0.0.1:8420 HOST",
         )
+    if not accounts:
+        raise UsageError("whoever reaches this address could move a shaft: it takes a login, and there is no user yet",
+                         where=f"--host {host}", next_step="Add one: tdhil serve users add NAME --role admin")
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _names(host: str, more: Sequence[str]) -> frozenset[str]:
+    """By which names the service may be reached. Raises UsageError."""
+    for name in more:
+        with suppress(ValueError):
+            ipaddress.ip_address(name)
+            continue
+        if not re.fullmatch(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*", name):
+            raise UsageError("must be a host's name or address, without a port", where=f"--allowed-host {name[:60]}")
+    everywhere = host in ("0.0.0.0", "::", "")
+    own = socket.gethostname() if everywhere else host
+    return frozenset(one.lower() for one in ("127.0.0.1", "localhost", "::1", own, *more))
 
 
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
-    mqtt: str | None = None,
+    mqtt: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
     ``mqtt``: the address of a broker that is told states and results.
+    ``names``: more names of this host.
 
-    Raises UsageError for what can't be served, and LogError for a folder that can't be written.
+    Raises UsageError for what can't be served, accounts that can't be read among it, and LogError for a folder that
+    can't be written.
     """
     require_service()
-    require_loopback(host)
+    from tdhil.service.accounts import AccountsFile
+
+    accounts = bool(AccountsFile(data.resolve()).read())
+    require_way(host, tls=tls is not None, accounts=accounts)
+    if tls is not None:
+        tls.context()
+    allowed = _names(host, names)
     if rigs is not None and not rigs.is_dir():
         raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
 
+    from tdhil.service.access import Access
     from tdhil.service.asking import Rigs
     from tdhil.service.mqtt import Broker, Publisher
     from tdhil.service.store import Audit, Index, Store
     from tdhil.service.supervisor import Supervisor
-    from tdhil.service.web import LOOPBACK, Web
+    from tdhil.service.web import Web
 
     broker = None if mqtt is None else Broker.of(mqtt)
     store = Store(data.resolve())
     store.prepare()
     alone = _alone(store.folder)
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
-    web = Web(supervisor, hosts=LOOPBACK | {host.lower()}, viewers=viewers)
+    web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say))
     publisher = None if broker is None else Publisher(broker, web.told, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]
     shown = f"[{host}]" if ":" in host else host
-    say(f"tdhil serve: http://{shown}:{at}   (runs: {store.folder})")
+    say(f"tdhil serve: {'http' if tls is None else 'https'}://{shown}:{at}   (runs: {store.folder})")
+    if not _loopback(host):
+        say(f"It answers to {', '.join(sorted(allowed))}; name others with --allowed-host.")
     if supervisor.rigs.built_in:
         say("No rig file is there: two simulated rigs to play with. Nothing real moves.")
     say("A stop over HTTP is no emergency stop: keep the hard-wired one within reach. Ctrl-C brakes what moves.")
     if publisher is not None:
         publisher.start()
     try:
-        _uvicorn(web.asgi, listening, supervisor.brake, say)
+        _uvicorn(web.asgi, listening, supervisor.brake, say, tls)
     finally:
         if publisher is not None:
             publisher.close()
@@ -113,13 +176,16 @@ def check_idle(data: Path, say: Say) -> int:
     return int(ExitCode.REFUSED if busy else ExitCode.OK)
 
 
-def _uvicorn(app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say) -> None:
+def _uvicorn(
+    app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say, tls: Tls | None = None
+) -> None:
     import uvicorn
 
     config = uvicorn.Config(
         app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_ping_interval=10.0,
         ws_ping_timeout=10.0, timeout_graceful_shutdown=2, lifespan="on", server_header=False, date_header=True,
-        h11_max_incomplete_event_size=32 * 1024,
+        h11_max_incomplete_event_size=32 * 1024, proxy_headers=False,      # who asks is who is connected
+        ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
     server = uvicorn.Server(config)
     former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}

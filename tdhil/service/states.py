@@ -232,7 +232,12 @@ def way_to(status: Status, end: State, at: str, **known: Any) -> Status:
 
 def now() -> str:
     """Wall clock, ISO 8601 in UTC, to the millisecond."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return iso(datetime.now(UTC).timestamp())
+
+
+def iso(time_s: float) -> str:
+    """A time as of `time.time`, the same way."""
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -242,7 +247,9 @@ def now() -> str:
 #
 #     TdhilError
 #     ├── NotThere                    no such rig, run or file                                  exit 2, HTTP 404
-#     ├── NotAllowed                  another host, another origin, not over HTTP               exit 4, HTTP 403
+#     ├── NotAllowed                  another host, another origin, not over HTTP, not his role exit 4, HTTP 403
+#     │   ├── NotLoggedIn             nobody knows who asks                                     exit 4, HTTP 401
+#     │   └── TooManyTries            of passwords; ``wait_s`` says how long                    exit 4, HTTP 429
 #     └── PreflightRefused
 #         └── Conflict                another run has the rig; the code is void                 exit 4, HTTP 409
 
@@ -257,6 +264,19 @@ class NotAllowed(TdhilError):
     """May not be had from there, or not over HTTP at all."""
 
     exit_code = ExitCode.REFUSED
+
+
+class NotLoggedIn(NotAllowed):
+    """Nobody knows who asks."""
+
+
+class TooManyTries(NotAllowed):
+    """Of passwords. ``wait_s``: then again."""
+
+    def __init__(self, wait_s: float) -> None:
+        self.wait_s = wait_s
+        super().__init__("too many tries", where="login", next_step=f"Again in {wait_s:.0f} s."
+                         " Who is logged in already can stop all the same; so does the hard-wired stop")
 
 
 class Conflict(PreflightRefused):

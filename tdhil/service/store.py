@@ -31,11 +31,13 @@ ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 _FILE_LIMIT: Final = 16 * 2**20
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """The file has its old content or the new, also after a loss of power. Raises OSError."""
+def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
+    """It has its old content or the new, also after a loss of power; ``mode``: who may read it. Raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
     try:
         with beside.open("wb") as file:
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)     # while it is empty
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -46,9 +48,9 @@ def write_whole(path: Path, data: bytes) -> None:
     _sync_folder(path.parent)
 
 
-def write_json(path: Path, plain: Mapping[str, Any]) -> None:
+def write_json(path: Path, plain: Mapping[str, Any], mode: int | None = None) -> None:
     """The same, of a JSON object."""
-    write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n")
+    write_whole(path, json.dumps(plain, ensure_ascii=False, indent=1, allow_nan=False).encode() + b"\n", mode)
 
 
 def read_json(path: Path) -> dict[str, Any] | None:

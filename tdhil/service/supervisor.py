@@ -124,7 +124,7 @@ class Supervisor:
         require_motion(rig)
         rig.way(options)               # what the options contradict is said now, not by the run
         with self._asking:
-            if key is not None and (before := self._by_key(rig_id, key)) is not None:
+            if key is not None and (before := self._by_key(rig_id, key, who)) is not None:
                 if dict(before.options) != options:
                     raise Conflict("this key was used for another request", where="Idempotency-Key",
                                    next_step="Take a new key")
@@ -240,11 +240,11 @@ class Supervisor:
 
     # -- looking after them ----------------------------------------------------------------------------------------
 
-    def _by_key(self, rig: str, key: str) -> Request | None:
+    def _by_key(self, rig: str, key: str, who: str) -> Request | None:
         for run in self.store.ids()[:KEYS]:
             with suppress(Exception):
                 request = self.store.request(run)
-                if request.rig == rig and request.idempotency_key == key:
+                if (request.rig, request.idempotency_key, request.asked_by) == (rig, key, who):
                     return request
         return None
 
@@ -346,7 +346,7 @@ class Supervisor:
 
     # -- what is written down of it: nothing that has to do with a shaft waits for it ----------------------------------
 
-    def note(self, who: str, what: str, run: str | None, rig: str, **details: Any) -> None:
+    def note(self, who: str, what: str, run: str | None, rig: str | None, **details: Any) -> None:
         """Into the audit, in time; nothing waits for it."""
         def write() -> None:
             try:

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sqlite3
 import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, urlencode, urlsplit
 
 import anyio
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -25,6 +26,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
 from pydantic import ValidationError
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.authentication import AuthenticationMiddleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, WebSocketRoute
@@ -35,32 +38,59 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.errors import ExitCode, TdhilError, UsageError
+from tdhil.service.access import (
+    NOBODY,
+    SOCKET_LOOK_S,
+    Access,
+    Principal,
+    address_of,
+    require,
+    require_options,
+    set_cookies,
+    token_in,
+)
+from tdhil.service.accounts import ROLES, Role, Token, User
 from tdhil.service.answers import (
     API,
+    CSRF_HEADER,
     OPTIONS,
     ROUTES,
     SOCKETS,
+    AccountsView,
+    AccountView,
     AuditView,
     CompareView,
     ErrorView,
     HealthView,
     LeaseView,
+    MeView,
     PlanView,
     ReplayView,
     RigView,
     Route,
     RunView,
     StoppedView,
+    TokenView,
     TrendView,
     adapter,
     document,
     plain,
 )
-from tdhil.service.asking import RigFile, options_of, require_unwatched
+from tdhil.service.asking import RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.attending import LEASE_S
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
-from tdhil.service.states import Conflict, NotAllowed, NotThere, State, Told, now
+from tdhil.service.states import (
+    Conflict,
+    NotAllowed,
+    NotLoggedIn,
+    NotThere,
+    State,
+    Told,
+    TooManyTries,
+    iso,
+    now,
+)
 from tdhil.service.store import Summary, read_json, write_json
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.wire import Refused, lives
@@ -76,15 +106,9 @@ POLICY: Final = (
 )
 """Of every page: nothing from elsewhere, and no script or style in the page itself."""
 _REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
+_OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
+"""Where a login may lead to."""
 _BROKEN_HINT: Final = "The terminal of tdhil serve says more"
-
-
-@dataclass(frozen=True)
-class Principal:
-    """Who asks. On loopback without users: whoever sits at this computer, with every role."""
-
-    name: str = "local"
-    roles: frozenset[str] = frozenset({"viewer", "operator", "engineer", "admin"})
 
 
 class Guard:
@@ -112,6 +136,8 @@ class Guard:
         if _name_of(host) not in self._hosts:
             return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
                               next_step=f"Open it as {', '.join(sorted(self._hosts))}")
+        if connection.scope["type"] == "websocket" and token_in(connection) is not None:
+            return None                # a token comes with no page by itself; without it nothing else counts
         origin = connection.headers.get("origin")
         if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
             return None
@@ -149,8 +175,8 @@ def status_of(error: BaseException) -> int:
     if isinstance(error, HTTPException):
         return int(error.status_code)
     for kind, status in (
-        (NotThere, 404), (NotAllowed, 403), (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422),
-        (CommunicationLost, 503),
+        (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
+        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (CommunicationLost, 503),
     ):
         if isinstance(error, kind):
             return status
@@ -171,23 +197,30 @@ def told_of(error: BaseException) -> ErrorView:
 
 
 def _error_response(error: BaseException) -> Response:
-    return JSONResponse(plain(told_of(error), ErrorView), status_of(error))
+    headers = {"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {}
+    if isinstance(error, TooManyTries):
+        headers["retry-after"] = f"{error.wait_s:.0f}"
+    return JSONResponse(plain(told_of(error), ErrorView), status_of(error), headers=headers)
 
 
 class Web:
-    """The application around one supervisor. ``hosts``: by which names it may be reached.
+    """The application around one supervisor. ``hosts``: by which names it may be reached; ``access``: who may what.
 
     ``viewers``: origins (``http://localhost:8080``) whose pages may read logs by the Foxglove protocol, and no more.
     """
 
     def __init__(
-        self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK, viewers: frozenset[str] = frozenset()
+        self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK, viewers: frozenset[str] = frozenset(),
+        access: Access | None = None,
     ) -> None:
         self.supervisor, self.store = supervisor, supervisor.store
+        self.access = access or Access(self.store.folder)
+        self.access.changed = lambda what, name: supervisor.note("terminal", what, None, None, name=name)
         self.feeds = Feeds()
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
         self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
         self._works = anyio.CapacityLimiter(1)         # arithmetic, one piece at a time
+        self._logins = anyio.CapacityLimiter(1)        # passwords too: each takes 32 MB
         self._waiting: dict[tuple[str, str], ReplayView] = {}
         self._made = threading.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -207,7 +240,8 @@ class Web:
         )
         self._pages.globals["version"] = __version__
         self.app = Starlette(routes=self._routes(), lifespan=self._lifespan,
-                             exception_handlers={Exception: self._failed, HTTPException: self._failed})
+                             middleware=[Middleware(AuthenticationMiddleware, backend=self.access)],
+                             exception_handlers=dict.fromkeys((TdhilError, HTTPException, Exception), self._failed))
         self.asgi: ASGIApp = Guard(self.app, hosts, viewers)
 
     def _routes(self) -> list[BaseRoute]:
@@ -221,19 +255,23 @@ class Web:
             Way("/runs", self._page("runs.html", "runs")),
             Way("/runs/{run}", self._page("run.html", "runs")),
             Way("/runs/{run}/live", self._page("live.html", "runs")),
-            Way("/audit", self._page("audit.html", "audit")),
+            Way("/audit", self._page("audit.html", "audit", "admin")),
+            Way("/accounts", self._page("accounts.html", "accounts", "viewer")),
+            Way("/login", self._login_page),
             Way("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
         ]
-        sockets = [WebSocketRoute(f"{base}{one.path}", getattr(self, f"_{one.name}")) for base in (API, "")
-                   for one in SOCKETS]
+        sockets = [WebSocketRoute(f"{base}{one.path}", self._socket(one.role, getattr(self, f"_{one.name}")))
+                   for base in (API, "") for one in SOCKETS]
         return [*api, *at_the_root, *sockets, *pages, Mount("/static", StaticFiles(directory=HERE / "static"))]
 
     @asynccontextmanager
     async def _lifespan(self, app: Starlette) -> Any:
+        await anyio.to_thread.run_sync(self.access.start)
         await anyio.to_thread.run_sync(self.supervisor.start)
         try:
             yield
         finally:
+            await anyio.to_thread.run_sync(self.access.close)
             await anyio.to_thread.run_sync(self.supervisor.close)
 
     async def _failed(self, request: Request, error: Exception) -> Response:
@@ -243,8 +281,11 @@ class Web:
             traceback.print_exception(error, file=sys.stderr)
         if request.url.path.startswith(API) or request.method != "GET":
             return _error_response(error)
+        if isinstance(error, NotLoggedIn) and self.access.login:
+            there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
+            return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
         told = told_of(error).error
-        return self._render("error.html", "", status_of(error), told=told)
+        return self._render(request, "error.html", "", status_of(error), told=told)
 
     # -- the API -----------------------------------------------------------------------------------------------------
 
@@ -265,11 +306,9 @@ class Web:
 
         return serve
 
-    @staticmethod
-    def _require(route: Route, request: Request) -> None:
-        who = principal(request)
-        if route.role not in who.roles:
-            raise NotAllowed(f"{who.name} is no {route.role}", where=route.name)
+    def _require(self, route: Route, request: Request) -> None:
+        sent = None if route.method == "GET" else request.headers.get(CSRF_HEADER, "")
+        require(principal(request), route.role, route=route.name, open_here=not self.access.login, csrf=sent)
 
     async def _rigs(self, request: Request, body: Any) -> list[RigView]:
         return await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
@@ -317,8 +356,15 @@ class Web:
         if key is not None and not 1 <= len(key) <= 200:
             raise UsageError("must have 1 to 200 characters", where="Idempotency-Key")
         rig, who = request.path_params["rig"], principal(request)
-        if who == Principal():
-            await self._off(lambda: require_unwatched(self.supervisor.rigs.get(rig)))
+
+        def check() -> None:
+            found = self.supervisor.rigs.get(rig)
+            require_motion(found)
+            if not who.known:
+                require_unwatched(found)
+            require_options(who, options_of(body))
+
+        await self._off(check)
         asked = await self._off(lambda: self.supervisor.start_run(rig, body, who.name, key))
         if asked.new:
             self._asked.inc()
@@ -468,6 +514,104 @@ class Web:
 
         return await self._off(look)
 
+    # -- who is who --------------------------------------------------------------------------------------------------
+
+    def _me_view(self, who: Principal) -> MeView:
+        ends_s = self.access.ends_s(who)
+        return MeView(who.name, [role for role in ROLES if role in who.roles], self.access.login,
+                      None if ends_s is None else iso(ends_s))
+
+    async def _me(self, request: Request, body: Any) -> MeView:
+        return self._me_view(principal(request))
+
+    async def _login(self, request: Request, body: Any) -> Response:
+        if not self.access.login:
+            raise UsageError("there is nobody to log in as", where="login",
+                             next_step="Add a user on the terminal: tdhil serve users add")
+        cookie, who = await self._slowly(request, body.name.strip().lower()[:64], body.password)
+        self.supervisor.note(who.name, "logged in", None, None, address=address_of(request))
+        response = JSONResponse(plain(self._me_view(who), MeView))
+        set_cookies(response, request, cookie)
+        return response
+
+    async def _slowly(self, request: Request, name: str, password: str) -> tuple[str, Principal]:
+        """A password is looked at. Raises NotLoggedIn and TooManyTries."""
+        address = address_of(request)
+        if self._logins.statistics().tasks_waiting >= 10:
+            raise TooManyTries(10.0)
+        try:
+            found: tuple[str, Principal] = await anyio.to_thread.run_sync(
+                partial(self.access.log_in, name, password, address), limiter=self._logins)
+            return found
+        except NotLoggedIn:
+            self.supervisor.note("nobody", "login refused", None, None, name=name, address=address)
+            raise
+
+    async def _logout(self, request: Request, body: Any) -> Response:
+        who = principal(request)
+        if who.session:
+            await self._off(lambda: self.access.log_out(request))
+            self.supervisor.note(who.name, "logged out", None, None)
+        response = JSONResponse(plain(self._me_view(self.access.who(request)), MeView))
+        set_cookies(response, request, None)
+        return response
+
+    async def _password(self, request: Request, body: Any) -> MeView:
+        who = principal(request)
+        if not who.session:
+            raise UsageError("only who logged in has a password", where="password")
+        try:
+            await self._slowly(request, who.name, body.old)
+        except NotLoggedIn:
+            raise UsageError("that isn't the old password", where="old") from None
+        await self._account(request, lambda: self.access.accounts.set_password(who.name, body.new), "password set",
+                            who.name)
+        return self._me_view(self.access.who(request))
+
+    async def _account(self, request: Request, change: Callable[[], T], what: str, name: str) -> T:
+        """Change an account, one at a time, and say by whom. Raises UsageError."""
+        if not self.access.login:
+            raise UsageError("the first user is added on the terminal", where="accounts",
+                             next_step="tdhil serve users add NAME --role admin; then start with a certificate")
+        found: T = await anyio.to_thread.run_sync(change, limiter=self._logins)
+        self.supervisor.note(principal(request).name, what, None, None, name=name)
+        return found
+
+    async def _accounts(self, request: Request, body: Any) -> AccountsView:
+        return self._accounts_view()
+
+    def _accounts_view(self) -> AccountsView:
+        known = self.access.accounts.known
+        return AccountsView([_account_view(one) for one in known.users.values()],
+                            [_account_view(one) for one in known.tokens.values()])
+
+    async def _add_user(self, request: Request, body: Any) -> AccountView:
+        accounts = self.access.accounts
+        return _account_view(await self._account(
+            request, lambda: accounts.add_user(body.name, body.role, body.password), "user added", body.name))
+
+    async def _set_password(self, request: Request, body: Any) -> AccountView:
+        accounts, name = self.access.accounts, request.path_params["user"]
+        return _account_view(await self._account(
+            request, lambda: accounts.set_password(name, body.password), "password set", name))
+
+    async def _remove_user(self, request: Request, body: Any) -> AccountsView:
+        accounts, name = self.access.accounts, request.path_params["user"]
+        await self._account(request, lambda: accounts.remove_user(name, keep_admin=True), "user removed", name)
+        return self._accounts_view()
+
+    async def _add_token(self, request: Request, body: Any) -> TokenView:
+        token = await self._account(
+            request, lambda: self.access.accounts.add_token(body.name, body.role), "token added", body.name)
+        return TokenView(body.name, body.role, token)
+
+    async def _remove_token(self, request: Request, body: Any) -> AccountsView:
+        accounts, name = self.access.accounts, request.path_params["token"]
+        await self._account(request, lambda: accounts.remove_token(name), "token removed", name)
+        return self._accounts_view()
+
+    # -- how it is ---------------------------------------------------------------------------------------------------
+
     async def _health(self, request: Request, body: Any) -> HealthView:
         rigs = await self._off(self.supervisor.rigs.all)
         return HealthView("ok", __version__, self.supervisor.live(), len(rigs))
@@ -570,6 +714,35 @@ class Web:
 
     # -- live --------------------------------------------------------------------------------------------------------
 
+    def _socket(
+        self, role: Role, serve: Callable[[WebSocket], Awaitable[None]]
+    ) -> Callable[[WebSocket], Awaitable[None]]:
+        """A socket for who has the role, as long as he has it. Else it is closed: 4401 for nobody, 4403 for less."""
+        async def allowed(socket: WebSocket) -> bool:
+            who = self.access.who(socket)
+            if role not in who.roles:
+                await socket.close(4403 if who.roles else 4401, "log in" if not who.roles else f"for {role} only")
+            return role in who.roles
+
+        async def look(socket: WebSocket, scope: anyio.CancelScope) -> None:
+            with suppress(RuntimeError):
+                while await allowed(socket):
+                    await anyio.sleep(SOCKET_LOOK_S)
+            scope.cancel()
+
+        async def guarded(socket: WebSocket) -> None:
+            if role not in self.access.who(socket).roles:
+                await socket.accept()          # only so does a page hear why
+                await allowed(socket)
+                return
+            async with anyio.create_task_group() as both:
+                both.start_soon(look, socket, both.cancel_scope)
+                with suppress(WebSocketDisconnect):
+                    await serve(socket)
+                both.cancel_scope.cancel()
+
+        return guarded
+
     async def _watch(self, socket: WebSocket) -> None:
         run = socket.path_params["run"]
         try:
@@ -637,20 +810,30 @@ class Web:
 
     # -- pages -------------------------------------------------------------------------------------------------------
 
-    def _page(self, template: str, here: str) -> Callable[[Request], Awaitable[Response]]:
+    def _page(self, template: str, here: str, role: Role = "viewer") -> Callable[[Request], Awaitable[Response]]:
         async def serve(request: Request) -> Response:
+            require(principal(request), role, route=request.url.path, open_here=not self.access.login)
             known: dict[str, Any] = {}
             if "rig" in request.path_params:
                 known["rig"] = await self._off(
                     lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
             if "run" in request.path_params:
                 known["run"] = await self._off(lambda: self.run_view(request.path_params["run"]))
-            return self._render(template, here, **known)
+            return self._render(request, template, here, **known)
 
         return serve
 
-    def _render(self, template: str, here: str, status: int = 200, **known: Any) -> Response:
-        return HTMLResponse(self._pages.get_template(template).render(here=here, **known), status)
+    async def _login_page(self, request: Request) -> Response:
+        there = request.query_params.get("next", "/")
+        there = there if _OF_HERE.fullmatch(there) else "/"
+        if principal(request).roles or not self.access.login:
+            return RedirectResponse(there, 303)
+        return self._render(request, "login.html", "login", next=there)
+
+    def _render(self, request: Request, template: str, here: str, status: int = 200, **known: Any) -> Response:
+        text = self._pages.get_template(template).render(
+            here=here, who=principal(request), login=self.access.login, **known)
+        return HTMLResponse(text, status)
 
     @staticmethod
     async def _off(work: Callable[[], T]) -> T:
@@ -660,8 +843,13 @@ class Web:
 
 
 def principal(request: HTTPConnection) -> Principal:
-    """Who asks: as long as there are no users, whoever sits at this computer."""
-    return Principal()
+    """Who asks."""
+    found: Principal = request.scope.get("user", NOBODY)
+    return found
+
+
+def _account_view(one: User | Token) -> AccountView:
+    return AccountView(one.name, one.role, one.since)
 
 
 def _as_it_is(path: Path) -> Iterator[bytes]:

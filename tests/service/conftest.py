@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tdhil.service.access import Access
 from tdhil.service.asking import Rigs
 from tdhil.service.store import Audit, Index, Store
 from tdhil.service.supervisor import Supervisor
@@ -32,7 +33,7 @@ def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -
 class Service:
     """One service without its web: the parts, and what it said on its terminal."""
 
-    def __init__(self, folder: Path, rigs: Path | None, fake: bool = True) -> None:
+    def __init__(self, folder: Path, rigs: Path | None, fake: bool = True, login: bool = False) -> None:
         self.said: list[str] = []
         self.store = Store(folder)
         self.store.prepare()
@@ -40,7 +41,8 @@ class Service:
         command = (lambda run: [sys.executable, str(FAKE), str(run)]) if fake else None
         self.supervisor = Supervisor(self.store, Rigs(rigs), self.audit, self.index, say=self.said.append,
                                      command=command)
-        self.web = Web(self.supervisor)
+        self.access = Access(folder, login=login, say=self.said.append)
+        self.web = Web(self.supervisor, access=self.access)
 
     def wait(self, run: str, *states: str) -> str:
         def there() -> str | None:

@@ -18,7 +18,7 @@ from drivers import PreflightRefused
 from tdhil.service import attending
 from tdhil.service.attending import Board, Confirming, Lease
 from tdhil.service.states import Confirmation, State, Stop, now, way_to
-from tdhil.service.store import Store, write_json
+from tdhil.service.store import Store, read_json, write_json
 from tdhil.service.wire import STOP_FILE, Listener
 
 RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100.0, "high_total": 108.0,
@@ -61,7 +61,7 @@ def main(folder: Path) -> None:
     listener = Listener(folder, answer)
     with listener:
         if (folder / STOP_FILE).exists():
-            answer({"do": "stop", "by": "local"})
+            answer({"do": "stop", **(read_json(folder / STOP_FILE) or {})})
         board.to(State.PREFLIGHT)
         if what == "deaf":
             (folder / "control.sock").unlink()

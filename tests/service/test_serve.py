@@ -6,12 +6,14 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,9 +22,9 @@ from drivers import CommunicationLost
 from tdhil.cli.main import main
 from tdhil.errors import ExitCode, UsageError
 from tdhil.recording import read_run
-from tdhil.service import attend
+from tdhil.service import AccountsFile, attend
 from tdhil.service.client import ServiceError
-from tdhil.service.serving import require_loopback
+from tdhil.service.serving import require_way
 from tdhil.service.store import Store
 from tests.service.conftest import HANGS_S, wait_for
 
@@ -30,14 +32,14 @@ QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, 
 
 
 class Server:
-    def __init__(self, data: Path, *more: str) -> None:
+    def __init__(self, data: Path, *more: str, **client: Any) -> None:
         self.log = (data.parent / "serve.txt").open("a+")
         start = self.log.seek(0, os.SEEK_END)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "tdhil", "serve", "--data", str(data), "--port", "0", *more], stderr=self.log)
-        address = wait_for("the address", lambda: re.search(r"http://\S+", self.said(start)))
+        address = wait_for("the address", lambda: re.search(r"https?://\S+", self.said(start)))
         self.url = address.group(0)
-        self.client = tdhil.Client(self.url)
+        self.client = tdhil.Client(self.url, **client)
         wait_for("an answer", self.answers)
 
     def said(self, start: int = 0) -> str:
@@ -51,8 +53,8 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(data: Path, *more: str) -> Iterator[Server]:
-    server = Server(data, *more)
+def served(data: Path, *more: str, **client: Any) -> Iterator[Server]:
+    server = Server(data, *more, **client)
     try:
         yield server
     finally:
@@ -160,18 +162,92 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.0.2.1", "::", "rig.example", ""])
-def test_another_host_is_refused_in_words(host, capsys, tmp_path, monkeypatch):
+def test_another_host_without_login_and_tls_is_refused_in_words(host, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["serve", "--host", host]) == ExitCode.USAGE
     said = capsys.readouterr().err
-    assert "no login and no TLS yet" in said
+    assert "takes a login, and TLS" in said
     assert "ssh -L" in said
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(UsageError, match="there is no user yet"):
+        require_way(host, tls=True, accounts=False)
+    with pytest.raises(UsageError, match="takes a login"):
+        require_way(host, tls=False, accounts=False)
+    require_way(host, tls=True, accounts=True)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
-def test_this_computer_is_not(host):
-    require_loopback(host)
+def test_this_computer_is_not_as_long_as_it_has_no_users(host):
+    require_way(host, tls=False, accounts=False)
+    require_way(host, tls=True, accounts=False)
+    require_way(host, tls=True, accounts=True)
+    with pytest.raises(UsageError, match="goes over no open line"):
+        require_way(host, tls=False, accounts=True)
+
+
+@pytest.fixture(scope="module")
+def tls(tmp_path_factory) -> tuple[Path, Path]:
+    """A certificate of its own for 127.0.0.1, and its key."""
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl to make a certificate")
+    folder = tmp_path_factory.mktemp("tls")
+    cert, key = folder / "cert.pem", folder / "key.pem"
+    subprocess.run(["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
+                    "-subj", "/CN=tdhil", "-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost", "-days", "2",
+                    "-keyout", key, "-out", cert], check=True, capture_output=True)
+    return cert, key
+
+
+def test_a_certificate_that_does_not_serve_is_refused_in_words(tls, tmp_path, capsys, monkeypatch):
+    cert, key = tls
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "no.pem").write_text("no certificate")
+    subprocess.run(["openssl", "ec", "-aes128", "-passout", "pass:x", "-in", key, "-out", "locked.pem"], check=True,
+                   capture_output=True)
+    other = tmp_path / "other.pem"
+    subprocess.run(["openssl", "ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", other], check=True)
+    for pair in ((cert, tmp_path / "none.pem"), ("no.pem", key), (cert, "locked.pem"), (cert, other)):
+        assert main(["serve", "--tls-cert", str(pair[0]), "--tls-key", str(pair[1])]) == ExitCode.USAGE
+        assert "certificate and key can't be used" in capsys.readouterr().err
+    assert main(["serve", "--tls-cert", str(cert)]) == ExitCode.USAGE
+    assert main(["serve", "--allowed-host", "rig:80", "--tls-cert", str(cert), "--tls-key", str(key)]) == ExitCode.USAGE
+
+
+def test_with_users_it_is_reached_over_tls_with_a_token_alone(tls, tmp_path):
+    """As a process: a token over TLS may; none, another, an open line and a name that isn't ours may not."""
+    data = tmp_path / "data"
+    accounts = AccountsFile(data)
+    data.mkdir()
+    accounts.add_user("anna", "admin", "correct horse battery")
+    token = accounts.add_token("notebook", "operator")
+    assert main(["serve", "--data", str(data), "--port", "0"]) == ExitCode.USAGE
+    with served(data, "--tls-cert", str(tls[0]), "--tls-key", str(tls[1]), token=token, ca=tls[0]) as server:
+        assert server.url.startswith("https://")
+        assert server.client.me()["name"] == "notebook (token)"
+        for client in (tdhil.Client(server.url, ca=tls[0]), tdhil.Client(server.url, ca=tls[0], token="tdhil_x")):
+            with pytest.raises(ServiceError) as refused:
+                client.rigs()
+            assert (refused.value.status, refused.value.exit_code) == (401, ExitCode.REFUSED)
+        with pytest.raises(ServiceError) as refused:
+            server.client.audit()
+        assert refused.value.status == 403
+        with pytest.raises(CommunicationLost):
+            tdhil.Client(server.url, token=token).rigs()           # a certificate that nobody vouches for
+        with pytest.raises(CommunicationLost):
+            tdhil.Client(server.url.replace("https", "http")).rigs()
+        accounts.remove_token("notebook")
+        wait_for("its end", lambda: not known(server.client))
+
+
+def known(client: tdhil.Client) -> bool:
+    return bool(client.me()["roles"])
+
+
+def test_a_token_goes_over_tls_alone():
+    with pytest.raises(UsageError, match="over TLS alone"):
+        tdhil.Client("http://127.0.0.1:8420", token="tdhil_x")
+    with pytest.raises(UsageError, match="can't be read as certificates"):
+        tdhil.Client("https://127.0.0.1:8420", token="tdhil_x", ca="/none.pem")
 
 
 def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):

@@ -28,15 +28,26 @@
 
   class Refused extends Error {}
 
+  const may = (role) => (document.body.dataset.roles || "").split(" ").includes(role);
+
+  /** What a change brings along, as it is now: another page may have logged in anew meanwhile. */
+  function csrf() {
+    const name = `__Host-tdhil-csrf-${location.port || 443}=`;
+    const found = document.cookie.split("; ").find((one) => one.startsWith(name));
+    return found ? { "X-CSRF-Token": found.slice(name.length) } : {};
+  }
+
   async function call(method, path, body, headers = {}, withinMs = 15000, keepalive = false) {
     const abort = new AbortController();
     const timer = setTimeout(() => abort.abort(), withinMs);
     try {
       const answer = await fetch(API + path, {
-        method, keepalive, signal: abort.signal, headers: body === undefined ? headers : { "Content-Type": "application/json", ...headers },
+        method, keepalive, signal: abort.signal,
+        headers: body === undefined ? headers : { "Content-Type": "application/json", ...csrf(), ...headers },
         body: body === undefined ? undefined : JSON.stringify(body),
       });
       const found = await answer.json();
+      if (answer.status === 401 && document.body.dataset.page !== "login") loggedOut();
       if (!answer.ok) throw new Refused(found.error ? found.error.message : `HTTP ${answer.status}`);
       return found;
     } finally {
@@ -44,10 +55,23 @@
     }
   }
 
+  let outside = false;
   function away(text) {
+    if (outside) return;
     const bar = byId("away");
     bar.hidden = !text;
     if (bar.textContent !== (text || "")) bar.textContent = text || "";
+  }
+
+  /** The page stays, with its Stop: only who asks for another one is asked to log in. */
+  function loggedOut() {
+    if (outside) return;
+    const there = encodeURIComponent(location.pathname + location.search);
+    away("");
+    outside = true;
+    byId("away").hidden = false;
+    show(byId("away"), "Your login has ended: what you see is old. Stop still gets through; so does the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
+    document.body.classList.add("stale");
   }
 
   /** Again and again, and grey while nothing comes. */
@@ -96,7 +120,7 @@
       free: rig.simulated || rig.motion !== "never" ? "free" : `free; not moved from here (service.motion: ${rig.motion})`,
       busy: "a run has it", held: `held by ${rig.holder}`, blocked: "blocked: a stop was not confirmed", unusable: rig.problem,
     }[rig.state];
-    const mayStart = rig.state === "free" && (rig.simulated || rig.motion !== "never");
+    const mayStart = may("operator") && rig.state === "free" && (rig.simulated || rig.motion !== "never");
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
@@ -412,7 +436,10 @@
     function connect() {
       const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${API}/live/${run}`);
       socket.addEventListener("message", (event) => take(JSON.parse(event.data)));
-      socket.addEventListener("close", () => setTimeout(connect, 700));
+      socket.addEventListener("close", (event) => {
+        if (event.code === 4401) loggedOut();
+        else setTimeout(connect, 700);
+      });
     }
     connect();
 
@@ -591,6 +618,54 @@
     });
   }
 
-  const pages = { rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, history: historyPage, audit: auditPage };
+  // -- who is who
+
+  async function saying(where, work) {
+    where.hidden = true;
+    try {
+      await work();
+    } catch (error) {
+      where.textContent = error instanceof Refused ? error.message : "No answer from tdhil serve.";
+      where.hidden = false;
+    }
+  }
+
+  async function loginPage() {
+    const next = document.body.dataset.next, form = byId("login");
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      saying(byId("login-said"), async () => {
+        await call("POST", "/login", { name: form.elements.name.value, password: form.elements.password.value });
+        location.replace(next);
+      });
+    });
+    const me = await call("GET", "/me");     // a link from elsewhere comes without the cookie, this page's own request has it
+    if (me.roles.length) location.replace(next);
+  }
+
+  function accountsPage() {
+    const said = byId("accounts-said");
+    const given = (form) => Object.fromEntries(new FormData(form));
+    const sends = (id, path, after) => byId(id) && byId(id).addEventListener("submit", (event) => {
+      event.preventDefault();
+      const form = event.target;
+      saying(said, async () => { after(await call("POST", path, given(form))); form.reset(); });
+    });
+    const rows = (where, path, found) => show(byId(where), ...found.map((one) => el("tr", {}, el("th", { scope: "row" }, one.name), el("td", {}, one.role), el("td", {}, when(one.since)),
+      el("td", {}, el("button", { type: "button", class: "quiet", "aria-label": `Remove ${one.name}`, onclick: () => confirm(`Remove ${one.name}?`) && saying(said, async () => fill(await call("POST", `/${path}/${encodeURIComponent(one.name)}/remove`, {}))) }, "Remove")))));
+    const fill = (found) => { rows("users", "users", found.users); rows("tokens", "tokens", found.tokens); };
+    const look = async () => fill(await call("GET", "/accounts"));
+    sends("password", "/password", () => location.assign("/login"));
+    sends("add-user", "/users", look);
+    sends("add-token", "/tokens", (made) => { show(byId("token"), `The token of ${made.name}, shown this once: `, el("code", {}, made.token)); look(); });
+    if (byId("users")) saying(said, look);
+  }
+
+  const logout = byId("logout");
+  if (logout) logout.addEventListener("click", async () => {
+    try { await call("POST", "/logout", {}); location.assign("/login"); } catch (error) { away("No answer from tdhil serve: you may still be logged in."); }
+  });
+
+  const pages = { login: loginPage, accounts: accountsPage, rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, history: historyPage, audit: auditPage };
   (pages[document.body.dataset.page] || (() => {}))();
 })();

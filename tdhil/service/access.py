@@ -1,0 +1,347 @@
+"""Who asks, and what he may: by a session's cookie, by a machine's token, or by sitting at this computer.
+
+All of it is answered from memory: no request, and no stop above all, waits for a file here.
+
+* Without accounts, on loopback: whoever sits there, with every role.
+* With accounts: nobody without a login. Its end takes everything from a page but the stop.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from starlette.authentication import AuthCredentials
+from starlette.requests import HTTPConnection
+from starlette.responses import Response
+
+from tdhil.errors import TdhilError
+from tdhil.service.accounts import ROLES, Accounts, AccountsFile, Role, matches, role_at_least
+from tdhil.service.answers import CSRF_HEADER
+from tdhil.service.states import NotAllowed, NotLoggedIn, TooManyTries
+from tdhil.service.store import read_json, write_json
+
+SESSION_S: Final = 12 * 3600.0
+"""A shift."""
+STOPS_S: Final = 7 * 86400.0
+"""So long after its end a session's page can still stop."""
+READ_S: Final = 1.0
+SOCKET_LOOK_S: Final = 2.0
+"""So often it is looked whether who opened a socket may still have it."""
+COOKIE: Final = "__Host-tdhil"
+CSRF_COOKIE: Final = "__Host-tdhil-csrf"
+STOPS: Final = frozenset({"stop", "stop_rig"})
+"""The routes that are never refused to somebody who is known."""
+_MOST_SESSIONS: Final = 5000
+_PROXIES: Final = ("forwarded", "x-forwarded-for", "x-real-ip", "via")
+_ENGINEER_S: Final = ("accept_unverified", "accept_wider_limit", "accept_speed_unit")
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Principal:
+    """Who asks. ``name`` is what the audit says; ``session``: a login's own name, '' for a token and at this computer.
+
+    ``known``: by a password or a token. ``csrf``: what a change has to bring along, '' where nothing.
+    """
+
+    name: str
+    roles: frozenset[str]
+    known: bool = False
+    may_stop: bool = True
+    session: str = ""
+    csrf: str = ""
+
+    @property
+    def is_authenticated(self) -> bool:
+        return bool(self.roles)
+
+    @property
+    def display_name(self) -> str:
+        return self.name
+
+
+LOCAL: Final = Principal("local", frozenset(ROLES))
+NOBODY: Final = Principal("nobody", frozenset(), may_stop=False)
+
+
+@dataclass(frozen=True)
+class Session:
+    """A login: ``since`` of the password that it was made with; times as of `time.time`."""
+
+    user: str
+    since: str
+    begun_s: float
+    ends_s: float
+
+
+class Tries:
+    """How often a password may be tried in a minute. Nobody waits longer than that, so nobody is locked out for long.
+
+    For a name from one address 5, from one address 20, for a name from all the addresses that it never came from 30:
+    who tries from elsewhere doesn't keep him away whose name it is.
+    """
+
+    WINDOW_S: Final = 60.0
+    OF_PAIR, OF_ADDRESS, OF_NAME = 5, 20, 30
+    _MOST = 20_000
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._tried: dict[tuple[str, ...], deque[float]] = {}
+        self._good: set[tuple[str, str]] = set()
+        self._lock = threading.Lock()
+
+    def begin(self, name: str, address: str) -> None:
+        """Count one, before its password is looked at. Raises TooManyTries."""
+        with self._lock:
+            now_s = self._clock()
+            if len(self._tried) > self._MOST:
+                self._tried = {key: times for key, times in self._tried.items() if now_s - times[-1] < self.WINDOW_S}
+            counts = [(("pair", name, address), self.OF_PAIR), (("address", address), self.OF_ADDRESS)]
+            if (name, address) not in self._good:
+                counts.append((("name", name), self.OF_NAME))
+            times = [(self._tried.setdefault(key, deque(maxlen=most)), most) for key, most in counts]
+            waits = [self.WINDOW_S - (now_s - one[0]) for one, most in times if len(one) == most]
+            if (wait_s := max(waits, default=0.0)) > 0.0:
+                raise TooManyTries(max(wait_s, 1.0))
+            for one, _ in times:
+                one.append(now_s)
+
+    def good(self, name: str, address: str) -> None:
+        """It was the password."""
+        with self._lock:
+            if len(self._good) > self._MOST:
+                self._good.clear()
+            self._good.add((name, address))
+            self._tried.pop(("pair", name, address), None)
+
+
+class Access:
+    """Of one service, for any thread. ``login``: are there accounts, so that nobody gets in without?"""
+
+    def __init__(
+        self, folder: Path, *, login: bool = False, say: Say = lambda text: None,
+        clock: Callable[[], float] = time.time, changed: Callable[[str, str], None] = lambda what, name: None,
+    ) -> None:
+        self.login = login
+        self.accounts = AccountsFile(folder)
+        self.tries = Tries()
+        self._path = folder / "sessions.json"
+        self._say, self._clock, self.changed = say, clock, changed
+        self._lock = threading.Lock()
+        self._writing = threading.Lock()
+        self._sessions: dict[str, Session] = _sessions_of(self._path)
+        self._trouble = ""
+        self._end = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Read the accounts, and again every second."""
+        self.refresh(first=True)
+        self._thread = threading.Thread(target=self._look, name="accounts", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._end.set()
+        if self._thread is not None:
+            self._thread.join(5.0)
+
+    def _look(self) -> None:
+        while not self._end.wait(READ_S):
+            self.refresh()
+
+    def refresh(self, *, first: bool = False) -> None:
+        """Read the accounts if they were changed; where they can't be read, those of before hold."""
+        before = self.accounts.known
+        try:
+            found = self.accounts.read()
+        except TdhilError as error:
+            if str(error) != self._trouble:
+                self._trouble = str(error)
+                self._say(f"the accounts stay as they were: {error}")
+            return
+        self._trouble = ""
+        if found is not before and not first:
+            for what, name in _differences(before, found):
+                self.changed(what, name)
+
+    # -- who asks ----------------------------------------------------------------------------------------------------
+
+    def who(self, connection: HTTPConnection) -> Principal:
+        """Without touching a file. Who brings a token that nobody knows is nobody, also at this computer."""
+        accounts = self.accounts.known
+        if (token := token_in(connection)) is not None:
+            if (found := accounts.of_token(token)) is None:
+                return NOBODY
+            return Principal(f"{found.name} (token)", role_at_least(found.role), known=True)
+        if not self.login:
+            if any(name in connection.headers for name in _PROXIES):
+                return NOBODY                      # from who knows where, by way of this computer
+            return Principal("local", frozenset({"viewer"})) if accounts else LOCAL
+        cookie = _cookie(connection, COOKIE)
+        return NOBODY if cookie is None else self._of_session(cookie, accounts)
+
+    def _of_session(self, cookie: str, accounts: Accounts) -> Principal:
+        name = _hash(cookie)
+        session = self._sessions.get(name)
+        user = None if session is None else accounts.users.get(session.user)
+        if session is None or user is None or user.since != session.since:
+            return NOBODY
+        now_s = self._clock()
+        if now_s > session.ends_s + STOPS_S:
+            return NOBODY
+        roles = role_at_least(user.role) if now_s < session.ends_s else frozenset()
+        return Principal(user.name, roles, known=True, session=name[:16], csrf=csrf_of(cookie))
+
+    async def authenticate(self, connection: HTTPConnection) -> tuple[AuthCredentials, Principal]:
+        """For starlette's AuthenticationMiddleware."""
+        who = self.who(connection)
+        return AuthCredentials(sorted(who.roles)), who
+
+    # -- login -------------------------------------------------------------------------------------------------------
+
+    def log_in(self, name: str, password: str, address: str) -> tuple[str, Principal]:
+        """The cookie's value, and whose it is. Slow on purpose. Raises TooManyTries and NotLoggedIn."""
+        self.tries.begin(name, address)
+        user = self.accounts.known.users.get(name)
+        good = matches(password, None if user is None else user.password)
+        if user is None or not good:
+            raise NotLoggedIn("name and password don't go together", where="login")
+        self.tries.good(name, address)
+        cookie, now_s = secrets.token_urlsafe(32), self._clock()
+        with self._lock:
+            kept = {one: it for one, it in self._sessions.items() if now_s < it.ends_s + STOPS_S}
+            while len(kept) >= _MOST_SESSIONS:
+                kept.pop(next(iter(kept)))
+            self._sessions = {**kept, _hash(cookie): Session(user.name, user.since, now_s, now_s + SESSION_S)}
+        self._save()
+        return cookie, self._of_session(cookie, self.accounts.known)
+
+    def log_out(self, connection: HTTPConnection) -> None:
+        """Here and now, and after a restart."""
+        if (cookie := _cookie(connection, COOKIE)) is not None:
+            with self._lock:
+                self._sessions = {one: it for one, it in self._sessions.items() if one != _hash(cookie)}
+            self._save()
+
+    def ends_s(self, who: Principal) -> float | None:
+        """When his session ends, as of `time.time`; None without one."""
+        return next((it.ends_s for one, it in self._sessions.items() if who.session and one.startswith(who.session)),
+                    None)
+
+    def _save(self) -> None:
+        with self._writing:
+            plain = {one: asdict(it) for one, it in self._sessions.items()}
+            try:
+                write_json(self._path, plain, mode=0o600)
+            except OSError as error:
+                self._say(f"the logins can't be written, and end with this process: {error}")
+
+
+def set_cookies(response: Response, connection: HTTPConnection, cookie: str | None) -> None:
+    """Of a login; None: take them back. The browser forgets them when it is closed."""
+    for name, value, hidden in ((COOKIE, cookie or "", True),
+                                (CSRF_COOKIE, "" if cookie is None else csrf_of(cookie), False)):
+        response.set_cookie(_named(name, connection), value, max_age=None if cookie else 0, path="/", secure=True,
+                            httponly=hidden, samesite="strict")
+
+
+def csrf_of(cookie: str) -> str:
+    """What a page of this session sends along with a change; its script reads it in a cookie of its own.
+
+    So a page from before a new login has the new one, and its stop gets through.
+    """
+    return hmac.new(cookie.encode(), b"csrf", hashlib.sha256).hexdigest()[:32]
+
+
+def require(who: Principal, role: Role | None, *, route: str, open_here: bool, csrf: str | None = None) -> None:
+    """``role``: None is anybody; ``csrf``: what came along with a change. Raises NotLoggedIn and NotAllowed."""
+    if role is None:
+        return
+    if role not in who.roles and not (route in STOPS and who.may_stop):
+        if who.roles:
+            raise NotAllowed(f"{who.name} is no {role}", where=route,
+                             next_step=f"Ask somebody who is {role}" if who.known or not open_here else
+                             "Users were added: start tdhil serve again, with --tls-cert and --tls-key")
+        raise NotLoggedIn(
+            "the login has ended" if who.known else "nobody knows who asks", where=route,
+            next_step="What comes through a proxy, or with a token that isn't known, is refused" if open_here
+            else "Log in again; a stop still gets through" if who.known else "Log in, or send a token",
+        )
+    if who.csrf and csrf is not None and not hmac.compare_digest(csrf.encode(), who.csrf.encode()):
+        raise NotAllowed("this came from no page of this login", where=CSRF_HEADER, next_step="Load the page again")
+
+
+def require_options(who: Principal, options: Mapping[str, Any]) -> None:
+    """What an engineer alone may ask for. Raises NotAllowed."""
+    for name in _ENGINEER_S:
+        if options.get(name) and "engineer" not in who.roles:
+            raise NotAllowed(f"{who.name} is no engineer, and takes nothing upon himself that nobody verified",
+                             where=name, next_step="Ask an engineer")
+
+
+def token_in(connection: HTTPConnection) -> str | None:
+    """What came as a machine's token; a WebSocket may bring it as ?token=…, since browsers send it no header."""
+    if (given := connection.headers.get("authorization")) is not None:
+        kind, _, token = given.partition(" ")
+        return token.strip() if kind.lower() == "bearer" else ""
+    found: str | None = connection.query_params.get("token") if connection.scope["type"] == "websocket" else None
+    return found
+
+
+def address_of(connection: HTTPConnection) -> str:
+    """Whence, for the rate limit; of IPv6 the network, which is one customer's."""
+    host = "?" if connection.client is None else connection.client.host
+    with suppress(ValueError):
+        address = ipaddress.ip_address(host.partition("%")[0])
+        if address.version == 6:
+            return str(address.ipv4_mapped or ipaddress.ip_network((int(address) >> 64 << 64, 64)))
+    return host
+
+
+def _cookie(connection: HTTPConnection, name: str) -> str | None:
+    found: str | None = connection.cookies.get(_named(name, connection))
+    return found or None
+
+
+def _named(name: str, connection: HTTPConnection) -> str:
+    """With the port in it: a browser gives the cookies of a host to all of its ports."""
+    port = None
+    with suppress(ValueError):
+        port = urlsplit(f"//{connection.headers.get('host', '')}").port
+    return f"{name}-{port or 443}"
+
+
+def _hash(cookie: str) -> str:
+    return hashlib.sha256(cookie.encode()).hexdigest()
+
+
+def _sessions_of(path: Path) -> dict[str, Session]:
+    found: dict[str, Session] = {}
+    for name, one in (read_json(path) or {}).items():
+        with suppress(TypeError, ValueError):
+            session = Session(**one)
+            if isinstance(session.user, str) and isinstance(session.since, str):
+                found[name] = Session(session.user, session.since, float(session.begun_s), float(session.ends_s))
+    return found
+
+
+def _differences(before: Accounts, after: Accounts) -> Iterator[tuple[str, str]]:
+    for kind, old, new in (("user", before.users, after.users), ("token", before.tokens, after.tokens)):
+        for name in sorted({*old, *new}):
+            was, is_now = old.get(name), new.get(name)
+            if was != is_now:
+                what = "removed" if is_now is None else "added" if was is None else "changed"
+                yield f"{kind} {what}", f"{name}" if is_now is None else f"{name} ({is_now.role})"

@@ -1,0 +1,252 @@
+"""Who there is: people with passwords, machines with tokens; `accounts.json` in the service's folder.
+
+Of a password only what scrypt makes of it is kept, of a token its hash. The web reads the file once a second, beside
+everything else, and keeps what it read last where it can't be read any more: no request waits for a disk.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import re
+import secrets
+import threading
+import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from tdhil.errors import LogError, UsageError
+from tdhil.service.states import NotThere, now
+from tdhil.service.store import write_json
+
+Role = Literal["viewer", "operator", "engineer", "admin"]
+ROLES: Final[tuple[Role, ...]] = get_args(Role)
+"""From the least to the most; each may what those before it may."""
+FILE: Final = "accounts.json"
+NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
+_RESERVED: Final = frozenset({"local", "service", "somebody", "nobody", "terminal"})
+"""The audit says these of others than people."""
+SHORTEST: Final = 10
+"""Characters of a password."""
+LONGEST: Final = 200
+_N, _R, _P, _BYTES = 2**15, 8, 3, 32
+_MOST_N, _MOST_R, _MOST_P = 2**17, 16, 8
+TOKEN: Final = "tdhil_"
+
+
+def role_at_least(role: Role) -> frozenset[str]:
+    """The role, and those below it."""
+    return frozenset(ROLES[: ROLES.index(role) + 1])
+
+
+@dataclass(frozen=True)
+class User:
+    """A person. ``password``: as `scrypt` makes it; ``since``: when it was set, which ends what began before."""
+
+    name: str
+    role: Role
+    password: str
+    since: str
+
+
+@dataclass(frozen=True)
+class Token:
+    """A machine. ``sha256`` of the token, which was shown once."""
+
+    name: str
+    role: Role
+    sha256: str
+    since: str
+
+
+@dataclass(frozen=True)
+class Accounts:
+    """All of them, by name."""
+
+    users: Mapping[str, User] = field(default_factory=dict)
+    tokens: Mapping[str, Token] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.users or self.tokens)
+
+    def of_token(self, token: str) -> Token | None:
+        """Whose it is."""
+        digest = hashlib.sha256(token.encode()).hexdigest()
+        return next((one for one in self.tokens.values() if hmac.compare_digest(one.sha256, digest)), None)
+
+
+def scrypt(password: str) -> str:
+    """What is kept of a password: ``scrypt$N$r$p$salt$key`` (RFC 7914): 32 MB, and some 0.3 s."""
+    salt = secrets.token_bytes(16)
+    return f"scrypt${_N}${_R}${_P}${salt.hex()}${_derive(password, salt, _N, _R, _P).hex()}"
+
+
+def matches(password: str, kept: str | None) -> bool:
+    """Is it the password? Takes as long where there is nobody of that name, so that time tells no names."""
+    nobody = f"scrypt${_N}${_R}${_P}${bytes(16).hex()}${bytes(_BYTES).hex()}"
+    kind, n, r, p, salt, key = (kept or nobody).split("$")
+    found = _derive(password[:LONGEST], bytes.fromhex(salt), int(n), int(r), int(p))
+    return hmac.compare_digest(found, bytes.fromhex(key)) and kept is not None and kind == "scrypt"
+
+
+def _derive(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:
+    given = unicodedata.normalize("NFKC", password).encode("utf-8", "surrogatepass")
+    return hashlib.scrypt(given, salt=salt, n=n, r=r, p=p, dklen=_BYTES, maxmem=2 * 128 * n * r + 2**20)
+
+
+def require_password(password: str, name: str) -> None:
+    """Raises UsageError for one that is too easily guessed."""
+    if not SHORTEST <= len(password) <= LONGEST:
+        raise UsageError(f"must have {SHORTEST} to {LONGEST} characters", where="password",
+                         next_step="A few words that don't belong together will do")
+    if password.lower().strip("0123456789 !.") in (name, "password", "tdhil") or len(set(password)) < 5:
+        raise UsageError("is one of the first that would be tried", where="password",
+                         next_step="A few words that don't belong together will do")
+
+
+def _require_name(name: str) -> None:
+    if not NAME.fullmatch(name) or name in _RESERVED:
+        raise UsageError("must be 1 to 32 of a-z, 0-9, '.', '_' and '-', and no word of the audit's own"
+                         f" ({', '.join(sorted(_RESERVED))})", where=f"name {name[:40]!r}")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+class AccountsFile:
+    """The file, for any thread and for any process: who changes it holds a lock as long."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / FILE
+        self._stamp: tuple[int, ...] | None = None
+        self._known = Accounts()
+        self._lock = threading.Lock()
+
+    @property
+    def known(self) -> Accounts:
+        """As it was read last; no file is touched."""
+        return self._known
+
+    def read(self) -> Accounts:
+        """As it is now. Raises UsageError where it can't be read; `known` stays what it was."""
+        with self._lock:
+            try:
+                looked = self.path.stat()
+                stamp = (looked.st_mtime_ns, looked.st_size, looked.st_ino)
+                if stamp != self._stamp:
+                    self._known, self._stamp = _accounts_of(self.path.read_bytes()), stamp
+            except FileNotFoundError:
+                if self._stamp is not None:        # it was there: whoever took it away didn't remove the users
+                    raise UsageError("the accounts have gone", where=str(self.path),
+                                     next_step="Bring them back") from None
+            except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+                raise UsageError(f"the accounts can't be read ({str(error)[:100]})", where=str(self.path),
+                                 next_step="Bring back a copy, or delete it and add the users again") from error
+            return self._known
+
+    def add_user(self, name: str, role: Role, password: str) -> User:
+        """Raises UsageError."""
+        _require_name(name)
+        require_password(password, name)
+        made = User(name, role, scrypt(password), now())
+        with self._changing() as accounts:
+            if name in accounts.users:
+                raise UsageError("there is such a user", where=name, next_step="Remove him first, or set a password")
+            self._write(replace(accounts, users={**accounts.users, name: made}))
+        return made
+
+    def set_password(self, name: str, password: str) -> User:
+        """Ends all that the user had open. Raises NotThere and UsageError."""
+        require_password(password, name)
+        kept = scrypt(password)
+        with self._changing() as accounts:
+            made: User = replace(_there(accounts.users, name), password=kept, since=now())
+            self._write(replace(accounts, users={**accounts.users, name: made}))
+        return made
+
+    def remove_user(self, name: str, *, keep_admin: bool = False) -> None:
+        """Raises NotThere; with ``keep_admin`` UsageError for the last one."""
+        with self._changing() as accounts:
+            gone = _there(accounts.users, name)
+            left = {one: user for one, user in accounts.users.items() if one != name}
+            if keep_admin and gone.role == "admin" and all(one.role != "admin" for one in left.values()):
+                raise UsageError("is the last admin", where=name, next_step="Use tdhil serve users remove")
+            self._write(replace(accounts, users=left))
+
+    def add_token(self, name: str, role: Role) -> str:
+        """The token itself, which is kept nowhere. Raises UsageError."""
+        _require_name(name)
+        token = TOKEN + secrets.token_urlsafe(32)
+        made = Token(name, role, hashlib.sha256(token.encode()).hexdigest(), now())
+        with self._changing() as accounts:
+            if name in accounts.tokens:
+                raise UsageError("there is such a token", where=name, next_step="Remove it first")
+            self._write(replace(accounts, tokens={**accounts.tokens, name: made}))
+        return token
+
+    def remove_token(self, name: str) -> None:
+        """Raises NotThere."""
+        with self._changing() as accounts:
+            _there(accounts.tokens, name)
+            self._write(replace(accounts, tokens={one: it for one, it in accounts.tokens.items() if one != name}))
+
+    @contextmanager
+    def _changing(self) -> Iterator[Accounts]:
+        """One after the other, here and on the terminal. Raises LogError where the folder can't be written."""
+        import fcntl
+
+        try:
+            descriptor = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path.parent),
+                           next_step="Name the service's folder with --data") from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            yield self.read()
+        finally:
+            os.close(descriptor)
+
+    def _write(self, accounts: Accounts) -> None:
+        try:
+            write_json(self.path, {
+                "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
+                "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
+            }, mode=0o600)
+        except OSError as error:
+            raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path)) from error
+        self.read()
+
+
+def _plain(one: User | Token) -> dict[str, Any]:
+    return {name: value for name, value in asdict(one).items() if name != "name"}
+
+
+def _there(found: Mapping[str, Any], name: str) -> Any:
+    if name not in found:
+        raise NotThere("there is no such account", where=name[:40], next_step=f"There are {', '.join(found) or 'none'}")
+    return found[name]
+
+
+def _accounts_of(data: bytes) -> Accounts:
+    """Raises ValueError, TypeError or KeyError for what is none."""
+    plain = json.loads(data)
+    users = {name: User(name, **one) for name, one in plain["users"].items()}
+    tokens = {name: Token(name, **one) for name, one in plain["tokens"].items()}
+    everybody: tuple[User | Token, ...] = (*users.values(), *tokens.values())
+    for one in everybody:
+        if not NAME.fullmatch(one.name) or one.role not in ROLES or not isinstance(one.since, str):
+            raise ValueError(f"{one.name[:40]!r} is no account")
+    for user in users.values():
+        kind, n, r, p, salt, key = user.password.split("$")
+        sane = 0 < int(n) <= _MOST_N and 0 < int(r) <= _MOST_R and 0 < int(p) <= _MOST_P
+        if kind != "scrypt" or not sane or len(bytes.fromhex(salt)) < 16 or len(bytes.fromhex(key)) != _BYTES:
+            raise ValueError(f"the password of {user.name} is none")
+    for token in tokens.values():
+        if not re.fullmatch(r"[0-9a-f]{64}", token.sha256):
+            raise ValueError(f"the token {token.name} is none")
+    return Accounts(users, tokens)
