@@ -91,6 +91,8 @@ def main(arguments: list[str]) -> int:
     """0; what went wrong is in the answer."""
     with suppress(OSError, AttributeError):
         os.nice(NICE.get(arguments[0], USUAL_NICE))
+    with suppress(OSError):                    # where memory runs out, this goes before the web and before any run
+        Path("/proc/self/oom_score_adj").write_text("500")
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)                          # what libraries print is no part of the answer
     try:

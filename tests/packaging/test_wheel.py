@@ -24,7 +24,7 @@ def wheel(tmp_path_factory) -> zipfile.ZipFile:
     for name in (".gitignore", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     junk = shutil.ignore_patterns("__pycache__", ".*_cache", "*.egg-info")
-    for name in (*PACKAGES, "tests", "examples", "docs", "benchmarks"):
+    for name in (*PACKAGES, "tests", "examples", "deploy", "docs", "benchmarks"):
         shutil.copytree(ROOT / name, source / name, ignore=junk)
     (source / "tdhil" / "forgotten.mcap").touch()
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(source)]
@@ -67,7 +67,8 @@ def test_profiles_come_with_their_eds(names):
 def test_documentation_and_examples_come_along(names):
     wanted = {"tdhil/_docs/README.md"}
     wanted |= {f"tdhil/_docs/{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "docs").rglob("*.md")}
-    wanted |= {f"tdhil/_docs/examples/{path.name}" for path in (ROOT / "examples").iterdir()}
+    wanted |= {f"tdhil/_docs/{folder}/{path.name}" for folder in ("examples", "deploy")
+               for path in (ROOT / folder).iterdir()}
     assert wanted - names == set()
 
 

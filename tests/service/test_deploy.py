@@ -141,6 +141,14 @@ def test_systemd_takes_the_unit(tmp_path):
     assert done.returncode == 0, done.stdout[-300:] + done.stderr
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="oom_score_adj is Linux's")
+def test_arithmetic_goes_first_where_memory_runs_out():
+    code = ("import pathlib, sys; from tdhil.service import work; work.main(['plan']);"
+            "print(pathlib.Path('/proc/self/oom_score_adj').read_text(), file=sys.stderr)")
+    done = subprocess.run([sys.executable, "-c", code], input=b"{}", capture_output=True)
+    assert int(done.stderr.split()[-1]) == 500
+
+
 # -- a container
 
 
