@@ -30,5 +30,9 @@ if TYPE_CHECKING:
         figures_at as figures_at, largest_stable_share as largest_stable_share, least_damping as least_damping,
         recipe_with as recipe_with, string_modes_hz as string_modes_hz, tune as tune,
     )
+    from tdhil.soft_torque.virtual_string import (
+        COLUMNS as COLUMNS, Course as Course, HostController as HostController, HostLoop as HostLoop,
+        Observer as Observer, Phase as Phase, Program as Program, Rig as Rig, VirtualString as VirtualString,
+    )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

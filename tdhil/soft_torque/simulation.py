@@ -135,8 +135,9 @@ def simulate(
     duration_s: float,
     keep_every_s: float = 0.1,
     longest_tick_s: float = LONGEST_TICK_S,
+    hold_s: float = 0.0,
 ) -> Trace:
-    """Every loop at every set speed: the set speed goes from ``begin``'s to the target along the ramp.
+    """Every loop at every set speed: the set speed goes from ``begin``'s to the target along the ramp, after a hold.
 
     ``target_rad_s``: (loops, speeds). A bit must be stated. Raises ValueError where none is.
     """
@@ -145,37 +146,31 @@ def simulate(
     grid = grid_of(string, longest_tick_s)
     shape = target_rad_s.shape
     top = _Top(loops, grid, shape[1])
-    bit = _Bit(string.bit, string.bottom_viscous_nm_s_rad, grid)
     now = np.broadcast_to(begin.speed_rad_s, shape).astype(float).copy()
     set_speed = now.copy() if begin.how != "rest" else np.zeros(shape)
-    waves = _Waves(grid, shape[0] * shape[1])
-    speed: Array = np.zeros(shape)
-    bit_speed: Array = np.zeros(shape)
-    held = np.zeros(shape)
+    pipe = Pipe(string, grid, shape[0] * shape[1])
+    speed, held = np.zeros(shape), np.zeros(shape)
     if begin.how == "stuck":
         speed, held = now, np.full(shape, string.bit.static_nm)
-        waves.fill(held.ravel(), np.zeros(held.size))
+        pipe.wind_up(held.ravel())
     elif begin.how == "turning":
-        speed = bit_speed = now
-        load = bit.sliding(bit_speed) * np.sign(bit_speed) + string.bottom_viscous_nm_s_rad * bit_speed
-        waves.fill(load.ravel(), speed.ravel())
-        held = waves.top_torque(speed.ravel()).reshape(shape)
+        speed = now
+        held = pipe.turn(now.ravel()).reshape(shape)
     top.begin(speed, held)
-    bit_speed = bit_speed.ravel().copy()
     step = ramp_rad_s2 * grid.tick_s
-    count = ceil(duration_s / grid.tick_s)
+    count, held_ticks = ceil(duration_s / grid.tick_s), round(hold_s / grid.tick_s)
     every = max(1, round(keep_every_s / grid.tick_s))
     kept: list[tuple[float, Array, Array, Array, Array]] = []
-    first: Array = np.full(bit_speed.shape, np.inf)
-    last: Array = np.full(bit_speed.shape, -1.0)
-    turned = bit_speed > 0.0
+    first: Array = np.full(now.size, np.inf)
+    last: Array = np.full(now.size, -1.0)
+    turned = pipe.bit_rad_s > 0.0
     for tick in range(count):
-        set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
-        arriving_down, arriving_up = waves.arriving()
-        top_wave, mean_top = top.step(arriving_up[0], set_speed)
-        bit_wave, bit_speed = bit.step(arriving_down[-1], bit_speed)
-        waves.send(arriving_down, arriving_up, top_wave, bit_wave)
+        if tick >= held_ticks:
+            set_speed = set_speed + np.clip(target_rad_s - set_speed, -step, step)
+        top_wave, mean_top = top.step(pipe.at_top(), set_speed)
+        pipe.tick(top_wave)
         time_s = (tick + 1) * grid.tick_s
+        bit_speed = pipe.bit_rad_s
         still = bit_speed == 0.0
         last[still] = time_s
         turned |= bit_speed > 0.0
@@ -219,10 +214,14 @@ class _Waves:
 
     def top_torque(self, top_speed: Array) -> Array:
         """τ just below the rotor."""
-        arriving = self._up[(self._now - self._grid.ticks[0]) % self._size, 0]
         felt = self._grid.impedance_nm_s_rad[0] + 0.5 * self._grid.drag_nm_s_rad[0]
-        torque: Array = felt * top_speed - arriving
+        torque: Array = felt * top_speed - self.at_top()
         return torque
+
+    def at_top(self) -> Array:
+        """What comes out of the topmost segment now, at its upper end."""
+        arriving: Array = self._up[(self._now - self._grid.ticks[0]) % self._size, 0]
+        return arriving
 
     def arriving(self) -> tuple[Array, Array]:
         """What comes out of every segment now, at its lower and at its upper end."""
@@ -239,6 +238,46 @@ class _Waves:
         self._down[slot, 1:] = self._twice_below * speed - b
         self._up[slot, :-1] = self._twice_above * speed - a
         self._now += 1
+
+
+class Pipe:
+    """Waves and bit, a tick at a time: whatever hangs below a top drive, simulated or real; one number a case."""
+
+    def __init__(self, string: DrillString, grid: Grid, cases: int) -> None:
+        assert string.bit is not None
+        self._viscous = string.bottom_viscous_nm_s_rad
+        self._waves = _Waves(grid, cases)
+        self._bit = _Bit(string.bit, string.bottom_viscous_nm_s_rad, grid)
+        self.bit_rad_s: Array = np.zeros(cases)
+
+    def wind_up(self, torque_nm: Array) -> None:
+        """Nothing turns, and all of it is wound up to that torque."""
+        self._waves.fill(torque_nm, np.zeros(torque_nm.size))
+
+    def turn(self, speed: Array) -> Array:
+        """All of it turns steadily; the torque that this takes at the top."""
+        self.bit_rad_s = speed.copy()
+        load = self._bit.sliding(speed) * np.sign(speed) + self._viscous * speed
+        self._waves.fill(load, speed)
+        return self.top_torque(speed)
+
+    def release(self) -> None:
+        """Off bottom: the bit's dry friction is gone."""
+        self._bit.release()
+
+    def at_top(self) -> Array:
+        """b, that comes up out of the topmost segment during the coming tick."""
+        return self._waves.at_top()
+
+    def top_torque(self, speed: Array) -> Array:
+        """τ just below the rotor, at that speed."""
+        return self._waves.top_torque(speed)
+
+    def tick(self, from_top: Array) -> None:
+        """One on, with the wave that the top sends down meanwhile."""
+        arriving_down, arriving_up = self._waves.arriving()
+        bit_wave, self.bit_rad_s = self._bit.step(arriving_down[-1], self.bit_rad_s)
+        self._waves.send(arriving_down, arriving_up, from_top, bit_wave)
 
 
 class _Top:
@@ -329,6 +368,10 @@ class _Bit:
     def sliding(self, speed: Array) -> Array:
         """T_f without its sign."""
         return self._friction.coulomb_nm + self._bent(speed)
+
+    def release(self) -> None:
+        """No dry friction any more."""
+        self._friction, self._falls = BitFriction(0.0, 0.0, np.inf), 0.0
 
     def _bent(self, speed: Array) -> Array:
         if self._falls == 0.0:
