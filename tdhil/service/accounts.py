@@ -217,6 +217,10 @@ class AccountsFile:
                 "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
                 "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
             }, mode=0o600)
+            if os.geteuid() == 0:              # by root for a service that isn't: it has to read them
+                owner = self.path.parent.stat()
+                for path in (self.path, self.path.with_suffix(".lock")):
+                    os.chown(path, owner.st_uid, owner.st_gid)
         except OSError as error:
             raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path)) from error
         self.read()
