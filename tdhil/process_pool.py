@@ -31,7 +31,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from selectors import EVENT_READ, DefaultSelector
 from struct import Struct
-from types import TracebackType
 from typing import Any, Final, Generic, Self, TypeVar
 
 from tdhil.errors import TdhilError
@@ -43,6 +42,7 @@ _PROGRAM: Final = "import sys; sys.path[:] = {path!r}; from tdhil.process_pool i
 _LENGTH: Final = Struct("<Q")
 _TRIES: Final = 2
 _KILLS: Final = 5
+_ASK_S: Final = 0.2             # how often somebody is asked whether to stop
 _START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
 _STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
 _ALONE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -83,11 +83,13 @@ class Pool(Generic[Task, Result]):
         self._limits = limits
         self._workers: list[_Worker] = []
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | Loss]]:
+    def run(
+        self, tasks: Iterable[Task], stop: Callable[[], bool] | None = None
+    ) -> Iterator[tuple[Task, Result | Loss]]:
         """Every task with its result, or with what became of it instead, as they are done.
 
-        Raises TdhilError where no process can be started, and what ``function`` raises. Whoever stops in the middle
-        calls `close`.
+        ``stop`` is asked several times a second: True ends it at once, without what is in hand. Raises TdhilError where
+        no process can be started, and what ``function`` raises. Whoever stops in the middle calls `close`.
         """
         fresh = iter(tasks)
         again: deque[_Job[Task]] = deque()
@@ -97,12 +99,16 @@ class Pool(Generic[Task, Result]):
                 worker.job = None
                 answers.register(worker.stdout, EVENT_READ, worker)
             while True:
+                if stop is not None and stop():
+                    return
                 more = self._feed(fresh, again, answers)
                 busy = [worker for worker in self._workers if worker.job is not None]
                 if not busy and not more:
                     return
                 now_s = time.monotonic()
                 next_s = min((worker.deadline_s for worker in busy), default=now_s + 1.0)
+                if stop is not None:
+                    next_s = min(next_s, now_s + _ASK_S)
                 wait_s = None if math.isinf(next_s) else max(0.0, next_s - now_s)
                 ready = {key.data for key, _ in answers.select(wait_s)}
                 now_s = time.monotonic()
@@ -166,9 +172,7 @@ class Pool(Generic[Task, Result]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -27,6 +27,7 @@ _AHEAD: Final = 4                       # tasks for each thread of the cluster
 _RESUBMIT: Final = 5
 _PATIENCE_S: Final = 60.0               # without a single worker
 _LOOK_S: Final = 10.0
+_ASK_S: Final = 0.5                     # how often somebody is asked whether to stop
 _here = threading.local()
 
 
@@ -54,7 +55,8 @@ def guarded(function: Callable[[Task], Result], task: Task, limits: TaskLimits) 
 
 
 def run_on_cluster(
-    function: Callable[[Task], Result], tasks: Iterable[Task], address: str, limits: TaskLimits
+    function: Callable[[Task], Result], tasks: Iterable[Task], address: str, limits: TaskLimits,
+    stop: Callable[[], bool] | None = None,
 ) -> Iterator[tuple[Task, Result | Loss]]:
     """Every task with its result, as `Pool.run` gives it. Raises UsageError before the start where the scheduler can't
     be reached or its workers don't fit, and TdhilError where all of them have gone.
@@ -67,12 +69,12 @@ def run_on_cluster(
                          next_step="Start one with: dask scheduler") from error
     with client:
         threads = _check(client, address)
-        yield from _results(distributed, client, function, tasks, limits, threads * _AHEAD)
+        yield from _results(distributed, client, function, tasks, limits, threads * _AHEAD, stop)
 
 
 def _results(
     distributed: Any, client: Any, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits,
-    most: int,
+    most: int, stop: Callable[[], bool] | None,
 ) -> Iterator[tuple[Task, Result | Loss]]:
     waiting = iter(tasks)
     under_way: dict[Any, tuple[Task, int]] = {}
@@ -85,7 +87,11 @@ def _results(
             submit(task, 1)
         if not under_way:
             return
-        for future in _done(distributed, client, list(under_way)):
+        done = _done(distributed, client, list(under_way), stop)
+        if not done:
+            client.cancel(list(under_way), force=True)
+            return
+        for future in done:
             task, tries = under_way.pop(future)
             try:
                 result: Result | Loss = future.result(timeout=_LOOK_S)
@@ -108,18 +114,20 @@ def _results(
                 yield task, Loss("ProcessDied", f"the cluster's workers died with it, in each of {tries} tries")
 
 
-def _done(distributed: Any, client: Any, futures: list[Any]) -> list[Any]:
-    """Those that are done, at least one. Raises TdhilError where there has been no worker for long."""
+def _done(distributed: Any, client: Any, futures: list[Any], stop: Callable[[], bool] | None) -> list[Any]:
+    """Those that are done, at least one; none where it is to stop. TdhilError: there has been no worker for long."""
     empty_s = 0.0
-    while True:
+    wait_s = _LOOK_S if stop is None else _ASK_S
+    while stop is None or not stop():
         with suppress(TimeoutError), client.as_current():
-            return list(distributed.wait(futures, timeout=_LOOK_S, return_when="FIRST_COMPLETED").done)
-        empty_s = 0.0 if client.scheduler_info()["workers"] else empty_s + _LOOK_S
+            return list(distributed.wait(futures, timeout=wait_s, return_when="FIRST_COMPLETED").done)
+        empty_s = 0.0 if client.scheduler_info()["workers"] else empty_s + wait_s
         if empty_s >= _PATIENCE_S:
             raise TdhilError(
                 f"the cluster has had no worker for {empty_s:.0f} s; what is done is kept", where="fleet",
                 next_step="Start workers, and the same command again",
             )
+    return []
 
 
 def _check(client: Any, address: str) -> int:

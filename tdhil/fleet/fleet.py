@@ -112,8 +112,12 @@ def run_fleet(
     request: FleetRequest,
     progress: Progress | None = None,
     function: Callable[[LogTask], Done] = identify_log,
+    stop: Callable[[], bool] | None = None,
 ) -> FleetSummary:
-    """Identify all that isn't done yet, and write the table. Ctrl-C ends it early: what is done is in the table then.
+    """Identify all that isn't done yet, and write the table.
+
+    Ctrl-C ends it early, and so does ``stop``, which is asked several times a second: what is done is in the table
+    then, `FleetSummary.interrupted` says so, and the same again does the rest. It may be called in any thread.
 
     Raises UsageError (nothing there, a file that isn't ours, a cluster that doesn't fit) and LogBroken (disk full).
     """
@@ -131,7 +135,7 @@ def run_fleet(
         taken: list[tuple[float, str]] = []
         interrupted = False
         try:
-            results = _results(request, function, [task for task, _ in todo], stack) if todo else iter(())
+            results = _results(request, function, [task for task, _ in todo], stack, stop) if todo else iter(())
             stamps = {task.log: stamp for task, stamp in todo}
             for task, result in results:
                 done = _lost(task, result) if isinstance(result, Loss) else result
@@ -141,6 +145,7 @@ def run_fleet(
                 rows[task.log] = row
                 taken.append((done.cpu_s, task.log))
                 progress.done(row)
+            interrupted = stop is not None and stop() and len(rows) < len(found.logs)
         except KeyboardInterrupt:
             interrupted = True
             stack.close()
@@ -156,16 +161,17 @@ def run_fleet(
 
 
 def _results(
-    request: FleetRequest, function: Callable[[LogTask], Done], tasks: Sequence[LogTask], stack: ExitStack
+    request: FleetRequest, function: Callable[[LogTask], Done], tasks: Sequence[LogTask], stack: ExitStack,
+    stop: Callable[[], bool] | None,
 ) -> Iterator[tuple[LogTask, Done | Loss]]:
     if request.scheduler is not None:
         from tdhil.fleet.cluster import run_on_cluster
 
-        cluster = run_on_cluster(function, tasks, request.scheduler, request.limits)
+        cluster = run_on_cluster(function, tasks, request.scheduler, request.limits, stop)
         stack.callback(cluster.close)  # type: ignore[attr-defined]
         return cluster
     pool: Pool[LogTask, Done] = stack.enter_context(Pool(function, min(request.jobs, len(tasks)), request.limits))
-    return pool.run(tasks)
+    return pool.run(tasks, stop)
 
 
 def _lost(task: LogTask, loss: Loss) -> Done:

@@ -5,7 +5,11 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
+import threading
+import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,10 +84,35 @@ def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
 
 
 @pytest.mark.heavy
-def test_one_process_or_two_give_the_same_table(few, tmp_path):
-    one, two = (run_fleet(FleetRequest((str(few),), tmp_path / f"{jobs}.csv", jobs=jobs, cache=False)).rows
-                for jobs in (1, 2))
-    assert [repr(row) for row in one] == [repr(row) for row in two]
+def test_one_process_two_or_a_cluster_of_two_give_the_same_table(few, tmp_path):
+    """A small benchmarks/fleet_thousand.py."""
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
+    request = FleetRequest((str(few),), tmp_path / "one.csv", cache=False)
+    tables = [run_fleet(request).rows, run_fleet(replace(request, out=tmp_path / "two.csv", jobs=2)).rows]
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = replace(request, out=tmp_path / "there.csv", scheduler=cluster.scheduler_address)
+        tables.append(run_fleet(there).rows)
+    assert len({tuple(repr(row) for row in rows) for rows in tables}) == 1
+
+
+@pytest.mark.heavy
+def test_a_cluster_s_processes_killed_at_random(tmp_path, calls):
+    """Dask's own workers, and the process that each keeps: nothing is lost, nothing comes twice."""
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed (pip install '.[cluster]')")
+    import dask
+
+    from benchmarks.fleet_thousand import Killer, cluster_processes
+
+    roots = many(tmp_path / "logs", 60)
+    with dask.config.set({"distributed.scheduler.allowed-failures": 10}), distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        killer = Killer(6, lambda: cluster_processes(workers_too=True))
+        request = FleetRequest(roots, tmp_path / "fleet.csv", scheduler=cluster.scheduler_address)
+        summary = run_fleet(request, killer, function=poison.quick)
+    assert killer.kills == 6
+    assert [Path(row.log).name for row in read_table(tmp_path / "fleet.csv")] == [f"{k:03d}.mcap" for k in range(60)]
+    assert {row.verdict for row in summary.rows} == {"valid"}
 
 
 def test_every_kind_of_file_has_its_row(few, tmp_path):
@@ -169,6 +198,67 @@ def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
     assert run_fleet(request, function=poison.quick).done_before == 39
     assert run_fleet(replace(request, settings=Settings(confidence=0.9)), function=poison.quick).done_before == 0
     assert run_fleet(replace(request, again=True), function=poison.quick).done_before == 0
+
+
+def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
+    """Also one that hangs; and the same again does the rest."""
+    request = FleetRequest(many(tmp_path / "logs", 30, (poison.HANGS,)), tmp_path / "fleet.csv", jobs=2)
+    seen = []
+
+    class Counting:
+        def start(self, total, done): ...
+
+        def done(self, row):
+            seen.append(row)
+
+    first = run_fleet(request, Counting(), poison.quick, stop=lambda: len(seen) >= 10)
+    assert first.interrupted
+    assert 10 <= len(first.rows) == 31 - first.left < 30
+    (tmp_path / "logs" / "bad0.mcap").unlink()
+    second = run_fleet(request, function=poison.quick, stop=lambda: False)
+    assert (second.interrupted, second.done_before, second.left) == (False, len(first.rows), 0)
+
+
+def test_ctrl_c_in_a_terminal_and_the_same_command_again(tmp_path, calls):
+    """The whole foreground group gets the signal, as from a keyboard: the processes at work are in none of it."""
+    pty = pytest.importorskip("pty")
+    (folder,) = many(tmp_path / "logs", 120)
+    out = tmp_path / "fleet.csv"
+    script = (
+        "import functools, os, sys\n"
+        "os.open(os.ttyname(0), os.O_RDWR)                  # its controlling terminal from now on\n"
+        "import tdhil.fleet\n"
+        "from tdhil.cli.main import main\n"
+        "from tests.fleet import poison\n"
+        "tdhil.fleet.run_fleet = functools.partial(tdhil.fleet.run_fleet, function=poison.quick)\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-c", script, "fleet", folder, "--out", str(out), "--jobs", "2"]
+    try:
+        with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
+                              cwd=Path(__file__).parents[2]) as host:
+            os.close(theirs)
+            reader = threading.Thread(target=drain, args=(ours,), daemon=True)
+            reader.start()
+            while len(calls.read_text().split()) < 20 and host.poll() is None:
+                time.sleep(0.01)
+            os.write(ours, b"\x03")
+            assert host.wait() == 130
+    finally:
+        os.close(ours)
+    done = {row.log for row in read_table(out)}
+    assert 10 <= len(done) < 120                       # of twenty begun, what was in hand is gone
+    calls.write_text("")
+    summary = run_fleet(FleetRequest((folder,), out, jobs=2), function=poison.quick)
+    assert (summary.done_before, len(summary.rows)) == (len(done), 120)
+    assert sorted(calls.read_text().split()) == sorted({row.log for row in summary.rows} - done)
+
+
+def drain(terminal):
+    with suppress(OSError):
+        while os.read(terminal, 4096):
+            pass
 
 
 def test_live_logs_and_pipes_are_left_alone(tmp_path):
