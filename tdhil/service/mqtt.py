@@ -123,7 +123,9 @@ class Publisher:
                 raise UsageError(f"can't be taken ({getattr(error, 'strerror', None) or error})",
                                  where=f"{CA_FILE} {self._broker.ca_file}") from None
         found.on_connect = self._on_connect
-        found.on_connect_fail = lambda client, data: self._away("can't be reached")
+        # paho doesn't say why: a certificate that nobody vouches for comes to the same.
+        why = "can't be reached" + (", or its certificate isn't trusted" if self._broker.tls else "")
+        found.on_connect_fail = lambda client, data: self._away(why)
         found.on_disconnect = lambda client, data, flags, reason, properties: self._away(str(reason))
         return found
 

@@ -29,6 +29,15 @@ DEPLOY = ROOT / "deploy"
 # -- is anything moving?
 
 
+@pytest.fixture(autouse=True)
+def locks(tmp_path, monkeypatch):
+    """A folder of its own: others may be at work on this computer."""
+    folder = tmp_path / "lock"
+    folder.mkdir()
+    folder.chmod(0o1777)
+    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (str(folder),))
+
+
 def idle(data: Path) -> int:
     return main(["serve", "--check-idle", "--data", str(data)])
 
@@ -45,11 +54,7 @@ def test_a_run_that_lives_is_in_the_way_of_an_upgrade_with_or_without_its_web(se
     wait_for("the end", lambda: idle(service.store.folder) == ExitCode.OK)
 
 
-def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys, monkeypatch):
-    locks = tmp_path / "lock"
-    locks.mkdir()
-    locks.chmod(0o1777)
-    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (str(locks),))
+def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys):
     assert holders() == []
     with hold("modbus 127.0.0.1:1 unit 1"), hold("modbus 127.0.0.1:2 unit 1"):
         assert holders() == [holder_of("modbus 127.0.0.1:1 unit 1"), holder_of("modbus 127.0.0.1:2 unit 1")]
@@ -170,5 +175,9 @@ def test_the_container_s_recipe_names_what_there_is_and_nobody_s_registry():
     (entry,) = [rest for word, rest in steps if word == "ENTRYPOINT"]
     assert build_parser("serve").parse_args(re.findall(r'"([^"]+)"', entry)[1:]).data == Path("/data")
     (check,) = [rest for word, rest in steps if word == "HEALTHCHECK"]
-    compile(re.findall(r'"([^"]+)"', check)[2], "HEALTHCHECK", "exec")
+    code = re.findall(r'"([^"]+)"', check)[2]
+    for address in ("http://127.0.0.1:1", "https://127.0.0.1:1"):      # nobody there: unhealthy, and no other mistake
+        done = subprocess.run([sys.executable, "-c", code.replace(":8420", ":1")], capture_output=True, text=True,
+                              env={**os.environ, "TDHIL_HEALTH": address.partition(":")[0]})
+        assert (done.returncode, "refused" in done.stderr) == (1, True), done.stderr
     assert ("STOPSIGNAL", signal.SIGTERM.name) in [tuple(one) for one in steps]

@@ -6,6 +6,7 @@ import contextlib
 import json
 import shutil
 import socket
+import ssl
 import subprocess
 import threading
 import time
@@ -28,7 +29,8 @@ CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 1, 2, 3, 4, 14        # MQTT 3.1
 class Heard:
     """The broker's end of the wire, by the specification: acknowledges, and notes down every packet."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, tls: ssl.SSLContext | None = None) -> None:
+        self._tls = tls
         self.listening = socket.create_server(("127.0.0.1", port))
         self.port = self.listening.getsockname()[1]
         self.packets: list[tuple[int, int, bytes]] = []                # type, flags, body
@@ -43,7 +45,10 @@ class Heard:
                 threading.Thread(target=self._serve, args=(peer,), daemon=True).start()
 
     def _serve(self, peer: socket.socket) -> None:
-        with contextlib.suppress(OSError, IndexError), peer.makefile("rb") as file:
+        with contextlib.suppress(OSError, IndexError), contextlib.ExitStack() as both:
+            if self._tls is not None:
+                peer = both.enter_context(self._tls.wrap_socket(peer, server_side=True))
+            file = both.enter_context(peer.makefile("rb"))
             while True:
                 first, length, shift = file.read(1)[0], 0, 0
                 while True:
@@ -173,6 +178,28 @@ def test_a_password_comes_from_a_file_and_is_shown_nowhere(tmp_path):
     assert heard.packets[0][2].endswith(b"\x00\x08rig room\x00\x0dh4rd to guess")
     assert "h4rd" not in repr(broker) + str(broker) + str(said)
     assert "unencrypted" in said[0]
+    heard.close()
+
+
+def test_a_broker_s_certificate_is_looked_at_before_anything_is_told(tls, tmp_path):
+    """One that nobody vouches for is sent nothing, no password above all."""
+    cert, key = tls
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(cert, key)
+    heard, said = Heard(tls=context), []
+    given = {"TDHIL_MQTT_USER": "u", "TDHIL_MQTT_PASSWORD": "p"}
+    doubted = Publisher(Broker.of(f"mqtts://127.0.0.1:{heard.port}", given), dict, said.append)
+    doubted.start()
+    wait_for("the complaint", lambda: said)
+    doubted.close()
+    assert "its certificate isn't trusted; it is tried again" in said[0]
+    assert heard.packets == []
+    trusted = Publisher(Broker.of(f"mqtts://127.0.0.1:{heard.port}", given | {"TDHIL_MQTT_CA_FILE": str(cert)}), dict,
+                        said.append)
+    trusted.start()
+    wait_for("the status", lambda: heard.last().get("tdhil/status") == "online")
+    trusted.close()
+    assert "unencrypted" not in str(said)
     heard.close()
 
 

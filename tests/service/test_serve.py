@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -183,19 +182,6 @@ def test_this_computer_is_not_as_long_as_it_has_no_users(host):
     require_way(host, tls=True, accounts=True)
     with pytest.raises(UsageError, match="goes over no open line"):
         require_way(host, tls=False, accounts=True)
-
-
-@pytest.fixture(scope="module")
-def tls(tmp_path_factory) -> tuple[Path, Path]:
-    """A certificate of its own for 127.0.0.1, and its key."""
-    if shutil.which("openssl") is None:
-        pytest.skip("no openssl to make a certificate")
-    folder = tmp_path_factory.mktemp("tls")
-    cert, key = folder / "cert.pem", folder / "key.pem"
-    subprocess.run(["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
-                    "-subj", "/CN=tdhil", "-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost", "-days", "2",
-                    "-keyout", key, "-out", cert], check=True, capture_output=True)
-    return cert, key
 
 
 def test_a_certificate_that_does_not_serve_is_refused_in_words(tls, tmp_path, capsys, monkeypatch):
