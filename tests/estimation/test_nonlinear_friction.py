@@ -38,7 +38,7 @@ FIRST_ORDER = np.array([0.4, 0.0, 0.15, 0.0, 0.0, 0.02])
 def test_the_two_filters_have_the_ratio_that_the_lines_show(phi):
     s = 2j * np.pi * np.array(LINES)
     speed, torque = signal_filters.filters(phi, s)
-    assert np.allclose(torque / speed, np.exp(signal_filters.log_ratio(phi, s)), rtol=1e-12)
+    assert np.allclose(torque / speed, signal_filters.Ratio(phi, s).value, rtol=1e-12)
 
 
 def test_a_parabola_s_lines_by_hand():

@@ -15,6 +15,7 @@ Gaussian.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,8 @@ from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.shafts import Believing
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
 from tdhil.recording import FloatArray
+
+_SERIES = 1e-4          # of q/ν
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,9 @@ class Likelihood:
         self.s_tw = np.array([line.s_tw for line in lines])
         self.nu = np.array([line.nu for line in lines])
         self.segments = np.array([float(len(line.speed)) for line in lines])
+        self._s_wt: ComplexArray = self.s_tw.conj()
         self._scale = 2.0 * (self.nu + self.segments) / self.nu
+        self._half_scale = 0.5 * self._scale / self.nu
         self._load = load
         self._believing = model.shaft if isinstance(model.shaft, Believing) else None
         self._of_line = np.equal.outer(np.arange(len(lines)), self.owner).astype(np.float64)
@@ -66,9 +71,7 @@ class Likelihood:
         self._prior_rows = np.zeros((len(known), model.size))
         for row, prior in enumerate(known):
             self._prior_rows[row, prior.index] = 1.0 / prior.sd
-        self._prior_index = np.array([prior.index for prior in known], dtype=np.intp)
-        self._prior_mean = np.array([prior.mean for prior in known])
-        self._prior_sd = np.array([prior.sd for prior in known])
+        self._prior_offset = np.array([prior.mean / prior.sd for prior in known])
         stated = {prior.index for prior in priors}
         lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
         self._lags = lags if model.rigid and not stated & set(lags) else None
@@ -101,53 +104,62 @@ class Likelihood:
 
     def variance(self, g: ComplexArray) -> FloatArray:
         """v_k of one period's equation error, (K,); floored where the cross term cancels all but rounding."""
-        alone = self.s_tt + np.abs(g) ** 2 * self.s_ww
-        v: FloatArray = np.maximum(alone - 2.0 * (g.conj() * self.s_tw).real, 1e-9 * alone)
+        alone = self.s_tt + (g.real * g.real + g.imag * g.imag) * self.s_ww
+        v: FloatArray = np.maximum(alone - 2.0 * (g.real * self.s_tw.real + g.imag * self.s_tw.imag), 1e-9 * alone)
         return v
 
     def weighted(self, theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """√P r/√v of every segment and line, and q (K,)."""
         g = self.model.impedance(theta, self.s)
-        root_v = np.sqrt(self.variance(g))
-        e: ComplexArray = self._error(theta, g) * self.root_periods / root_v[self.owner]
-        q: FloatArray = self._of_line @ (e.real**2 + e.imag**2)
-        return e, q
+        return self._weighted(theta, g, self._gain(self.variance(g)))
 
-    def _error(self, theta: FloatArray, g: ComplexArray) -> ComplexArray:
-        """The equation error of every segment and line."""
-        error: ComplexArray = self._unloaded(theta) - g[self.owner] * self.speed
-        return error
+    def _gain(self, v: FloatArray) -> FloatArray:
+        """√P/√v of every segment and line."""
+        gain: FloatArray = self.root_periods / np.sqrt(v)[self.owner]
+        return gain
+
+    def _weighted(self, theta: FloatArray, g: ComplexArray, gain: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        e: ComplexArray = (self._unloaded(theta) - g[self.owner] * self.speed) * gain
+        q: FloatArray = self._of_line @ (e.real * e.real + e.imag * e.imag)
+        return e, q
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """A real vector whose sum of squares is −2 ln L."""
-        e, q = self.weighted(theta)
-        u = self._phi(q, False)[0][self.owner] * e
-        return np.concatenate([u.real, u.imag, self._prior_residuals(theta)])
+        return self.at(theta)[0]
 
     def linearised(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The residuals (R,) and ∂residuals/∂theta (R, P).
+        """The residuals (R,) and ∂residuals/∂theta (R, P)."""
+        residuals, slopes = self.at(theta)
+        return residuals, slopes()
 
-        With u = √P r/√v: ∂u = −√P W ∂G/√v − u ∂v/(2v), ∂v = 2 Re(G* ∂G) S_WW − 2 Re(∂G* S_TW), ∂q = 2 Σ Re(u* ∂u),
-        and ∂(φ u) = φ ∂u + φ' ∂q u.
+    def at(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
+        """The residuals (R,), and what gives ∂residuals/∂theta (R, P) should it be asked for.
+
+        With u = √P r/√v: ∂u = −√P W ∂G/√v − u ∂v/(2v), ∂v = 2 Re[(G* S_WW − S_TW*) ∂G], ∂q = 2 Σ Re(u* ∂u), and
+        ∂(φ u) = φ ∂u + φ' ∂q u. A descent tries more places than it goes to.
         """
-        g, slopes = self.model.impedance_jacobian(theta, self.s)
+        g, g_slopes = self.model.seen(theta, self.s)
         v = self.variance(g)
-        v_slopes = 2.0 * (
-            (g.conj()[:, None] * slopes).real * self.s_ww[:, None] - (slopes.conj() * self.s_tw[:, None]).real
-        )
-        k = self.owner
-        gain = self.root_periods / np.sqrt(v)[k]
-        e: ComplexArray = self._error(theta, g) * gain
-        q = self._of_line @ (e.real**2 + e.imag**2)
-        e_slopes = -gain[:, None] * self._by(slopes) - e[:, None] * (v_slopes / (2.0 * v[:, None]))[k]
-        q_slopes = 2.0 * (self._of_line @ (e.conj()[:, None] * e_slopes).real)
+        gain = self._gain(v)
+        e, q = self._weighted(theta, g, gain)
         phi, phi_slope = self._phi(q)
+        k, n = self.owner, len(self.owner)
         u = phi[k] * e
-        u_slopes = phi[k][:, None] * e_slopes + e[:, None] * (phi_slope[:, None] * q_slopes)[k]
-        return (
-            np.concatenate([u.real, u.imag, self._prior_residuals(theta)]),
-            np.concatenate([u_slopes.real, u_slopes.imag, self._prior_jacobian(theta)]),
-        )
+        known = self._prior_residuals(theta)
+        residuals = np.empty(2 * n + len(known))
+        residuals[:n], residuals[n : 2 * n], residuals[2 * n :] = u.real, u.imag, known
+
+        def slopes() -> FloatArray:
+            by_g = g_slopes()
+            by_v = ((g.conj() * self.s_ww - self._s_wt) / v)[:, None] * by_g
+            e_slopes = -gain[:, None] * self._by(by_g) - e[:, None] * by_v.real[k]
+            q_slopes = 2.0 * (self._of_line @ (e.conj()[:, None] * e_slopes).real)
+            u_slopes = phi[k][:, None] * e_slopes + e[:, None] * (phi_slope()[:, None] * q_slopes)[k]
+            found = np.empty((len(residuals), len(theta)))
+            found[:n], found[n : 2 * n], found[2 * n :] = u_slopes.real, u_slopes.imag, self._prior_jacobian(theta)
+            return found
+
+        return residuals, slopes
 
     def _by(self, slopes: ComplexArray) -> ComplexArray:
         """∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
@@ -156,64 +168,63 @@ class Likelihood:
             found[:, self._load.index] += self._load.lines
         return found
 
-    def _phi(self, q: FloatArray, sloped: bool = True) -> tuple[FloatArray, FloatArray]:
-        """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q) and dφ/dq, (K,) each; by series where q/ν is small.
-
-        This is called thousands of times for one interval. Not ``sloped``: the second is left out.
-        """
+    def _phi(self, q: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
+        """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q), (K,), and what gives dφ/dq; by series where q/ν is small."""
         x = q / self.nu
-        if x.min() >= 1e-4:          # as nearly always
-            ratio = np.log1p(x) / x
-            slope = (1.0 / (1.0 + x) - ratio) / x if sloped else ratio
-        else:
-            small = x < 1e-4
-            safe = np.where(small, 1.0, x)
-            plain = np.log1p(safe) / safe
-            ratio = np.where(small, 1.0 - x / 2.0 + x * x / 3.0, plain)
-            slope = np.where(small, -0.5 + 2.0 * x / 3.0, (1.0 / (1.0 + safe) - plain) / safe)
-        phi = np.sqrt(self._scale * ratio)
-        return phi, self._scale * slope / (2.0 * phi * self.nu) if sloped else phi
+        small = x < _SERIES
+        few = bool(small.any())          # hardly ever
+        safe = np.where(small, 1.0, x) if few else x
+        plain = np.log1p(safe) / safe
+        phi: FloatArray = np.sqrt(self._scale * (np.where(small, 1.0 - x / 2.0 + x * x / 3.0, plain) if few else plain))
+
+        def slope() -> FloatArray:
+            found = (1.0 / (1.0 + safe) - plain) / safe
+            if few:
+                found = np.where(small, -0.5 + 2.0 * x / 3.0, found)
+            of_q: FloatArray = self._half_scale * found / phi
+            return of_q
+
+        return phi, slope
 
     def objective(self, theta: FloatArray) -> float:
         """−2 ln L."""
         return float(np.sum(self.residuals(theta) ** 2))
 
     def _prior_residuals(self, theta: FloatArray) -> FloatArray:
-        known: FloatArray = (theta[self._prior_index] - self._prior_mean) / self._prior_sd
+        known: FloatArray = self._prior_rows @ theta - self._prior_offset
         if self._believing is not None:
             known = np.concatenate([known, self.beliefs(theta)[0]])
-        if self._lags is not None:
-            known = np.append(known, self._shared_lag(theta)[0])
-        if self.constraint is None:
-            return known
-        z = self.tie_error(theta)
-        dof = self.constraint.dof
-        found = np.empty(len(known) + 1)
-        found[:-1], found[-1] = known, math.copysign(math.sqrt((dof + 1.0) * float(np.log1p(z * z / dof))), z)
-        return found
+        more = [] if self._lags is None else [self._shared_lag(theta)[0]]
+        if self.constraint is not None:
+            z, dof = self.tie_error(theta), self.constraint.dof
+            more.append(math.copysign(math.sqrt((dof + 1.0) * math.log1p(z * z / dof)), z))
+        return np.concatenate([known, more]) if more else known
 
-    def _shared_lag(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """What the reports' common lag costs (`signal_filters.shared_lag`), and its slopes (P,)."""
+    def _shared_lag(self, theta: FloatArray) -> tuple[float, float, float]:
+        """What the reports' common lag costs (`signal_filters.shared_lag`), and its slopes over either lag."""
+        assert self._lags is not None
+        speed, torque = self._lags
+        return signal_filters.shared_lag(float(theta[speed]), float(theta[torque]), self._unseen_s)
+
+    def _shared_lag_row(self, theta: FloatArray) -> FloatArray:
+        """The slopes (P,) of `_shared_lag`."""
         assert self._lags is not None
         row = np.zeros(self.model.size)
-        speed, torque = self._lags
-        value, row[speed], row[torque] = signal_filters.shared_lag(
-            float(theta[speed]), float(theta[torque]), self._unseen_s
-        )
-        return value, row
+        _, *row[list(self._lags)] = self._shared_lag(theta)
+        return row
 
     def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
-        rows = self._prior_rows
+        rows = [self._prior_rows]
         if self._believing is not None:
-            rows = np.concatenate([rows, self.beliefs(theta)[1]])
+            rows.append(self.beliefs(theta)[1])
         if self._lags is not None:
-            rows = np.concatenate([rows, self._shared_lag(theta)[1][None, :]])
-        if self.constraint is None:
-            return rows
-        z, n = self.tie_error(theta), self.constraint.dof
-        value = np.sqrt((n + 1.0) * np.log1p(z * z / n))
-        slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else np.sqrt((n + 1.0) / n)
-        return np.concatenate([rows, slope / self.constraint.sd * self._tie_row[None, :]])
+            rows.append(self._shared_lag_row(theta)[None, :])
+        if self.constraint is not None:
+            z, n = self.tie_error(theta), self.constraint.dof
+            value = math.sqrt((n + 1.0) * math.log1p(z * z / n))
+            slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else math.sqrt((n + 1.0) / n)
+            rows.append(slope / self.constraint.sd * self._tie_row[None, :])
+        return np.concatenate(rows)
 
     def tie_error(self, theta: FloatArray) -> float:
         """How far the friction is from what the levels say, in standard deviations.
@@ -240,7 +251,7 @@ class Likelihood:
         parts += [(np.outer(row, row), np.inf) for row in self._prior_rows]
         parts += [(np.outer(row, row), np.inf) for row in self.beliefs(theta)[1]]
         if self._lags is not None:
-            row = self._shared_lag(theta)[1]
+            row = self._shared_lag_row(theta)
             parts.append((np.outer(row, row), np.inf))
         if self.constraint is not None:
             parts.append((np.outer(self._tie_row, self._tie_row) / self.constraint.sd**2, self.constraint.dof))

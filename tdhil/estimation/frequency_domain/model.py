@@ -1,6 +1,6 @@
 """A shaft seen through a drive's reports: G(s) = Z(s; m) · exp(ln F_T/F_w(s; phi)), theta = (m, phi)."""
 
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -67,18 +67,25 @@ class Model:
 
     def impedance(self, theta: FloatArray, s: ComplexArray) -> ComplexArray:
         """G, N·m·s/rad, (K,)."""
-        m, phi = theta[: self.mechanical], theta[self.mechanical :]
-        g: ComplexArray = self.shaft.impedance(m, s) * np.exp(signal_filters.log_ratio(phi, s))
-        return g
+        return self.seen(theta, s)[0]
 
     def impedance_jacobian(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """G (K,) and ∂G/∂theta (K, P)."""
-        m, phi = theta[: self.mechanical], theta[self.mechanical :]
-        seen = np.exp(signal_filters.log_ratio(phi, s))
-        g: ComplexArray = self.shaft.impedance(m, s) * seen
-        slopes: ComplexArray = np.concatenate(
-            [self.shaft.jacobian(m, s) * seen[:, None], signal_filters.log_ratio_jacobian(phi, s) * g[:, None]], axis=1
-        )
+        g, slopes = self.seen(theta, s)
+        return g, slopes()
+
+    def seen(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, Callable[[], ComplexArray]]:
+        """G (K,), and what gives ∂G/∂theta (K, P) should it be asked for."""
+        m = theta[: self.mechanical]
+        reports = signal_filters.Ratio(theta[self.mechanical :], s)
+        g: ComplexArray = self.shaft.impedance(m, s) * reports.value
+
+        def slopes() -> ComplexArray:
+            found = np.empty((len(s), len(theta)), dtype=np.complex128)
+            np.multiply(self.shaft.jacobian(m, s), reports.value[:, None], out=found[:, : self.mechanical])
+            np.multiply(reports.log_slopes(), g[:, None], out=found[:, self.mechanical :])
+            return found
+
         return g, slopes
 
     def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:

@@ -18,8 +18,8 @@ from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.recording import BoolArray, FloatArray
 
-Linearised = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-Residuals = Callable[[FloatArray], FloatArray]
+At = Callable[[FloatArray], tuple[FloatArray, Callable[[], FloatArray]]]
+"""From parameters to residuals r, and to what gives their slopes A should it come to that."""
 
 _MOST_STEPS = 200
 _MOST_TRIES = 12
@@ -44,30 +44,34 @@ class Box:
     scale: FloatArray
 
 
-def descend(linearised: Linearised, residuals: Residuals, start: FloatArray, free: BoolArray, box: Box) -> Fit:
+def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
     """From ``start`` (P,) down; only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent."""
-    theta = np.where(free, np.clip(start, box.low, box.high), start)
-    r, a = linearised(theta)
+    low, high = box.low, box.high
+    theta = np.where(free, np.clip(start, low, high), start)
+    r, slopes = at(theta)
     cost = float(r @ r)
     damping = 1e-3
     for _ in range(_MOST_STEPS):
+        a = slopes()
         gradient = a.T @ r
-        stuck = (theta <= box.low) & (gradient > 0.0) | (theta >= box.high) & (gradient < 0.0)
+        stuck = (theta <= low) & (gradient > 0.0) | (theta >= high) & (gradient < 0.0)
         moving = np.flatnonzero(free & ~stuck)
         if len(moving) == 0:
             break
-        scaled = a[:, moving] * box.scale[moving]
+        scale = box.scale[moving]
+        scaled = a[:, moving] * scale
         normal, pull = scaled.T @ scaled, scaled.T @ r
-        size = np.diag(normal).copy()
+        size = normal.diagonal().copy()
         size[size <= 0.0] = 1.0
+        here, least, most, floor = theta[moving], low[moving], high[moving], 1e-14 * size.max()
         gain = 0.0
         for _ in range(_MOST_TRIES):
-            step = _solved(normal + np.diag(damping * size + 1e-14 * size.max()), -pull)
+            damped = normal.copy()
+            damped.flat[:: len(moving) + 1] += damping * size + floor
+            step = _solved(damped, -pull)
             trial = theta.copy()
-            trial[moving] = np.clip(
-                theta[moving] + step * box.scale[moving], box.low[moving], box.high[moving]
-            )
-            tried = residuals(trial)
+            trial[moving] = np.minimum(np.maximum(here + step * scale, least), most)
+            tried, slopes = at(trial)
             trial_cost = float(tried @ tried)
             if trial_cost < cost:
                 gain = cost - trial_cost
@@ -77,10 +81,8 @@ def descend(linearised: Linearised, residuals: Residuals, start: FloatArray, fre
                 break
         if gain <= 0.0:
             break
-        theta = trial
+        theta, r, cost = trial, tried, trial_cost
         damping = max(damping / 10.0, 1e-9)
-        r, a = linearised(theta)
-        cost = float(r @ r)
         if gain < _SMALL_GAIN * max(1.0, 1e-3 * cost):
             break
     return Fit(theta, cost)
@@ -147,7 +149,7 @@ def _descent(problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed) 
     begin = np.array(start, dtype=np.float64)
     for index, value in fixed.items():
         free[index], begin[index] = False, value
-    return descend(problem.linearised, problem.residuals, begin, free, limits)
+    return descend(problem.at, begin, free, limits)
 
 
 def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
@@ -209,7 +211,7 @@ def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
     """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
     phi = np.zeros(signal_filters.COUNT)
     phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
-    seen = problem.torque / (np.exp(signal_filters.log_ratio(phi, problem.s))[problem.owner] * problem.speed)
+    seen = problem.torque / (signal_filters.Ratio(phi, problem.s).value[problem.owner] * problem.speed)
     s = problem.s[problem.owner]
     weight = np.abs(problem.speed)
     inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))

@@ -43,50 +43,60 @@ PLAUSIBLE: Final = ((SPEED_LAG, 1.0), (TORQUE_LAG, 1.0), (AVERAGE, 1.0))     # s
 _AVERAGE_CYCLES = 0.8          # an average of w has a zero at 1/w: lines must stay below it
 
 
-def log_ratio(phi: FloatArray, s: ComplexArray) -> ComplexArray:
-    """Ln F_T/F_w, (K,); ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s)."""
-    speed_lag, speed_shape, torque_lag, torque_shape, u, skew = phi.tolist()
-    x = speed_lag * s
-    y = torque_lag * s
-    ratio: ComplexArray = np.log((1.0 + x + speed_shape * x * x) / (1.0 + y + torque_shape * y * y)) - skew * s
-    if u != 0.0:
-        ratio = ratio + np.sign(u) * np.log(np.sinc(np.abs(s) * np.sqrt(abs(u)) / (2.0 * np.pi)))
-    return ratio
+class Ratio:
+    """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are asked for a result.
+
+    ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s); ``s`` (K,). ``value`` (K,).
+    """
+
+    def __init__(self, phi: FloatArray, s: ComplexArray) -> None:
+        self._phi, self._s = phi.tolist(), s
+        speed_lag, speed_shape, torque_lag, torque_shape, u, skew = self._phi
+        self._x, self._y = speed_lag * s, torque_lag * s
+        self._speed = 1.0 + self._x * (1.0 + speed_shape * self._x)
+        self._torque = 1.0 + self._y * (1.0 + torque_shape * self._y)
+        value: ComplexArray = self._speed / self._torque * np.exp(-skew * s)
+        if u != 0.0:
+            half = 0.5 * math.sqrt(abs(u)) * np.abs(s)
+            sinc = np.sin(half) / half
+            value = value * sinc if u > 0.0 else value / sinc
+        self.value = value
+
+    def log_slopes(self) -> ComplexArray:
+        """∂ ln F_T/F_w / ∂phi, (K, 6).
+
+        With y = ω √|u|/2: ∂a/∂u = (y cot y − 1)/(2|u|), which is −ω²/24 at u = 0.
+        """
+        s = self._s
+        found = np.empty((len(s), COUNT), dtype=np.complex128)
+        _, speed_shape, _, torque_shape, u, _ = self._phi
+        for lag, shape, size, x, poles in (
+            (SPEED_LAG, SPEED_SHAPE, speed_shape, self._x, 1.0 / self._speed),
+            (TORQUE_LAG, TORQUE_SHAPE, torque_shape, self._y, -1.0 / self._torque),
+        ):
+            found[:, lag] = (1.0 + 2.0 * size * x) * s * poles
+            found[:, shape] = x * x * poles
+        quarter = 0.25 * s.imag * s.imag
+        y2 = quarter * abs(u)
+        series = -1.0 / 6.0 - y2 / 90.0
+        small = y2 < 1e-3
+        if small.all():
+            found[:, AVERAGE] = quarter * series
+        else:
+            y = np.sqrt(np.where(small, 1.0, y2))
+            found[:, AVERAGE] = quarter * np.where(small, series, (y / np.tan(y) - 1.0) / (2.0 * y * y))
+        found[:, SKEW] = -s
+        return found
 
 
 def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is that of `log_ratio`."""
+    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is `Ratio`'s."""
     x, y = phi[SPEED_LAG] * s, phi[TORQUE_LAG] * s
     speed = 1.0 / (1.0 + x + phi[SPEED_SHAPE] * x * x)
     torque = np.exp(-phi[SKEW] * s) / (1.0 + y + phi[TORQUE_SHAPE] * y * y)
     u = float(phi[AVERAGE])
     average = np.sinc(np.abs(s) * np.sqrt(abs(u)) / (2.0 * np.pi))
     return (speed, torque * average) if u > 0.0 else (speed * average, torque)
-
-
-def log_ratio_jacobian(phi: FloatArray, s: ComplexArray) -> ComplexArray:
-    """∂ ln F_T/F_w / ∂phi, (K, 6).
-
-    With y = ω √|u|/2: ∂a/∂u = (y cot y − 1)/(2|u|), which is −ω²/24 at u = 0.
-    """
-    found = np.empty((len(s), COUNT), dtype=np.complex128)
-    values = phi.tolist()
-    for lag, shape, sign in ((SPEED_LAG, SPEED_SHAPE, 1.0), (TORQUE_LAG, TORQUE_SHAPE, -1.0)):
-        x = values[lag] * s
-        poles = sign / (1.0 + x + values[shape] * x * x)
-        found[:, lag] = (s + 2.0 * values[shape] * x * s) * poles
-        found[:, shape] = x * x * poles
-    quarter = 0.25 * np.abs(s) ** 2
-    y2 = quarter * abs(values[AVERAGE])
-    series = -1.0 / 6.0 - y2 / 90.0
-    small = y2 < 1e-3
-    if small.all():
-        found[:, AVERAGE] = quarter * series
-    else:
-        y = np.sqrt(np.where(small, 1.0, y2))
-        found[:, AVERAGE] = quarter * np.where(small, series, (y / np.tan(y) - 1.0) / (2.0 * y * y))
-    found[:, SKEW] = -s
-    return found
 
 
 # ---------------------------------------------------------------------------------------------------------------------
