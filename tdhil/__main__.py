@@ -1,7 +1,5 @@
 """`python -m tdhil`."""
 
-import sys
+from tdhil.cli.main import console
 
-from tdhil.cli.main import main
-
-sys.exit(main())
+console()

@@ -6,8 +6,11 @@ import argparse
 import errno
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import NoReturn
 
 from tdhil.cli.streams import sheltered
 from tdhil.version import __version__
@@ -160,5 +163,21 @@ def _report(error: Exception, as_json: bool) -> int:
     return int(code)
 
 
+def leave(code: int) -> NoReturn:
+    """The end of the process, at once also where arithmetic that was left alone goes on in a thread."""
+    background = sys.modules.get("tdhil.run.background")
+    if background is not None and background.goes_on():
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError, AttributeError):     # full, closed, or none
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+def console() -> NoReturn:
+    """`tdhil` in a shell."""
+    leave(main())
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    console()

@@ -172,10 +172,22 @@ class Background(Generic[T]):
                 self.instead = str(gone)
         usual_s = sys.getswitchinterval()
         sys.setswitchinterval(min(usual_s, SWITCH_S))
+        _in_threads.add(self)
         try:
             return self._work()
         finally:
+            _in_threads.discard(self)
             sys.setswitchinterval(usual_s)
+
+
+_in_threads: set[Background[Any]] = set()
+
+
+def goes_on() -> bool:
+    """Is a thread of this process still at arithmetic that was left alone? Then the process must not end in the usual
+    way: on its way out the C library calls OpenBLAS's end, which has been seen to wait for ever for such a thread.
+    """
+    return bool(_in_threads)
 
 
 def begin(
