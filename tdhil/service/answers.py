@@ -301,6 +301,13 @@ class Route:
     headers: Mapping[str, str] = field(default_factory=dict)
 
 
+_RANGE: Final = {"Range": "a piece of it, such as bytes=0-99"}
+
+
+def _file(media: str) -> Mapping[int, Any]:
+    return {200: media, 206: (media, "multipart/byteranges"), 400: "text/plain", 416: "text/plain"}
+
+
 ROUTES: Final = (
     Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
     Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
@@ -329,13 +336,13 @@ ROUTES: Final = (
           {202: ReplayView}, ReplayBody, (403, 404, 422)),
     Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
     Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
-          {200: "application/octet-stream", 206: "application/octet-stream"}, errors=(404,)),
-    Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", {200: "text/html", 206: "text/html"},
-          errors=(404,)),
+          _file("application/octet-stream"), errors=(404,), headers=_RANGE),
+    Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", _file("text/html"), errors=(404,),
+          headers=_RANGE),
     Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made when it is first asked for", "viewer",
-          {200: "application/pdf", 206: "application/pdf"}, errors=(404, 422)),
+          _file("application/pdf"), errors=(404, 422), headers=_RANGE),
     Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
-          {200: "application/json", 206: "application/json"}, errors=(404,)),
+          _file("application/json"), errors=(404,), headers=_RANGE),
     Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
           query={"limit": "at most so many lines (200)"}),
     Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,
@@ -417,8 +424,9 @@ def document() -> dict[str, Any]:
     for route in ROUTES:
         responses: dict[str, Any] = {}
         for code, kind in route.answers.items():
-            media, inside = (kind, {}) if isinstance(kind, str) else ("application/json", {"schema": schema(kind)})
-            responses[str(code)] = {"description": route.summary, "content": {media: inside}}
+            files = kind if isinstance(kind, tuple) else (kind,) if isinstance(kind, str) else ()
+            content: dict[str, Any] = {media: {} for media in files} or {"application/json": {"schema": schema(kind)}}
+            responses[str(code)] = {"description": route.summary, "content": content}
         closed = () if route.role is None else (401, 403)
         responses |= {str(code): error for code in sorted({*route.errors, *closed})}
         parameters = [

@@ -140,7 +140,7 @@ class Relay:
             found: Running | None = await anyio.to_thread.run_sync(self.current)
             if found is not None and (before is None or found.run != before.run):
                 return found
-            await anyio.sleep(2.0 * EVERY_S)
+            await anyio.sleep(5.0 * EVERY_S)
 
     async def _follow(self, running: Running) -> None:
         """The run's log, until it is closed, or the rig has this run no more and nothing is left to read."""

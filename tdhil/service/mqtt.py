@@ -165,12 +165,17 @@ class Publisher:
     # -- in its own --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        said = ""
         while not self._end.wait(EVERY_S):
             if self._connected.is_set():
                 try:
                     self._tell()
+                    trouble = ""
                 except Exception as error:     # of one look: the next one tells
-                    self._say(f"MQTT: {type(error).__name__}: {error}")
+                    trouble = f"MQTT: {type(error).__name__}: {error}"
+                if trouble not in ("", said):
+                    self._say(trouble)
+                said = trouble
 
     def _tell(self) -> None:
         news = {"status": ONLINE} | {

@@ -498,7 +498,7 @@ class Web:
         self.supervisor.note(who, f"downloaded {name}", run, rig)
         called = f"{rig}-{run}-{name}"
         grows = name == "run.mcap" and not (await self._off(lambda: self.store.status(run))).ended
-        if grows and "range" not in request.headers:
+        if grows and ("range" not in request.headers or "if-range" in request.headers):
             said = {"content-disposition": f'attachment; filename="{called}"'}
             return StreamingResponse(_as_it_is(path), media_type=media, headers=said)
         return FileResponse(path, media_type=media, filename=None if shown else called)

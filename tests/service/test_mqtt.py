@@ -155,6 +155,21 @@ def test_a_broker_that_is_away_delays_nothing_and_is_told_it_all_when_it_comes()
     assert [one for one in said if "tried again" in one] == [one for one in said if "is told" not in one]
 
 
+def test_what_cannot_be_looked_up_is_said_once_and_told_later():
+    heard, said, looks = Heard(), [], []
+
+    def look() -> dict[str, Any]:
+        looks.append(1)
+        if len(looks) < 5:
+            raise ValueError("no such disk")
+        return {"rigs/a/state": {}}
+
+    with publishing(heard.port, look, said):
+        wait_for("the state", lambda: "site/1/rigs/a/state" in heard.last())
+    assert [one for one in said if "disk" in one] == ["MQTT: ValueError: no such disk"]
+    heard.close()
+
+
 def test_an_end_without_a_broker_waits_for_nobody():
     silent = socket.create_server(("127.0.0.1", 0))        # takes connections, and says nothing
     for port in (silent.getsockname()[1], 1):
