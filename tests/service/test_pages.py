@@ -40,15 +40,15 @@ PLAN = {
 class Served:
     """The web of one service on a port of its own, in a thread; it can be ended."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Service, cert: Path | None = None, key: Path | None = None) -> None:
         import uvicorn
 
         self.service = service
         listening = socket.socket()
         listening.bind(("127.0.0.1", 0))
-        self.url = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        self.url = f"http{'s' if cert else ''}://127.0.0.1:{listening.getsockname()[1]}"
         config = uvicorn.Config(service.web.asgi, log_level="error", ws="websockets-sansio",
-                                timeout_graceful_shutdown=1)
+                                timeout_graceful_shutdown=1, ssl_certfile=cert, ssl_keyfile=key)
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._server.serve(sockets=[listening])), daemon=True)

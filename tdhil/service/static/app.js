@@ -70,7 +70,7 @@
     away("");
     outside = true;
     byId("away").hidden = false;
-    show(byId("away"), "Your login has ended: what you see is old. Stop still gets through; so does the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
+    show(byId("away"), "Your login has ended: what you see is old. Stop may still get through, and says so; if not, use the hard-wired stop. ", el("a", { href: `/login?next=${there}` }, "Log in"));
     document.body.classList.add("stale");
   }
 
