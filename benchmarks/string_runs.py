@@ -2,7 +2,9 @@
 on bottom that turns steadily, without and with 500 N·m of noise; how many are answered, how far off, how many covered,
 how wide.
 
-    python benchmarks/string_runs.py [--seeds 50] [--first 1] [--cases two-mass string pipe loaded bit]
+    python benchmarks/string_runs.py [--seeds 50] [--first 1] [--cases two-mass string pipe loaded bit prbs bit-prbs]
+
+`prbs` and `bit-prbs` are `loaded` and `bit` with pseudo-random torque, told before the echo.
 
 Every run is one `tdhil identify --simulate` over the CANopen path in stepped time, 20 to 40 s of processor time; one
 after the other, so that it can run beside other work.
@@ -44,9 +46,11 @@ CASES = {
     "pipe": ("plant_string.yaml", PIPE + STRING),
     "loaded": ("plant_stick_slip.yaml", ON_BOTTOM),
     "bit": ("plant_stick_slip.yaml", ON_BOTTOM),
+    "prbs": ("plant_stick_slip.yaml", ON_BOTTOM),
+    "bit-prbs": ("plant_stick_slip.yaml", ON_BOTTOM),
 }
 BIT_NOISE = "noise: {bottom_load_nm: 500.0}\n"
-"""Of the case `bit`: what the bit scatters by."""
+"""Of the cases `bit` and `bit-prbs`: what the bit scatters by."""
 
 
 @dataclass
@@ -86,7 +90,9 @@ def run(case: str, seed: int, keep: Path | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "tdhil", "identify", "--simulate", "--json", "--seed", str(seed),
                    "--plant", str(EXAMPLES / plant)]
-        if case == "bit":
+        if case.endswith("prbs"):
+            command += ["--excitation", "prbs"]
+        if case.startswith("bit"):
             noisy = Path(folder) / "plant.yaml"
             noisy.write_text((EXAMPLES / plant).read_text(encoding="utf-8") + BIT_NOISE, encoding="utf-8")
             command[command.index("--plant") + 1] = str(noisy)

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
         EXCITATIONS as EXCITATIONS, MODELS as MODELS, has_plateaus as has_plateaus, imported as imported, load as load,
+        told_before_echo as told_before_echo,
     )
     from tdhil.config.rig import (
         DriveData as DriveData, Limits as Limits, Modbus as Modbus, Registered as Registered, Rig as Rig,

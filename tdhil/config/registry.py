@@ -18,13 +18,15 @@ class Entry:
     """``at``: ``module:attribute`` of the object; ``text``: what it is.
 
     What a recording's excitation is to those who can't import it: ``periodic``, it has lines and whole periods;
-    ``plateaus``, the speed rests at levels within a period, so that it is calm there, and flat without being cut off.
+    ``plateaus``, the speed rests at levels within a period, so that it is calm there, and flat without being cut off;
+    ``before_echo``, it is for drill strings alone, and tells the inertia from the time before their echo.
     """
 
     at: str
     text: str
     periodic: bool = False
     plateaus: bool = False
+    before_echo: bool = False
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ EXCITATIONS: dict[str, Entry] = {
     "multisine": Entry("tdhil.run.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
     "sine": Entry("tdhil.run.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
     "step": Entry("tdhil.run.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True, True),
+    "prbs": Entry("tdhil.run.excitation.signals:PRBS", "pseudo-random torque, for a drill string on bottom", True,
+                  before_echo=True),
     "pulses": Entry("tdhil.run.excitation.pulses:PULSES", "torque pulses between steady speeds"),
     "coast-down": Entry("tdhil.run.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
 }
@@ -92,3 +96,8 @@ def names(registry: Mapping[str, Entry], *, periodic: bool = False) -> list[str]
 def has_plateaus(excitation: str) -> bool:
     """Does the speed rest at levels within a period? Not of an excitation that nobody knows any more."""
     return excitation in EXCITATIONS and EXCITATIONS[excitation].plateaus
+
+
+def told_before_echo(excitation: str) -> bool:
+    """Is it for drill strings, whose echo is not looked at? Not of an excitation that nobody knows any more."""
+    return excitation in EXCITATIONS and EXCITATIONS[excitation].before_echo

@@ -22,15 +22,20 @@ from tdhil.estimation.result import (
 )
 from tdhil.estimation.rough_estimates import RoughFriction, RoughInertia, rough_friction, rough_inertia
 from tdhil.estimation.samples import (
+    STICK_SLIP_REGULAR,
+    STICK_SLIP_SHARE,
     Samples,
     Stretch,
     excited_window,
+    repeats,
     stretches,
     usable_samples,
 )
 
 __all__ = [
     "STEP_S",
+    "STICK_SLIP_REGULAR",
+    "STICK_SLIP_SHARE",
     "BudgetLine",
     "Compliant",
     "Estimate",
@@ -51,6 +56,7 @@ __all__ = [
     "identify",
     "line_fit",
     "paper_estimate",
+    "repeats",
     "rough_friction",
     "rough_inertia",
     "stretches",

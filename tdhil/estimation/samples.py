@@ -294,3 +294,36 @@ def _is_whole(period: Samples, begin_s: float, length_s: float, interval_s: floa
         return False
     edges = np.concatenate(([begin_s], period.time_s, [begin_s + length_s]))
     return float(np.max(np.diff(edges))) <= longest_gap_s
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A bit that sticks and slips: a swing that repeats, as large as the waves of a bit between rest and twice its speed.
+
+
+STICK_SLIP_REGULAR = 0.6
+"""The least autocorrelation, after one period, of a swing that repeats."""
+
+STICK_SLIP_SHARE = 0.6
+"""A bit that sticks and slips swings by the mean speed and more, and so the torque above it by ζ times that. This share
+of it tells stick-slip from a swing that noise keeps going."""
+
+SHORTEST_SWING_S = 1.5
+
+
+def repeats(signal: FloatArray, step_s: float) -> tuple[float, float]:
+    """After what time it repeats, s, and how well: the first of the highest of the autocorrelation's peaks."""
+    x = signal - signal.mean()
+    count = len(x)
+    alike = np.zeros(count // 2 + 1)
+    for lag in range(len(alike)):
+        early, late = x[: count - lag], x[lag:]
+        scale = math.sqrt(float(early @ early) * float(late @ late))
+        alike[lag] = float(early @ late) / scale if scale > 0.0 else 0.0
+    dips = np.flatnonzero(alike < 0.0)
+    first = max(int(dips[0]) if len(dips) else len(alike), math.ceil(SHORTEST_SWING_S / step_s))
+    if first >= len(alike) or np.max(alike[first:]) <= 0.0:
+        return 0.0, 0.0
+    high = first + int(np.flatnonzero(alike[first:] >= 0.9 * np.max(alike[first:]))[0])
+    fallen = np.flatnonzero(alike[high:] < 0.0)
+    best = high + int(np.argmax(alike[high : high + int(fallen[0]) if len(fallen) else None]))
+    return best * step_s, max(0.0, float(alike[best]))

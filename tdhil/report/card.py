@@ -85,14 +85,17 @@ def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     if shaft is None:
         return
     yield "shaft", "compliant: J above is the motor's side, J_r"
-    for title, key, unit in (
+    rows = (
         ("J_L behind the spring", "load_inertia_kg_m2", "kg·m²"),
         ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
         ("spring k", "stiffness_nm_rad", "N·m/rad"),
         ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
         ("resonance", "resonance_hz", "Hz"),
         ("antiresonance", "antiresonance_hz", "Hz"),
-    ):
+    )
+    if all(shaft[key] is None for _, key, _ in rows):      # nobody looked below the motor
+        return
+    for title, key, unit in rows:
         part = shaft[key]
         yield title, "left open by the data" if part is None else estimate_text(part, unit)
 

@@ -25,6 +25,7 @@ from drivers import (
     quantile,
 )
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
+from tdhil.config import told_before_echo
 from tdhil.recording import LagPrior
 from tdhil.run.excitation import excitation_kind
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
@@ -234,6 +235,14 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
 
     ``lets_go``: the drive's profile says that it does after a quick stop.
     """
+    if told_before_echo(request.kind) and limits.wave_impedance_nm_s_rad <= 0.0:
+        raise PreflightRefused(
+            f"{request.kind} was asked for, which tells the inertia above a drill string whose pipe is known, and none"
+            " is",
+            where="--excitation and load in rig.yaml",
+            next_step="Use --excitation multisine, or give load: {kind: string, length_m, outer_diameter_m,"
+            " inner_diameter_m}",
+        )
     if limits.load != "string":
         return
     if not excitation_kind(request.kind).with_string:
@@ -253,10 +262,10 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
 
 
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
-    """PreflightRefused where torque could be lost while a string is wound up; nothing without a string."""
+    """PreflightRefused where torque could be lost while a string is wound up, or a string is missed."""
+    refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
     if limits.load != "string":
         return
-    refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
     if not preflight.watched:
         raise PreflightRefused(
             "a drill string hangs on the shaft, and no watchdog is armed in the drive: "

@@ -35,7 +35,7 @@ from tdhil.cli.bus_commands import BusCommands, FoundDrive
 from tdhil.cli.finding import Finding, ok
 from tdhil.cli.main import build_parser, main
 from tdhil.config.options import Setting
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, Entry, load, names
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, Entry, load, names, told_before_echo
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
@@ -417,6 +417,8 @@ def test_every_excitation_is_what_its_entry_says():
         kind = load(EXCITATIONS, name)
         assert isinstance(kind, ExcitationKind)
         assert isinstance(kind, PeriodicKind) == entry.periodic
+        assert told_before_echo(name) == entry.before_echo and not (entry.before_echo and kind.adaptive)
+    assert not told_before_echo("nobody's")
 
 
 @pytest.mark.parametrize("registry", [EXCITATIONS, MODELS, BUSES], ids=["excitations", "models", "buses"])

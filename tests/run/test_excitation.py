@@ -8,6 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdhil.config.registry import EXCITATIONS, names
+from tdhil.recording.recording import LagPrior
+from tdhil.run.design import Knowledge, assumed_noise, choose
 from tdhil.run.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan, make_transition
 
 LIMITS = MotionLimits(0.5, 10.0, 400.0)
@@ -164,3 +166,21 @@ def test_any_rig_is_planned_inside_its_limits_or_refused(scale, low, width, kind
         return
     assert limits.speed_low_rad_s < plan.speed_min_rad_s < plan.speed_max_rad_s < limits.speed_high_rad_s
     assert max(abs(plan.torque_min_nm), abs(plan.torque_max_nm)) <= 0.85 * limits.torque_limit_nm * (1 + 1e-9)
+
+
+def test_pseudo_random_torque():
+    """Flat over its lines, at one speed for ten minutes; nobody says how tight it will get."""
+    plan = make_plan(LIMITS, RigGuess(104.0, 8.0, 60.0), ExcitationWish(kind="prbs"))
+    (segment,) = plan.segments
+    reference = segment.reference
+    assert (segment.periods - segment.settle_periods) * reference.period_s == 600.0
+    assert np.allclose(np.diff(reference.lines_hz), 1.0 / reference.period_s)
+    torque = np.array(reference.amplitudes_rad_s) * np.array(reference.lines_hz)
+    assert torque.min() > 0.6 * torque.max()
+    elements = np.array([reference.reference((n + 0.5) * reference.period_s / 63)[1] for n in range(63)])
+    elements -= reference.mean_torque_nm
+    assert abs(np.count_nonzero(elements > 0.0) - 32) <= 5
+    usual = np.abs(np.fft.rfft(elements))[1:31]
+    assert usual.min() > 0.4 * usual.max()
+    chosen = choose(LIMITS, GUESS, ExcitationWish(kind="prbs"), Knowledge(assumed_noise(400.0, 10.0), LagPrior()), 0.95)
+    assert math.isnan(chosen.half_width) and math.isnan(chosen.usual_half_width)

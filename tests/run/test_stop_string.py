@@ -365,6 +365,14 @@ def test_what_a_string_forbids(limits, request_, preflight, what):
     refuse_with_string(replace(limits, load="none"), request_, preflight_of(**preflight))
 
 
+@pytest.mark.parametrize("limits", [STRING, replace(STRING, load="none")])
+def test_an_echo_is_not_looked_for_without_a_pipe(limits):
+    with pytest.raises(PreflightRefused, match="whose pipe is known") as caught:
+        refuse_with_string(limits, ExcitationRequest(kind="prbs"), preflight_of())
+    assert "length_m" in caught.value.next_step
+    refuse_with_string(replace(STRING, wave_impedance_nm_s_rad=300.0), ExcitationRequest(kind="prbs"), preflight_of())
+
+
 @pytest.mark.parametrize("title", ["quick-stop option", "something else"])
 @pytest.mark.parametrize("found", ["0", "6", "?"])
 def test_what_a_string_allows_hangs_on_no_row_of_the_table(title, found):

@@ -9,10 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from tdhil.config import told_before_echo
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
+from tdhil.estimation.frequency_domain.before_echo import identify_before_echo, refuse_stick_slip
 from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
 from tdhil.estimation.frequency_domain.inference import contradicted
@@ -69,6 +71,8 @@ def measured(case: Case, excitation: Excitation) -> PeriodicCase:
 
 def clear_lines(case: PeriodicCase) -> PeriodicCase:
     """The case with the lines that stand clear of their scatter. Raises Refused where they can't tell the inertia."""
+    if _before_echo(case):
+        refuse_stick_slip(case)
     check_lines(case)
     every = case.every
     if not every or max(line.nu for line in every) < _LEAST_NU:
@@ -76,6 +80,8 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
             f"{case.periods_used} usable whole periods are too few to know the scatter",
             "let each mean speed run for four periods or more after settling",
         )
+    if _before_echo(case):       # all or none, and the likelihood knows how sure each is
+        return replace(case, lines=every, usable=every, sound=True)
     lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
     if not lines:
         raise Refused("no excited line stands clear of the scatter", "excite with more amplitude, or for longer")
@@ -87,6 +93,8 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
 
 def identify_lines(case: PeriodicCase) -> Finding:
     """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J."""
+    if _before_echo(case):
+        return identify_before_echo(case)
     asked = shaft_model(case.options.model)
     rigid = None
     if asked.compliant is not None:
@@ -105,6 +113,12 @@ def identify_lines(case: PeriodicCase) -> Finding:
     if finding.rejected and rigid is not None and asked.lags:
         return identify_bent(case, rigid) or finding
     return finding
+
+
+def _before_echo(case: PeriodicCase) -> bool:
+    """Unless a shaft was asked for that is no string."""
+    excitation = case.recording.excitation
+    return excitation is not None and told_before_echo(excitation.kind) and shaft_model(case.options.model).piped
 
 
 def _settled(case: PeriodicCase) -> PeriodicCase:

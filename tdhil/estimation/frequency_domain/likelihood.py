@@ -85,6 +85,11 @@ class Likelihood:
         beliefs = len(self.beliefs(np.ones(self.model.size))[0])
         return 2 * len(self.owner) + len(self.priors) + (self.constraint is not None) + beliefs
 
+    @property
+    def held(self) -> int:
+        """How many parameters what is known beforehand holds, rather than the lines."""
+        return 0 if self._believing is None else self._believing.held
+
     def beliefs(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How far theta is from what is known of the shaft beforehand, in sd, (R,), and the slopes, (R, P)."""
         if self._believing is None:

@@ -232,8 +232,10 @@ class StringShaft:
 
 @runtime_checkable
 class Believing(Protocol):
-    """A shaft of which something is known beforehand."""
+    """A shaft of which something is known beforehand; ``held`` of its parameters by that more than by the lines."""
 
+    @property
+    def held(self) -> int: ...
     def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """How far m is from that, in standard deviations, (R,), and the slopes of it, (R, M)."""
         ...
@@ -244,6 +246,8 @@ class KnownStringShaft(StringShaft):
 
     What the pipe's section is wrong by is in J_s and in k alike, and leaves the waves' speed alone: steel's.
     """
+
+    held = 0
 
     def __init__(self, pipe: Pipe) -> None:
         self.pipe = pipe

@@ -97,7 +97,7 @@ class ExcitationFile(DataModel):
     """The whole file."""
 
     kind: Annotated[str, Registered(EXCITATIONS, periodic=True)] = Field(
-        default=DEFAULT_EXCITATION, description="a periodic excitation: multisine, sine or step"
+        default=DEFAULT_EXCITATION, description="a periodic excitation: multisine, sine, step or prbs"
     )
     mode: Literal["torque", "speed"] = Field(default="torque", description="what the drive regulated: torque or speed")
     segments: tuple[SegmentFile, ...] = Field(min_length=1, max_length=100, description="in the order of time")

@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 
+from tdhil.config import told_before_echo
 from tdhil.estimation.frequency_domain import (
     AVERAGE,
     LAG_BOUND_S,
@@ -225,7 +226,9 @@ class Knowledge:
 
 @dataclass(frozen=True)
 class Choice:
-    """The plan, the relative half-width of J to be expected of it, and of the usual excitation in the same time."""
+    """The plan, the relative half-width of J to be expected of it, and of the usual excitation in the same time; NaN
+    where none is predicted.
+    """
 
     plan: Plan
     half_width: float
@@ -253,6 +256,8 @@ def choose(
 
     given = not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
     usual = make_plan(limits, guess, wish)
+    if told_before_echo(wish.kind):     # the prediction is of a rigid shaft
+        return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
     if given:
         usual = _in_time(usual, wish, time_s)
         found = width(usual)

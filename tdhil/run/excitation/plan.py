@@ -27,7 +27,6 @@ LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their sca
 RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
 _BACKWARDS_SHARE = 0.012  # of the greatest speed: foreseen backwards less than this, the guard's own allowance is kept
 _SETTLE_S = 10.0         # at least this long before the first period that counts
-_SINGLE_TONE_S = 100.0   # shortest useful measurement of one tone
 
 
 @dataclass(frozen=True)
@@ -315,8 +314,9 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
                 f"{wish.periods} periods are too few: {settle} go to settling", f"Give --periods {settle + 1} or more"
             )
         return wish.periods
-    if periodic_kind(wish.kind).single_tone:
-        return settle + max(10, math.ceil(_SINGLE_TONE_S / period_s - 1e-9))
+    at_one_speed_s = periodic_kind(wish.kind).at_one_speed_s
+    if at_one_speed_s > 0.0:
+        return settle + max(10, math.ceil(at_one_speed_s / period_s - 1e-9))
     # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
     counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
     return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
@@ -341,14 +341,14 @@ def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tupl
 
 
 def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
-    """Two mean speeds (one for a single tone), as far apart as the swing allows.
+    """Two mean speeds (one where friction's slope isn't asked for), as far apart as the swing allows.
 
     The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit
     allows at the upper end; whatever it does not need goes to the distance, which is what tells B.
     """
     low, high = fit.limits.usable_low_rad_s, fit.limits.usable_high_rad_s
     span = (fit.foreseen + fit.down) * fit.swing
-    if periodic_kind(wish.kind).single_tone:
+    if periodic_kind(wish.kind).at_one_speed_s > 0.0:
         return (low + (high - low) * fit.down / (fit.foreseen + fit.down),)
     share = _OFFSET_SHARE if wish.offset_share is None else wish.offset_share
     amplitude = (1.0 - share) * (high - low) / span

@@ -81,19 +81,20 @@ def _turned(
 class PeriodicKind(ExcitationKind):
     """The same motion again and again about a mean speed, or two.
 
-    ``shape``: makes its lines. ``frequency_hz``: of the first of them where nobody asks for another. ``single_tone``:
-    one line tells nothing of friction's slope, so that it has one mean speed and as many periods as 100 s hold, and its
-    scatter decides nothing. ``tuned``: the design may choose other lines, fitted to the shaft's noise and lags.
+    ``shape``: makes its lines. ``frequency_hz``: of the first of them where nobody asks for another.
+    ``at_one_speed_s``: friction's slope isn't asked for, so that it has one mean speed, as many periods as that time
+    holds, and its scatter decides nothing; 0: two mean speeds. ``tuned``: the design may choose other lines, fitted to
+    the shaft's noise and lags.
     """
 
     shape: Callable[[], Shape] = field(kw_only=True)
     frequency_hz: float = field(kw_only=True)
-    single_tone: bool = False
+    at_one_speed_s: float = 0.0
     tuned: bool = False
 
     @property
     def adaptive(self) -> bool:
-        return not self.single_tone
+        return self.at_one_speed_s == 0.0
 
 
 def unit_peak(shape: Shape) -> Shape:
@@ -163,7 +164,7 @@ def sine_shape() -> Shape:
     return Shape(harmonics=(1,), amplitudes=(1.0,), phases_rad=(1.5 * math.pi,))
 
 
-SINE = PeriodicKind(shape=sine_shape, frequency_hz=SINE_FREQUENCY_HZ, single_tone=True)
+SINE = PeriodicKind(shape=sine_shape, frequency_hz=SINE_FREQUENCY_HZ, at_one_speed_s=100.0)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -192,3 +193,42 @@ def step_shape() -> Shape:
 
 
 STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pseudo-random torque, for a drill string: lines so dense that the time before its echo can be told from what comes
+# later (`estimation.frequency_domain.before_echo`).
+#
+# The binary sequence of greatest length 63 (x⁶ + x⁵ + 1), one element lasting a 63rd of the period of 20 s, moved the
+# motor by its torque alone; its lines up to 1.5 Hz, since what a drive reports of faster ones is mostly its filters.
+# Held for a time h, an element has the spectrum sin(x)/x, x = π f h, and J s turns torque into speed.
+
+
+PRBS_FREQUENCY_HZ = 0.05
+_ORDER, _TAPS = 6, (6, 5)
+_PRBS_LINES = 30
+
+
+def prbs_shape() -> Shape:
+    """Harmonics 1 to 30, peak deviation of speed 1."""
+    register, sequence = [1] * _ORDER, []
+    for _ in range(2**_ORDER - 1):
+        sequence.append(2.0 * register[-1] - 1.0)
+        register = [register[_TAPS[0] - 1] ^ register[_TAPS[1] - 1], *register[:-1]]
+    harmonics = np.arange(1, _PRBS_LINES + 1)
+    x = np.pi * harmonics / len(sequence)
+    torque = np.fft.fft(sequence)[1 : _PRBS_LINES + 1] * np.sin(x) / x * np.exp(-1j * x)
+    speed = torque / (1j * harmonics)
+    return unit_peak(
+        Shape(
+            harmonics=tuple(int(harmonic) for harmonic in harmonics),
+            amplitudes=tuple(float(one) for one in np.abs(speed)),
+            phases_rad=tuple(float(one) for one in np.angle(speed)),
+        )
+    )
+
+
+PRBS = PeriodicKind(
+    shape=prbs_shape, frequency_hz=PRBS_FREQUENCY_HZ, at_one_speed_s=600.0, needs_torque_mode=True,
+    why_torque_mode="a stiff speed loop leaves nothing of a torque that is as quick as the echo",
+)

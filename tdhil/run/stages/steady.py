@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers import Command, LimitHit, Mode, Sample
+from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
 from tdhil.recording import FloatArray, Level
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import MachineLimits
@@ -102,14 +103,9 @@ WINDOW_S = 12.0
 NO_CALMER = 0.75
 """Of what it was over the time before: a swing that is still above this share gets no smaller."""
 
-STICK_SLIP_REGULAR = 0.6
-"""The least autocorrelation, after one period, of a swing that repeats."""
+STICK_SLIP_TORQUE_SHARE = 0.5
+"""Of the mean torque: a swing that feeds itself goes so far. Where ζ is known, that tells it (`STICK_SLIP_SHARE`)."""
 
-STICK_SLIP_SHARE, STICK_SLIP_TORQUE_SHARE = 0.6, 0.5
-"""A bit that sticks and slips swings by the mean speed and more, and so the top's torque by ζ times that. This share of
-it tells stick-slip from a swing that noise keeps going. Where ζ is not known: a share of the mean torque."""
-
-SHORTEST_SWING_S = 1.5
 MOST_CALMING_S = 120.0
 
 
@@ -142,27 +138,8 @@ def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
         return Swing(0.0, 0.0, 0.0, 0.0)
     torque, speed = (part[-blocks * width:].reshape(blocks, width).mean(axis=1)
                      for part in (seen.torque_nm, seen.speed_rad_s))
-    after_s, regular = _repeats(torque, width * period_s)
+    after_s, regular = repeats(torque, width * period_s)
     return Swing(0.5 * float(np.ptp(torque)), 0.5 * float(np.ptp(speed)), after_s, regular)
-
-
-def _repeats(torque_nm: FloatArray, step_s: float) -> tuple[float, float]:
-    """After what time it repeats, and how well: the first of the highest of the autocorrelation's peaks."""
-    x = torque_nm - torque_nm.mean()
-    count = len(x)
-    alike = np.zeros(count // 2 + 1)
-    for lag in range(len(alike)):
-        early, late = x[: count - lag], x[lag:]
-        scale = math.sqrt(float(early @ early) * float(late @ late))
-        alike[lag] = float(early @ late) / scale if scale > 0.0 else 0.0
-    dips = np.flatnonzero(alike < 0.0)
-    first = max(int(dips[0]) if len(dips) else len(alike), math.ceil(SHORTEST_SWING_S / step_s))
-    if first >= len(alike) or np.max(alike[first:]) <= 0.0:
-        return 0.0, 0.0
-    high = first + int(np.flatnonzero(alike[first:] >= 0.9 * np.max(alike[first:]))[0])
-    fallen = np.flatnonzero(alike[high:] < 0.0)
-    best = high + int(np.argmax(alike[high : high + int(fallen[0]) if len(fallen) else None]))
-    return best * step_s, max(0.0, float(alike[best]))
 
 
 def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple[list[Sample], list[float]]:

@@ -1,0 +1,333 @@
+"""A drill string on bottom: the motor's inertia from what its shaft does before an echo comes back.
+
+Whatever the motor does runs down the string as a wave, and for the time 2L/v until anything of it returns the string is
+nothing but the resistance ζ = √(J_s k). What comes back later is the bit's: a mass, collars, new rock, a bit that cuts.
+With the waves at the top, down a = τ + ζω and up b = ζω − τ (τ the torque that the string takes), and the bottom taken
+for anything that answers linearly, b(t) = ∫ r(x) a(t − x) dx,
+
+    Z = J s + B + ζ (1 − Γ)/(1 + Γ),       Γ(s) = Σ_n r_n e^(−s t_n).
+
+r is not the string's whole echo but what the bottom makes of *one* wave: what runs up and down again and again passes
+the top, whose motion is measured, and is in a. So r is short, whatever the string's damping. It is unknown: next to
+nothing until 0.97 · 2L/v (`_UNEVEN`: pipes are worn, and mud drags along them), and from there anything of the size of
+a full reflection, dying away within some seconds. A dense line spectrum, 1/P apart, sees it over a whole period P. How
+the bit answers is fitted with the rest, and what it scatters by is noise like any other. A bit that sticks and slips
+answers in no such way, and is told by its swing.
+
+The interval is that of the profile likelihood, over all bottoms and reports. Scatter from period to period counts what
+the string swings on from one period to the next as if it came anew each time (`unleaked`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from tdhil.estimation.case import Finding, PeriodicCase, Words
+from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.inference import (
+    estimate,
+    grown_lines,
+    half_width_first_order,
+    rejects,
+    torque_scale_line,
+)
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.model import Model
+from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structure, lag_priors, lags_of, of_reports
+from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
+from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines, pooled_lines
+from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest
+from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
+from tdhil.recording import FloatArray, LagPrior, Pipe
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The shaft.
+
+
+RESISTANCE, ECHO = 2, 3     # in m: ζ, and the first of r
+_FASTER = 0.97              # of 2L/v: waves may be a little faster than in a smooth pipe of nominal steel
+_FINER = 4.0                # instants of r per half a cycle of the fastest line
+_FULL = 0.5                 # of r at first: four of them make up a reflection
+_DIES_S = 3.0               # to 1/e
+_LASTS_S = 6.0
+_UNEVEN = 0.01              # of r before the echo
+_TOP_SHARE = 0.05           # of ζ: the top's own friction
+_MOST = 5.0
+
+
+class EchoShaft:
+    """J (kg·m²), B, ζ (N·m·s/rad), r_1 … r_N. Known of it are ζ, to the pipe's tolerance, and how large r may be."""
+
+    def __init__(self, pipe: Pipe, fastest_hz: float) -> None:
+        step_s = 1.0 / (2.0 * fastest_hz * _FINER)
+        self.echo_s = _FASTER * 2.0 * pipe.delay_s
+        self.at_s: FloatArray = np.arange(step_s, self.echo_s + _LASTS_S, step_s)
+        late = self.at_s - self.echo_s
+        self.pipe = pipe
+        size: FloatArray = np.where(late < 0.0, _UNEVEN, _FULL * np.exp(-np.maximum(late, 0.0) / _DIES_S))
+        self.held = len(self.at_s)
+        self.names = ("inertia", "viscous", "resistance", *(f"echo_{n}" for n in range(len(self.at_s))))
+        self.inertia_row, self.viscous_row = np.eye(2, len(self.names))
+        zeta = pipe.impedance_nm_s_rad
+        sd = np.concatenate([[_TOP_SHARE * zeta, pipe.rel_sd * zeta], size])
+        self._beliefs: FloatArray = np.eye(len(self.names))[VISCOUS:] / sd[:, None]
+        self._believed: FloatArray = np.eye(len(sd))[1] / pipe.rel_sd
+        self._delayed: tuple[ComplexArray, ComplexArray] | None = None
+
+    def impedance(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        gamma = self._delays(s) @ m[ECHO:]
+        z: ComplexArray = m[INERTIA] * s + m[VISCOUS] + m[RESISTANCE] * (1.0 - gamma) / (1.0 + gamma)
+        return z
+
+    def jacobian(self, m: FloatArray, s: ComplexArray) -> ComplexArray:
+        """∂(1 − Γ)/(1 + Γ)/∂Γ = −2/(1 + Γ)²."""
+        delays = self._delays(s)
+        gamma = delays @ m[ECHO:]
+        by_gamma = -2.0 * m[RESISTANCE] / (1.0 + gamma) ** 2
+        return np.column_stack([s, np.ones_like(s), (1.0 - gamma) / (1.0 + gamma), by_gamma[:, None] * delays])
+
+    def bounds(self, rough_inertia: float, s: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        zeta, most = self.pipe.impedance_nm_s_rad, np.full(len(self.at_s), _MOST)
+        return (np.concatenate([[1e-6 * rough_inertia, -np.inf, 0.5 * zeta], -most]),
+                np.concatenate([[1e6 * rough_inertia, np.inf, 2.0 * zeta], most]))
+
+    def scales(self, rough_inertia: float, s: ComplexArray) -> FloatArray:
+        zeta = self.pipe.impedance_nm_s_rad
+        return np.concatenate([[rough_inertia, zeta, zeta], np.ones(len(self.at_s))])
+
+    def beliefs(self, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of `shafts.Believing`."""
+        return self._beliefs @ m - self._believed, self._beliefs
+
+    def start(self, inertia: float) -> FloatArray:
+        """(M,): above a bit that is a mass of the string's own weight."""
+        zeta, at = self.pipe.impedance_nm_s_rad, self.at_s
+        first = int(np.argmin(np.abs(at - 2.0 * self.pipe.delay_s)))
+        slow_s = self.pipe.inertia_kg_m2 / zeta
+        echo = np.where(at >= at[first], 1.8 * (at[1] - at[0]) / slow_s * np.exp((at[first] - at) / slow_s), 0.0)
+        echo[first] -= 0.9
+        return np.concatenate([[inertia, 0.0, zeta], echo])
+
+    def _delays(self, s: ComplexArray) -> ComplexArray:
+        """Of the lines, which are the same ones all along a fit."""
+        if self._delayed is None or self._delayed[0] is not s:
+            self._delayed = s, np.exp(-np.outer(s, self.at_s))
+        return self._delayed[1]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Scatter of a shaft that swings on.
+#
+# A string keeps swinging from one period into the next, so the error T − G W of a line in one period has the swing at
+# its beginning and at its end in it: a smooth function of frequency, which the next period takes back. In the mean of
+# N periods next to nothing is left of it, in their scatter all. With lines as dense as they can be, 1/P apart, what a
+# Hann window keeps of the scatter, e_k − (e_(k−1) + e_(k+1))/2, is free of what is smooth over k, and for the rest 3/2
+# times as large. Variances of neighbours are averaged: noise changes slowly with frequency, and each has few periods.
+
+
+_NEIGHBOURS = 2
+_SURER = 3.0        # times the degrees of freedom of one line's scatter, so averaged
+
+
+def unleaked(lines: tuple[Line, ...], fits: tuple[PeriodLines, ...]) -> tuple[Line, ...]:
+    """The pooled lines of ``fits`` with the scatter that their means have; themselves where they aren't dense."""
+    if len(lines) < 2 * _NEIGHBOURS + 1 or any(len(fit.lines_hz) != len(lines) for fit in fits):
+        return lines
+    steps = np.diff([line.hertz for line in lines])
+    if np.ptp(steps) > 1e-3 * steps[0] or lines[0].hertz > 1.001 * steps[0]:
+        return lines
+    plain, smooth = np.zeros(len(lines)), np.zeros(len(lines))
+    for fit in fits:
+        speed, torque = fit.speed.mean(axis=0), fit.torque.mean(axis=0)
+        error = fit.torque - torque - torque / speed * (fit.speed - speed)
+        hann = error[:, 1:-1] - 0.5 * (error[:, :-2] + error[:, 2:])
+        plain += np.sum(np.abs(error) ** 2, axis=0)
+        smooth += np.pad(np.sum(np.abs(hann) ** 2, axis=0) / 1.5, 1, mode="edge")
+    padded = np.pad(np.log(np.maximum(smooth, 1e-300)), _NEIGHBOURS, mode="edge")
+    count = 2 * _NEIGHBOURS + 1
+    share = np.exp(np.convolve(padded, np.full(count, 1.0 / count), "valid")) / np.maximum(plain, 1e-300)
+    return tuple(
+        replace(line, s_ww=line.s_ww * by, s_tt=line.s_tt * by, s_tw=line.s_tw * by, nu=_SURER * line.nu)
+        for line, by in zip(lines, share.tolist(), strict=True)
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+_LAGS_S = ((0.40, 0.15), (0.05, 0.05), (0.15, 0.40))       # to begin with
+_WORDS = Words(
+    "a string whose echo may be anything",
+    "is the pipe as rig.yaml has it, from the top down to where its section changes?",
+    "excite for longer (--periods), or lift the bit off bottom",
+)
+
+
+def identify_before_echo(case: PeriodicCase) -> Finding:
+    """J of the motor alone. Raises Refused where the pipe is not known, or the lines don't see the time before the
+    echo.
+    """
+    pipe, confidence = case.recording.pipe, case.options.confidence
+    if pipe is None:
+        raise Refused(
+            "pseudo-random torque tells the inertia above a drill string only if its pipe is known",
+            "state load.length_m and both diameters in rig.yaml, or use --excitation multisine",
+        )
+    lines = unleaked(pooled_lines(case.fits, 0.0), case.fits)
+    problem = problem_of(lines, pipe, case.recording.lag_prior)
+    fitted = fit_before_echo(problem, case.recording.lag_prior)
+    residual = residual_of(fitted)
+    shaft = echo_shaft(problem)
+    finding = Finding(
+        model="string", words=_WORDS, residual=residual, lines=fitted_points(fitted, confidence),
+        warnings=("J is the motor's side of the string, J_r, from what it does before an echo comes back",),
+        compliant=Compliant(None, None, None, None, None, None),
+    )
+    if rejects(residual):
+        return replace(finding, compliant=None)
+    inertia = estimate(fitted, INERTIA, confidence)
+    if not (inertia.bounded and inertia.low > 0.0):
+        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide)
+    speed_lag, torque_lag, skew = lags_of(fitted, confidence)
+    told = f"to {100.0 * pipe.rel_sd:.2g} % (1 sd), as {pipe.source or 'stated'}"
+    return replace(
+        finding,
+        inertia=inertia,
+        conditions=(
+            f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away in some"
+            " seconds",
+            f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {told}",
+            *of_reports(case.recording.lag_prior),
+        ),
+        speed_lag_s=speed_lag,
+        torque_lag_s=torque_lag,
+        skew_s=skew,
+        budget=_budget(fitted, inertia.low, inertia.high, confidence, case.recording.torque_scale_rel_sd),
+    )
+
+
+def problem_of(lines: tuple[Line, ...], pipe: Pipe, prior: LagPrior) -> Likelihood:
+    """Raises Refused where the lines are too few or too far apart to see an echo apart from what was before it."""
+    hertz = [line.hertz for line in lines]
+    apart = float(np.max(np.diff(hertz))) if len(hertz) > 1 else math.inf
+    shaft = EchoShaft(pipe, max(hertz, default=1.0))
+    if not 1.0 / apart >= shaft.echo_s + _LASTS_S:
+        raise Refused(
+            f"the lines are {apart:.3g} Hz apart: an echo after {shaft.echo_s:.2f} s can't be told from what was before"
+            f" it; {1.0 / (shaft.echo_s + _LASTS_S):.3g} Hz at most would do",
+            "use a lower --frequency, or --excitation multisine",
+        )
+    if not max(hertz) * shaft.echo_s >= 1.0:
+        raise Refused(
+            f"the echo comes back after {shaft.echo_s:.2f} s, before the fastest line, {max(hertz):.3g} Hz, has turned"
+            " once: the string is too short",
+            "use --excitation multisine",
+        )
+    model = Model(shaft)
+    lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
+    return Likelihood(lines, model, None, lag_priors(prior, *lags))
+
+
+def echo_shaft(problem: Likelihood) -> EchoShaft:
+    """The shaft of a problem of `problem_of`."""
+    assert isinstance(problem.model.shaft, EchoShaft)
+    return problem.model.shaft
+
+
+def fit_before_echo(problem: Likelihood, prior: LagPrior) -> Fitted:
+    """Raises Refused where the arithmetic breaks down."""
+    model, shaft = problem.model, echo_shaft(problem)
+    moved = model.mechanical - Model().mechanical
+    fixed = {index + moved: value for index, value in known_structure(prior).items()}
+    apparent, top = _apparent_inertia(problem.lines), 2j * np.pi * problem.lines[-1].hertz
+    starts = []
+    for speed_lag, torque_lag in _LAGS_S:
+        reports = np.zeros(signal_filters.COUNT)
+        reports[signal_filters.SPEED_LAG], reports[signal_filters.TORQUE_LAG] = speed_lag, torque_lag
+        inertia = apparent * abs((1.0 + torque_lag * top) / (1.0 + speed_lag * top))
+        starts.append(np.concatenate([shaft.start(inertia), reports]))
+    try:
+        return fit_model(problem, fixed, starts)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError) as error:
+        raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide) from error
+
+
+def _apparent_inertia(lines: tuple[Line, ...]) -> float:
+    """|T/(ω W)| where the motor turns all but alone: of the faster half of the lines."""
+    upper = lines[len(lines) // 2 :]
+    return float(np.median([abs(np.mean(line.torque / line.speed)) / (2.0 * np.pi * line.hertz) for line in upper]))
+
+
+def residual_of(fitted: Fitted) -> ResidualTest | None:
+    """Of the lines alone, less as many numbers as they were fitted with: beliefs about an echo aren't measured."""
+    from scipy.special import chdtrc
+
+    problem, theta = fitted.problem, fitted.whole.theta
+    _, q = problem.weighted(theta)
+    m, nu = problem.segments, problem.nu
+    statistic = float(np.sum((2.0 * nu + m - 1.0) * np.log1p(q / nu)))
+    whole, parts = problem.information(theta)
+    free = np.ix_(fitted.free, fitted.free)
+    measured = np.sum([part for part, _ in parts[: len(problem.lines)]], axis=0)
+    left = 2.0 * float(np.sum(m)) - float(np.trace(np.linalg.pinv(whole[free], hermitian=True) @ measured[free]))
+    return ResidualTest(statistic, left, float(chdtrc(left, statistic))) if left >= 1.0 else None
+
+
+_GRID_S = 0.25
+_LOOKED_AT_S = 300.0
+
+
+def refuse_stick_slip(case: PeriodicCase) -> None:
+    """Raise Refused, with period and size, where the motor swings besides as above a bit that sticks and slips.
+
+    The torque that is left over turns it, J ω. What stick-slip adds to the lines makes their J too small, if anything.
+    """
+    pipe = case.recording.pipe
+    if pipe is None or not case.every:
+        return
+    inertia_kg_m2 = _apparent_inertia(case.every)
+    for stretch, fit in zip(case.stretches, case.fits, strict=True):
+        segment = stretch.segment
+        if not stretch.periods:
+            continue
+        begin_s = segment.start_s + stretch.index[0] * segment.period_s
+        part = case.samples.between(begin_s, min(segment.end_s, begin_s + _LOOKED_AT_S))
+        grid: FloatArray = np.arange(part.time_s[0], part.time_s[-1], _GRID_S)
+        turned = np.exp(2j * np.pi * np.outer(grid - segment.start_s, fit.lines_hz))
+        rest = np.interp(grid, part.time_s, part.speed_rad_s) - (turned @ fit.speed.mean(axis=0)).real
+        swing_rad_s, mean_rad_s = math.sqrt(2.0) * float(rest.std()), abs(float(rest.mean()))
+        period_s, regular = repeats(rest, _GRID_S)
+        if regular < STICK_SLIP_REGULAR or period_s <= 0.0:
+            continue
+        if inertia_kg_m2 * 2.0 * np.pi / period_s * swing_rad_s >= (
+            STICK_SLIP_SHARE * pipe.impedance_nm_s_rad * mean_rad_s
+        ):
+            raise Refused(
+                f"stick-slip: besides the excitation the speed swings by ±{swing_rad_s:.2f} rad/s every {period_s:.1f}"
+                f" s about {mean_rad_s:.3g} rad/s, as above a bit that sticks and slips",
+                "lift the bit off bottom, take weight off it, or turn faster",
+            )
+
+
+def _budget(fitted: Fitted, low: float, high: float, confidence: float, scale: float) -> tuple[BudgetLine, ...]:
+    at, size = fitted.problem.model.at, fitted.problem.model.mechanical
+    lags = tuple(at(index) for index in (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW))
+    echo = tuple(range(ECHO, size))
+
+    def half(*known: int) -> float:
+        return half_width_first_order(fitted, INERTIA, confidence, known)
+
+    grown = (
+        ("noise", half(VISCOUS, RESISTANCE, *echo, *lags), "scatter from period to period, the bit's noise in it"),
+        ("echo", half(VISCOUS, RESISTANCE, *lags), "what the bottom makes of a wave"),
+        ("string", half(*lags), "the pipe's resistance to waves, and the top's own friction"),
+        ("lags", half(), "time constants of the reports' filters"),
+        ("lag structure", 0.5 * (high - low), "filters of two poles, moving averages"),
+    )
+    return (
+        *grown_lines(grown, 0.5 * (high - low)),
+        torque_scale_line(float(fitted.likelier.theta[INERTIA]), scale, confidence),
+    )

@@ -1,0 +1,124 @@
+"""A drill string of the tests' own: waves in delay lines between a motor and a bit, many seeds at once.
+
+Down a = τ + ζω, up b = ζω − τ (τ the torque that goes down), each unchanged within a section. Where two sections meet
+mud drags with d: ω = (a + b)/(ζ₁ + ζ₂ + d), up goes 2ζ₁ω − a, down 2ζ₂ω − b. The motor: J dω/dt = T − T_c − (B + ζ) ω
++ b; the bit: J_b dΩ/dt = a − ζΩ − T_bit − noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import lfilter
+
+from tdhil.recording import Excitation, LagPrior, Pipe, Recording, Segment
+
+STEP_S = 0.02
+SECTION_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """2300 m of pipe over a bit; ``bit_nm`` is what the bit takes at speed, ``bit_noise_nm`` what that scatters by."""
+
+    motor: float = 1500.0
+    viscous: float = 8.0
+    resistance: float = 296.5
+    sections: int = 9                 # of 0.08 s each
+    drag: float = 11.5                # of all of the mud
+    collars: float = 1.0              # how many times the pipe's resistance the lowest section has
+    bottom: float = 374.0
+    bit_nm: float = 2500.0
+    bit_viscous: float = 20.0
+    bit_noise_nm: float = 0.0
+    bit_correlation_s: float = 0.3
+    speed_lags_s: tuple[float, ...] = (0.40,)
+    torque_lags_s: tuple[float, ...] = (0.15,)
+    hold: float = 750.0               # of the host's slow control of the mean speed, N·m·s/rad
+    mean_rad_s: float = 20.0
+    speed_noise_rad_s: float = 0.003
+    torque_noise_nm: float = 5.0
+
+    def pipe(self, wrong: float = 0.0) -> Pipe:
+        """As rig.yaml has it: ζ wrong by a share."""
+        straight = self.sections - (self.collars != 1.0)
+        delay_s, zeta = straight * SECTION_STEPS * STEP_S, self.resistance * (1.0 + wrong)
+        return Pipe(zeta * delay_s, zeta / delay_s, 0.03, "rig.yaml")
+
+
+def turned(plant: Loaded, drive, noise):
+    """Speed of the motor and torque on it, (steps, runs); ``drive`` (steps,) and ``noise`` (steps, runs), N·m."""
+    steps, count = noise.shape
+    mean, many = plant.mean_rad_s, plant.sections
+    zeta = np.full(many, plant.resistance)
+    zeta[-1] *= plant.collars
+    drag = plant.drag / (many - 1)
+    load = plant.bit_nm + plant.bit_viscous * mean
+    # what each section carries on the mean
+    carried = load + drag * mean * np.arange(many - 1, -1, -1.0)
+    down = np.tile((carried + zeta * mean)[:, None, None], (1, SECTION_STEPS, count))
+    up = np.tile((zeta * mean - carried)[:, None, None], (1, SECTION_STEPS, count))
+    speed, bottom, seen = (np.full(count, mean) for _ in range(3))
+    hold_nm = carried[0] + plant.viscous * mean
+    loss, loss_b = plant.viscous + zeta[0], plant.bit_viscous + zeta[-1]
+    share, gone = _over_a_step(plant.motor / loss)
+    share_b, gone_b = _over_a_step(plant.bottom / loss_b)
+    late = np.exp(-STEP_S / max(sum(plant.speed_lags_s), 1e-3))
+    meet = (zeta[:-1] + zeta[1:] + drag)[:, None]
+    speeds, torques = np.empty((steps, count)), np.empty((steps, count))
+    for at in range(steps):
+        slot = at % SECTION_STEPS
+        arrived_down, arrived_up = down[:, slot].copy(), up[:, slot].copy()
+        torque = hold_nm + drive[at] + plant.hold * (mean - seen)
+        speeds[at], torques[at] = speed, torque
+        joint = (arrived_down[:-1] + arrived_up[1:]) / meet
+        up[:-1, slot] = 2.0 * zeta[:-1, None] * joint - arrived_down[:-1]
+        down[1:, slot] = 2.0 * zeta[1:, None] * joint - arrived_up[1:]
+        steady = (torque + arrived_up[0]) / loss
+        down[0, slot] = 2.0 * zeta[0] * (steady + (speed - steady) * gone) - arrived_up[0]
+        speed = steady + (speed - steady) * share
+        steady = (arrived_down[-1] - plant.bit_nm - noise[at]) / loss_b
+        up[-1, slot] = 2.0 * zeta[-1] * (steady + (bottom - steady) * gone_b) - arrived_down[-1]
+        bottom = steady + (bottom - steady) * share_b
+        seen = speed + (seen - speed) * late
+    return speeds, torques
+
+
+def _over_a_step(tau_s):
+    """What is left of a deviation at a step's end, and on its mean."""
+    share = np.exp(-STEP_S / tau_s)
+    return share, (1.0 - share) * tau_s / STEP_S
+
+
+def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2, lag_prior=None):
+    """A recording for each of ``seeds``, its pipe wrong by 3 % (1 sd); ``torques`` (K,) complex, of the excitation."""
+    streams = [np.random.default_rng([7, seed]) for seed in seeds]
+    time = STEP_S * np.arange(round((settle + periods) * period_s / STEP_S))
+    drive = (np.exp(2j * np.pi * np.outer(time, lines_hz)) @ torques).real
+    keep = np.exp(-STEP_S / plant.bit_correlation_s)
+    white = np.stack([stream.standard_normal(len(time)) for stream in streams], axis=1)
+    noise = plant.bit_noise_nm * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)
+    speeds, acted = turned(plant, drive, noise)
+    for lag_s in plant.speed_lags_s:
+        speeds = _late(speeds, lag_s)
+    for lag_s in plant.torque_lags_s:
+        acted = _late(acted, lag_s)
+    segment = Segment(0.0, (settle + periods) * period_s, period_s, settle, plant.mean_rad_s, tuple(lines_hz), (), ())
+    every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
+    return [
+        Recording(
+            time_s=time, fresh=every, limited=none,
+            speed_rad_s=speeds[:, run] + plant.speed_noise_rad_s * stream.standard_normal(len(time)),
+            torque_nm=acted[:, run] + plant.torque_noise_nm * stream.standard_normal(len(time)),
+            excitation=Excitation("prbs", "torque", (segment,)), torque_limit_nm=15000.0, simulated=True,
+            lag_prior=lag_prior or LagPrior(), pipe=plant.pipe(0.03 * float(stream.standard_normal())),
+        )
+        for run, stream in enumerate(streams)
+    ]
+
+
+def _late(signal, lag_s):
+    """A first-order lag, of what is between samples a straight line."""
+    keep = np.exp(-STEP_S / lag_s)
+    ramp = 1.0 - (1.0 - keep) * lag_s / STEP_S
+    first = (1.0 - keep) - ramp
+    return lfilter([ramp, first], [1.0, -keep], signal, axis=0, zi=signal[:1] * (1.0 - ramp))[0]

@@ -1,0 +1,110 @@
+"""A string on bottom: its impedance before and after an echo, scatter that isn't any, and the inertia above it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import Verdict, identify
+from tdhil.estimation.frequency_domain.before_echo import ECHO, EchoShaft, problem_of, unleaked
+from tdhil.estimation.frequency_domain.spectrum import PeriodLines, pooled_lines
+from tdhil.estimation.result import Refused
+from tdhil.recording import LagPrior
+from tests.estimation.loaded_bench import STEP_S, Loaded, records, turned
+
+PLANT = Loaded(bit_noise_nm=200.0)
+PERIOD_S, COUNT = 12.0, 13
+LINES_HZ = tuple(harmonic / PERIOD_S for harmonic in range(1, COUNT + 1))
+TORQUES = 220.0 * np.exp(1j * np.pi * np.arange(COUNT) ** 2 / COUNT)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return records(PLANT, [3], LINES_HZ, TORQUES, PERIOD_S, 25)[0]
+
+
+@pytest.mark.parametrize(("end", "wave"), ((1.0, np.tanh), (-1.0, lambda x: 1.0 / np.tanh(x))), ids=("free", "held"))
+def test_one_echo_is_a_bar_that_ends(end, wave):
+    """d'Alembert's bar, free or held at its bottom: ζ tanh(s T) or ζ/tanh(s T), with the wave's way T."""
+    pipe, s = PLANT.pipe(), 2j * np.pi * np.array(LINES_HZ)
+    shaft = EchoShaft(pipe, 1.0)
+    m = np.concatenate([[900.0, 7.0, 250.0], np.zeros(len(shaft.at_s))])
+    m[ECHO + 15] = end
+    expected = 900.0 * s + 7.0 + 250.0 * wave(0.5 * s * shaft.at_s[15])
+    assert np.allclose(shaft.impedance(m, s), expected, rtol=1e-9)
+
+
+def test_slopes_are_differences():
+    shaft, s = EchoShaft(PLANT.pipe(), 1.0), 2j * np.pi * np.array(LINES_HZ)
+    m = shaft.start(1500.0)
+    slopes, off = shaft.jacobian(m, s), shaft.beliefs(m)
+    for index in (0, 1, 2, ECHO, ECHO + 12, ECHO + 30):
+        by = np.eye(len(m))[index] * 1e-5 * max(abs(m[index]), 1.0)
+        rise = (shaft.impedance(m + by, s) - shaft.impedance(m - by, s)) / (2.0 * by[index])
+        assert np.allclose(slopes[:, index], rise, rtol=1e-4, atol=1e-6 * np.max(np.abs(rise)))
+        believed = (shaft.beliefs(m + by)[0] - shaft.beliefs(m - by)[0]) / (2.0 * by[index])
+        assert np.allclose(off[1][:, index], believed, atol=1e-6)
+
+
+def test_what_goes_down_comes_back_after_its_way():
+    """The bench: nothing but ζ until 2L/v after a push, whatever is below."""
+    push = np.zeros(200)
+    push[10] = 1000.0
+    free = replace(PLANT, drag=0.0, hold=0.0, viscous=0.0)
+    ways = [turned(plant, push, np.zeros((200, 1)))[0][:, 0] - plant.mean_rad_s
+            for plant in (free, replace(free, bottom=5.0, bit_viscous=500.0))]
+    back = 11 + round(2.0 * free.pipe().delay_s / STEP_S)
+    assert np.allclose(ways[0][:back], ways[1][:back], atol=1e-9)
+    assert abs(ways[0][back + 5] - ways[1][back + 5]) > 1e-4
+    decay = np.exp(-free.resistance / free.motor * STEP_S * np.arange(back - 11))
+    assert np.allclose(ways[0][11:back], ways[0][11] * decay, rtol=1e-9)
+
+
+def test_the_inertia_is_covered(record):
+    found = identify(record)
+    assert found.verdict is not Verdict.MODEL_REJECTED and found.model == "string"
+    assert found.inertia.low <= PLANT.motor <= found.inertia.high
+    assert found.inertia.value == pytest.approx(PLANT.motor, rel=0.08)
+    assert found.inertia.high - found.inertia.low < 0.4 * PLANT.motor
+    assert any("comes back from below within 1.40 s" in one for one in found.inertia.conditional_on)
+    assert {line.source for line in found.budget} >= {"noise", "echo", "string", "lags", "torque scale"}
+
+
+def test_refusals(record):
+    bare = identify(replace(record, pipe=None))
+    assert bare.verdict is Verdict.NOT_IDENTIFIABLE and "rig.yaml" in bare.advice
+    short = identify(replace(record, pipe=replace(record.pipe, inertia_kg_m2=0.1 * record.pipe.inertia_kg_m2,
+                                                  stiffness_nm_rad=10.0 * record.pipe.stiffness_nm_rad)))
+    assert short.verdict is Verdict.NOT_IDENTIFIABLE and "too short" in short.reason
+    lines = pooled_lines((_fit(np.random.default_rng(1), 5),), 0.0)
+    with pytest.raises(Refused, match=r"0\.2 Hz apart"):
+        problem_of(tuple(replace(line, hertz=0.2 * (k + 1)) for k, line in enumerate(lines)), record.pipe, LagPrior())
+
+
+def test_stick_slip_is_told_with_its_period(record):
+    swing = 6.0 * np.sin(2.0 * np.pi * record.time_s / 5.3) + 1.5 * np.sin(4.0 * np.pi * record.time_s / 5.3)
+    found = identify(replace(record, speed_rad_s=record.speed_rad_s + swing))
+    assert found.verdict is Verdict.NOT_IDENTIFIABLE
+    assert "every 5.2 s" in found.reason or "every 5.3 s" in found.reason, found.reason
+    assert "stick-slip" in found.reason and "lift the bit" in found.advice
+
+
+def _fit(rng, count, swing=0.0, periods=40):
+    """Lines of white scatter, and of a swing that goes on from period to period."""
+    speed = np.ones((periods, count)) + 0.0j
+    torque = np.full((periods, count), 5.0 + 3.0j)
+    torque += rng.standard_normal((periods, count)) + 1j * rng.standard_normal((periods, count))
+    torque += swing * np.diff(rng.standard_normal(periods + 1))[:, None]
+    means = np.zeros(periods)
+    return PeriodLines(tuple(0.05 * (k + 1) for k in range(count)), speed, torque, np.zeros((periods, count)) + 0.0j,
+                       means, means, means)
+
+
+@pytest.mark.parametrize("swing", (0.0, 30.0))
+def test_a_swing_that_goes_on_is_no_scatter(swing):
+    fits = (_fit(np.random.default_rng(5), 30, swing),)
+    plain = pooled_lines(fits, 0.0)
+    found = np.mean([line.s_tt for line in unleaked(plain, fits)])
+    assert found == pytest.approx(2.0, rel=0.15)
+    assert np.mean([line.s_tt for line in plain]) > 2.0 * (1.0 + 0.5 * swing**2) * 0.5
+    assert unleaked(plain[::2], fits) == plain[::2]
