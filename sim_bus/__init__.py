@@ -6,6 +6,7 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from sim_bus.command import add_kinds as add_kinds
+    from sim_bus.fault_script import KnownFault as KnownFault
     from sim_bus.params import RigParams as RigParams
     from sim_bus.trace import check_trace_path as check_trace_path
 else:

@@ -9,7 +9,7 @@
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Generic, Protocol, TypeVar
@@ -228,11 +228,34 @@ def parse_from(kinds: Mapping[str, Kind[M]], texts: Sequence[str]) -> tuple[Scri
     return faults
 
 
+@dataclass(frozen=True)
+class KnownFault:
+    """A fault that can be scripted. ``row`` of docs/faults.md (0: none); ``takes``: what its value is, '' for none.
+
+    ``from_start``: so is the drive, from the start and for good.
+    """
+
+    name: str
+    summary: str
+    row: int
+    value: str
+    takes: str
+    from_start: bool
+
+
+def listed_of(kinds: Mapping[str, Kind[M]], from_start: Container[str] = ()) -> tuple[KnownFault, ...]:
+    """Every fault, in the order of the fault table's rows."""
+    return tuple(
+        KnownFault(name, kind.summary, kind.row, kind.value, kind.takes, name in from_start)
+        for name, kind in sorted(kinds.items(), key=lambda item: (item[1].row or 99, item[0]))
+    )
+
+
 def listing_of(kinds: Mapping[str, Kind[M]]) -> str:
     """Every fault with its row and value, for people."""
     lines = ["NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: setup, speed, torque, hold, acquire, hold+2s",
              "", f"{'row':>3}  {'name':<37}what happens"]
-    for name, kind in sorted(kinds.items(), key=lambda item: (item[1].row or 99, item[0])):
-        shown = f"{name}[={kind.value}]" if kind.takes else name
-        lines.append(f"{kind.row or '-':>3}  {shown:<37}{kind.summary}")
+    for one in listed_of(kinds):
+        shown = f"{one.name}[={one.value}]" if one.takes else one.name
+        lines.append(f"{one.row or '-':>3}  {shown:<37}{one.summary}")
     return "\n".join(lines)

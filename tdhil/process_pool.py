@@ -74,6 +74,11 @@ class _Job(Generic[Task]):
     kills: int = 0
 
 
+def usable_cores() -> int:
+    """Of the processor, as many as this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Pool(Generic[Task, Result]):
     """``jobs`` processes that call ``function``, which is told by its name: one of a module. Started when needed."""
 

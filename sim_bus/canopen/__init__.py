@@ -6,7 +6,7 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from sim_bus.canopen.command import add_arguments as add_arguments, run as run
-    from sim_bus.canopen.faults import listing as listing, parse_all as parse_all
+    from sim_bus.canopen.faults import listed as listed, listing as listing, parse_all as parse_all
     from sim_bus.canopen.inline import InlineSimulator as InlineSimulator
     from sim_bus.canopen.simulator import EmbeddedSimulator as EmbeddedSimulator, Simulator as Simulator
 else:

@@ -21,8 +21,10 @@ from sim_bus.canopen.sender import Sender
 from sim_bus.fault_script import (
     Cast,
     Kind,
+    KnownFault,
     Scripted,
     factor,
+    listed_of,
     listing_of,
     make_from,
     parse_from,
@@ -571,6 +573,11 @@ def make(fault: Scripted) -> Misbehaviour:
 def parse_all(texts: Sequence[str]) -> tuple[Scripted, ...]:
     """All the faults of a command line, each checked. Raises FaultRefused."""
     return parse_from(KINDS, texts)
+
+
+def listed() -> tuple[KnownFault, ...]:
+    """Every fault."""
+    return listed_of(KINDS)
 
 
 def listing() -> str:

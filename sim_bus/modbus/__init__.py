@@ -11,6 +11,6 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from sim_bus.modbus.command import add_arguments as add_arguments, run as run
     from sim_bus.modbus.embedded import EmbeddedModbusDrive as EmbeddedModbusDrive
-    from sim_bus.modbus.faults import listing as listing, parse_all as parse_all
+    from sim_bus.modbus.faults import listed as listed, listing as listing, parse_all as parse_all
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -21,9 +21,11 @@ from sim_bus.fault_script import (
     Cast,
     FaultRefused,
     Kind,
+    KnownFault,
     Moment,
     Scripted,
     factor,
+    listed_of,
     listing_of,
     make_from,
     parse_from,
@@ -408,6 +410,12 @@ def wrongs_of(script: Iterable[Scripted], parameters: Sequence[str]) -> tuple[Wr
                                next_step=f"It has: {', '.join(parameters)}")
         wrongs.append(parse(f"{WRONGS[fault.name]}:{of}" if of else WRONGS[fault.name]))
     return tuple(wrongs)
+
+
+def listed(line_kind: str) -> tuple[KnownFault, ...]:
+    """Every fault that there can be on ``tcp``, ``rtu`` or ``embedded``."""
+    kinds = {name: kind for name, kind in KINDS.items() if line_kind in ONLY_ON.get(name, _LINES)}
+    return listed_of(kinds, WRONGS)
 
 
 def listing() -> str:

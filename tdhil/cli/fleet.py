@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from dataclasses import asdict, replace
@@ -140,7 +139,7 @@ def _tell(row: FleetRow, as_json: bool) -> None:
 
 def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -> FleetRequest:
     from tdhil.fleet import FleetRequest, Settings
-    from tdhil.process_pool import TaskLimits
+    from tdhil.process_pool import TaskLimits, usable_cores
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
         raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
@@ -154,16 +153,12 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
         raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
     return FleetRequest(
         roots, out, Settings(namespace.model, namespace.confidence, namespace.tolerance),
-        jobs=namespace.jobs or _cores(),
+        jobs=namespace.jobs or usable_cores(),
         scheduler=getattr(namespace, "scheduler", None),
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),
         cache=not namespace.no_cache, again=getattr(namespace, "again", False),
         retry_failed=getattr(namespace, "retry_failed", False),
     )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -17,6 +17,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="a rig.yaml for each rig (default: two that are simulated)")
     parser.add_argument("--data", type=Path, metavar="DIR", default=DATA,
                         help=f"where runs, accounts, audit and index go (default: {DATA})")
+    parser.add_argument("--logs", type=Path, metavar="DIR", action="append", default=[],
+                        help="logs that the page Fleet may identify again, beside the service's own runs; repeatable")
     parser.add_argument("--host", default=HOST, metavar="ADDRESS",
                         help=f"where to listen (default {HOST}: this computer only; others need users and TLS)")
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"default {PORT}; 0: any that is free")
@@ -81,7 +83,8 @@ def run(namespace: argparse.Namespace) -> int:
         return check_idle(namespace.data, say)
     viewers = frozenset(one.rstrip("/").lower() for one in namespace.viewer)
     return serve(namespace.rigs, namespace.data, namespace.host, namespace.port, say, viewers=viewers,
-                 mqtt=namespace.mqtt, tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host)
+                 mqtt=namespace.mqtt, tls=None if cert is None else Tls(cert, key), names=namespace.allowed_host,
+                 logs=namespace.logs)
 
 
 def run_accounts(namespace: argparse.Namespace) -> int:

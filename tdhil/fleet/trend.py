@@ -228,6 +228,11 @@ def compare_document(runs: Sequence[Compared]) -> dict[str, Any]:
             [{"hertz": line["hertz"], **line["apparent_inertia_kg_m2"]} for line in run.document.get("lines") or ()]
             for run in runs
         ],
+        "friction": [
+            [{"speed_rad_s": point["speed_rad_s"], **point["torque_nm"]}
+             for point in run.document.get("friction_curve") or ()]
+            for run in runs
+        ],
     }
 
 

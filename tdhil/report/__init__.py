@@ -10,7 +10,10 @@ if TYPE_CHECKING:
     )
     from tdhil.report.console import PlainConsole as PlainConsole
     from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document
-    from tdhil.report.html import check_report_path as check_report_path, write_report as write_report
+    from tdhil.report.html import (
+        Shown as Shown, check_report_path as check_report_path, pictures_in as pictures_in,
+        write_report as write_report,
+    )
     from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console
     from tdhil.report.page import (
         STYLE as STYLE, has_extra as has_extra, inline_svg as inline_svg,

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from hashlib import file_digest
+from html import unescape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,8 @@ from tdhil.report.content import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
 
 PDF = ".pdf"
+_PARTS = re.compile(
+    r"<h2>(?P<heading>[^<]*)</h2>|<figure>(?P<svg><svg.*?</svg>)\s*<figcaption>(?P<caption>[^<]*)<", re.DOTALL)
 _TEMPLATE, _STYLE = (files("tdhil.report").joinpath(name).read_text("utf-8")
                      for name in ("report.html.j2", "report.css"))
 """Read when this is imported: at the end of a run there may be no descriptor left to open them with."""
@@ -86,6 +91,26 @@ def sha256_of(path: Path) -> str:
             return file_digest(file, "sha256").hexdigest()
     except OSError:
         return ""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture of a page, as an SVG of its own, with the heading above it and the words below."""
+
+    heading: str
+    caption: str
+    svg: str
+
+
+def pictures_in(page: str) -> tuple[Shown, ...]:
+    """The pictures of a page that `report_page` made, in their order."""
+    found, heading = [], ""
+    for part in _PARTS.finditer(page):
+        if part["heading"] is not None:
+            heading = unescape(part["heading"])
+        else:
+            found.append(Shown(heading, unescape(part["caption"]), part["svg"]))
+    return tuple(found)
 
 
 def report_page(report: Report) -> str:

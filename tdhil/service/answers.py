@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 from pydantic import TypeAdapter
 
 from tdhil.service.accounts import Role
+from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told, Watch
 from tdhil.service.store import Broken, Entry, Summary
@@ -110,6 +111,31 @@ class CompareView:
 
     runs: list[str]
     comparison: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PictureView:
+    """A picture of the report; ``caption`` says what it shows."""
+
+    number: int
+    heading: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class FaultView:
+    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/faults.md; 0: it has none.
+
+    ``value`` is what it is taken for where none is said; ``takes`` says what it is, '' where there is none.
+    ``from_start``: it has no moment, and goes on for good.
+    """
+
+    name: str
+    summary: str
+    row: int
+    value: str
+    takes: str
+    from_start: bool
 
 
 @dataclass(frozen=True)
@@ -274,6 +300,20 @@ class TokenBody:
 
 
 @dataclass(frozen=True)
+class FleetBody:
+    """Which logs, and with what; None: as each run had it.
+
+    ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside of it.
+    """
+
+    folder: str = ""
+    below: str = ""
+    model: str | None = None
+    tolerance: float | None = None
+    confidence: float | None = None
+
+
+@dataclass(frozen=True)
 class Nothing:
     """An empty object will do."""
 
@@ -343,6 +383,27 @@ ROUTES: Final = (
           _file("application/pdf"), errors=(404, 422), headers=_RANGE),
     Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
           _file("application/json"), errors=(404,), headers=_RANGE),
+    Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made when first asked for",
+          "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
+    Route("GET", "/runs/{run}/pictures", "pictures", "The report's pictures", "viewer", {200: list[PictureView]},
+          errors=(404,)),
+    Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of them", "viewer", {200: "image/svg+xml"},
+          errors=(404,)),
+    Route("GET", "/rigs/{rig}/faults", "faults", "What can be rehearsed on a simulated rig", "viewer",
+          {200: list[FaultView]}, errors=(403, 404)),
+    Route("GET", "/fleets", "fleets", "Many logs identified again, the latest first", "viewer", {200: list[FleetView]}),
+    Route("GET", "/fleets/folders", "fleet_folders", "Where logs may be", "viewer", {200: list[str]}),
+    Route("POST", "/fleets", "ask_fleet", "Identify many logs again; the same question does what is left of it",
+          "operator", {202: FleetView}, FleetBody, (403, 409, 422)),
+    Route("GET", "/fleets/{fleet}", "fleet", "How far it is, and what came of it", "viewer", {200: FleetView},
+          errors=(404,)),
+    Route("POST", "/fleets/{fleet}/stop", "stop_fleet", "End it; what is done is kept", "operator", {200: FleetView},
+          Nothing, (403, 404)),
+    Route("GET", "/fleets/{fleet}/rows", "fleet_rows", "A row a log; while it goes, those that came since it began",
+          "viewer", {200: list[dict[str, Any]]}, errors=(404, 422),
+          query={"from": "leave out so many (0)", "limit": "at most so many (200)"}),
+    Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table", "viewer",
+          _file("text/csv"), errors=(404,), headers=_RANGE),
     Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
           query={"limit": "at most so many lines (200)"}),
     Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,

@@ -100,12 +100,13 @@ def _names(host: str, more: Sequence[str]) -> frozenset[str]:
 def serve(
     rigs: Path | None, data: Path, host: str, port: int, say: Say, *, viewers: frozenset[str] = frozenset(),
     mqtt: str | None = None, tls: Tls | None = None, names: Sequence[str] = (),
+    logs: Sequence[Path] = (),
 ) -> int:
     """Serve until SIGINT or SIGTERM; then live runs brake first. The exit code.
 
     ``viewers``: origins of Foxglove or Lichtblick in a browser, which may read logs as they grow.
     ``mqtt``: the address of a broker that is told states and results.
-    ``names``: more names of this host.
+    ``names``: more names of this host; ``logs``: folders whose logs a fleet may go through, beside the service's runs.
 
     Raises UsageError for what can't be served, accounts that can't be read among it, and LogError for a folder that
     can't be written.
@@ -120,6 +121,9 @@ def serve(
     allowed = _names(host, names)
     if rigs is not None and not rigs.is_dir():
         raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
+    for folder in logs:
+        if not folder.is_dir():
+            raise UsageError("there is no such folder", where=f"--logs {folder}", next_step="It has logs of runs in it")
 
     from tdhil.service.access import Access
     from tdhil.service.asking import Rigs
@@ -133,7 +137,8 @@ def serve(
     store.prepare()
     alone = _alone(store.folder)
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
-    web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say))
+    web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
+              logs={str(one): one for one in logs})
     publisher = None if broker is None else Publisher(broker, web.told, say)
     listening = _listen(host, port)
     at = listening.getsockname()[1]

@@ -25,7 +25,7 @@ from tdhil.service.console import Console
 from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, Watch, blocking, now, way_to
 from tdhil.service.store import Audit, Index, Request, Store, write_json
 from tdhil.service.wire import STOP_FILE, Refused, ask, lives, signal_stop, take_life
-from tdhil.session import Holder, holder_of
+from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
 """So often it is looked whether a run still lives."""
@@ -63,6 +63,7 @@ class Supervisor:
         self._lost: set[str] = set()
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
         self._unindexed: set[str] = set()
+        self._to_index: set[str] = set()               # those that have just ended
         self._braking = False
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -108,6 +109,10 @@ class Supervisor:
     def live(self) -> list[str]:
         """The runs that haven't ended."""
         return list(self._live)
+
+    def ahead_of_the_index(self) -> list[str]:
+        """The runs that are not, or not any more, what the index says of them."""
+        return [*{*self._live, *self._to_index, *self._unindexed}]
 
     def run_of(self, rig_id: str) -> str | None:
         """The run that has the rig."""
@@ -298,6 +303,7 @@ class Supervisor:
         if child is not None:
             with suppress(subprocess.TimeoutExpired):
                 child.wait(0.05)
+        self._to_index.add(run)
         self._live.pop(run, None)
         self._console.forget(run)
         watched = {} if status.watch is None else {"watch": asdict(status.watch)}
@@ -366,6 +372,7 @@ class Supervisor:
             if run not in self._unindexed:
                 self._say(f"the index has to wait: {error}")
             self._unindexed.add(run)
+        self._to_index.discard(run)
 
     def _index_again(self) -> None:
         for run in tuple(self._unindexed):
@@ -383,12 +390,12 @@ class Supervisor:
         self._notes = [one for one in self._notes if one.is_alive()] + [thread]
 
     def turning(self) -> bool:
-        """May a real shaft of this service be turning now?"""
+        """May a real shaft on this computer turn now: does a run of the service move, does anybody hold a drive?"""
         for run in self.live():
             with suppress(Exception):
                 if not self.store.request(run).simulated and self.store.status(run).state in MAY_TURN:
                     return True
-        return False
+        return bool(holders())
 
 
 def _stop_drive(rig_file: Path, *, simulated: bool) -> tuple[int, str]:

@@ -11,12 +11,13 @@ import re
 import sqlite3
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal, TypeVar
 from urllib.parse import quote, urlencode, urlsplit
 
@@ -50,6 +51,7 @@ from tdhil.service.access import (
     token_in,
 )
 from tdhil.service.accounts import ROLES, Role, Token, User
+from tdhil.service.afterwards import ANSWERS
 from tdhil.service.answers import (
     API,
     CSRF_HEADER,
@@ -79,6 +81,7 @@ from tdhil.service.answers import (
 from tdhil.service.asking import RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.attending import LEASE_S
 from tdhil.service.feed import Feed, Feeds
+from tdhil.service.fleets import Fleets
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.states import (
     Conflict,
@@ -207,15 +210,17 @@ class Web:
     """The application around one supervisor. ``hosts``: by which names it may be reached; ``access``: who may what.
 
     ``viewers``: origins (``http://localhost:8080``) whose pages may read logs by the Foxglove protocol, and no more.
+    ``logs``: folders, by name, whose logs may be identified again.
     """
 
     def __init__(
         self, supervisor: Supervisor, *, hosts: frozenset[str] = LOOPBACK, viewers: frozenset[str] = frozenset(),
-        access: Access | None = None,
+        access: Access | None = None, logs: Mapping[str, Path] = MappingProxyType({}),
     ) -> None:
         self.supervisor, self.store = supervisor, supervisor.store
         self.access = access or Access(self.store.folder)
         self.access.changed = lambda what, name: supervisor.note("terminal", what, None, None, name=name)
+        self.fleets = Fleets(self.store, logs, supervisor.turning)
         self.feeds = Feeds()
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
         self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
@@ -255,6 +260,10 @@ class Web:
             Way("/runs", self._page("runs.html", "runs")),
             Way("/runs/{run}", self._page("run.html", "runs")),
             Way("/runs/{run}/live", self._page("live.html", "runs")),
+            Way("/rehearse/{rig}", self._page("rehearse.html", "rigs")),
+            Way("/compare", self._page("compare.html", "runs")),
+            Way("/fleets", self._page("fleets.html", "fleets")),
+            Way("/fleets/{fleet}", self._page("fleet.html", "fleets")),
             Way("/audit", self._page("audit.html", "audit", "admin")),
             Way("/accounts", self._page("accounts.html", "accounts", "viewer")),
             Way("/login", self._login_page),
@@ -271,6 +280,7 @@ class Web:
         try:
             yield
         finally:
+            await anyio.to_thread.run_sync(self.fleets.close)
             await anyio.to_thread.run_sync(self.access.close)
             await anyio.to_thread.run_sync(self.supervisor.close)
 
@@ -290,7 +300,8 @@ class Web:
     # -- the API -----------------------------------------------------------------------------------------------------
 
     def _endpoint(self, route: Route) -> Callable[[Request], Awaitable[Response]]:
-        answer: Callable[[Request, Any], Awaitable[Any]] = getattr(self, f"_{route.name}")
+        own = getattr(self, f"_{route.name}", None)
+        answer: Callable[[Request, Any], Awaitable[Any]] = own or partial(ANSWERS[route.name], self)
         first = next(iter(route.answers))
 
         async def serve(request: Request) -> Response:
@@ -321,8 +332,7 @@ class Web:
         options = options_of(body)
         await self._off(lambda: rig.way(options))
         asked = {"rig_file": str(rig.path.resolve()), "options": options}
-        found = await anyio.to_thread.run_sync(partial(self.supervisor.work, "plan", None, asked), limiter=self._works)
-        return PlanView(rig.id, rig.sha256, found["document"])
+        return PlanView(rig.id, rig.sha256, await self.work("plan", None, asked))
 
     async def _trend(self, request: Request, body: Any) -> TrendView:
         rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
@@ -336,8 +346,7 @@ class Web:
             nothing = {"rig": rig.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
             return TrendView(rig.id, nothing)
         asked = {"rows": found, "rig": rig.id}
-        done = await anyio.to_thread.run_sync(partial(self.supervisor.work, "trend", None, asked), limiter=self._works)
-        return TrendView(rig.id, done["document"])
+        return TrendView(rig.id, await self.work("trend", None, asked))
 
     async def _compare(self, request: Request, body: Any) -> CompareView:
         runs = [one for one in request.query_params.get("runs", "").split(",") if one]
@@ -347,9 +356,7 @@ class Web:
             if not (await self._off(partial(self.store.place, run)) / "run.mcap").is_file():
                 raise NotThere("this run has no log", where=f"run {run}")
         asked = {"runs": runs, "runs_folder": str(self.store.runs)}
-        work = partial(self.supervisor.work, "compare", None, asked)
-        done = await anyio.to_thread.run_sync(work, limiter=self._works)
-        return CompareView(runs, done["document"])
+        return CompareView(runs, await self.work("compare", None, asked))
 
     async def _start(self, request: Request, body: dict[str, Any]) -> tuple[int, RunView]:
         key = request.headers.get("idempotency-key")
@@ -452,9 +459,8 @@ class Web:
         while self.supervisor.turning():
             await anyio.sleep(0.5)
         try:
-            found = await anyio.to_thread.run_sync(
-                partial(self.supervisor.work, "replay", run, view.asked), limiter=self._works)
-            done = ReplayView(view.name, view.asked, view.at, view.by, "done", found["document"])
+            found = await self.work("replay", run, view.asked)
+            done = ReplayView(view.name, view.asked, view.at, view.by, "done", found)
         except TdhilError as error:
             done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
         path = self.store.place(run) / "replays" / f"{view.name}.json"
@@ -471,10 +477,10 @@ class Web:
         return found
 
     async def _log(self, request: Request, body: Any) -> Response:
-        return await self._file(request, "run.mcap", "application/octet-stream")
+        return await self.file(request, "run.mcap", "application/octet-stream")
 
     async def _report(self, request: Request, body: Any) -> Response:
-        response = await self._file(request, "report.html", "text/html", shown=True)
+        response = await self.file(request, "report.html", "text/html", shown=True)
         response.headers["content-security-policy"] = _REPORT_POLICY
         return response
 
@@ -482,14 +488,25 @@ class Web:
         run = request.path_params["run"]
         folder = await self._off(lambda: self.store.place(run))
         if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
-            await anyio.to_thread.run_sync(
-                partial(self.supervisor.work, "report", run, {"name": "report.pdf"}), limiter=self._works)
-        return await self._file(request, "report.pdf", "application/pdf")
+            await self.work("report", run, {"name": "report.pdf"})
+        return await self.file(request, "report.pdf", "application/pdf")
+
+    async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """A piece of arithmetic, one at a time: its document. Raises Refused."""
+        work = partial(self.supervisor.work, what, run, asked)
+        found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=self._works))["document"]
+        return found
+
+    @staticmethod
+    def who(request: Request) -> str:
+        """The name of who asks."""
+        return principal(request).name
 
     async def _result(self, request: Request, body: Any) -> Response:
-        return await self._file(request, "result.json", "application/json")
+        return await self.file(request, "result.json", "application/json")
 
-    async def _file(self, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
+    async def file(self, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
+        """A file of the run, as a download (or ``shown``). Raises NotThere."""
         run, who = request.path_params["run"], principal(request).name
         path = (await self._off(lambda: self.store.place(run))) / name
         if not path.is_file():
@@ -655,8 +672,8 @@ class Web:
         )
 
     def list_runs(self, rig: str | None, state: str | None, limit: int) -> list[Summary]:
-        """From the index, or from the files where that can't be had; of a live run always from its files."""
-        live = self.supervisor.live()
+        """From the index, or from the files where that can't be had, or lags behind, as with a live run."""
+        live = self.supervisor.ahead_of_the_index()
         now_live = []
         for run in live:
             with suppress(NotThere):
@@ -819,6 +836,8 @@ class Web:
                     lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
             if "run" in request.path_params:
                 known["run"] = await self._off(lambda: self.run_view(request.path_params["run"]))
+            if "fleet" in request.path_params:
+                known["fleet"] = await self._off(lambda: self.fleets.get(request.path_params["fleet"]))
             return self._render(request, template, here, **known)
 
         return serve

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -53,6 +54,21 @@ def report(asked: dict[str, Any]) -> dict[str, Any]:
     return {"document": {"file": wanted}}
 
 
+def samples(asked: dict[str, Any]) -> dict[str, Any]:
+    """The run's samples as samples.csv, by `tdhil export`."""
+    os.chdir(asked["folder"])
+    beside = Path(f".{os.getpid()}-samples.csv")
+    command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if not beside.exists():
+            raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where="run.mcap")
+        beside.replace("samples.csv")
+    finally:
+        beside.unlink(missing_ok=True)
+    return {"document": {"file": "samples.csv"}}
+
+
 def recover(asked: dict[str, Any]) -> dict[str, Any]:
     """A clean copy of what a cut log holds, and what can be identified from it; no document where that is nothing."""
     from tdhil.errors import LogError
@@ -83,7 +99,8 @@ def compare(asked: dict[str, Any]) -> dict[str, Any]:
 
 
 WORK: Final = {
-    "plan": plan, "replay": replay, "report": report, "recover": recover, "trend": trend, "compare": compare,
+    "plan": plan, "replay": replay, "report": report, "samples": samples, "recover": recover, "trend": trend,
+    "compare": compare,
 }
 
 

@@ -23,6 +23,7 @@ from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
     from drivers import Clock, Drive, FrameTap, Target
+    from sim_bus import KnownFault
     from tdhil.config import DriveData, Rig
 
 
@@ -119,6 +120,10 @@ class BusKind(ABC):
     @abstractmethod
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
         """Faults of the embedded simulator, from what ``--fault`` says. Raises UsageError."""
+
+    @abstractmethod
+    def faults(self) -> tuple[KnownFault, ...]:
+        """What ``--fault`` knows of the embedded simulator."""
 
     @abstractmethod
     def fault_listing(self) -> str:

@@ -280,6 +280,9 @@ class ToyKind(BusKind):
     def parse_faults(self, texts: Sequence[str]) -> tuple[Any, ...]:
         return tuple(SimpleNamespace(text=text) for text in texts)
 
+    def faults(self) -> tuple[Any, ...]:
+        return ()
+
     def fault_listing(self) -> str:
         return "bite: the toy bites"
 

@@ -113,7 +113,8 @@ def test_every_route_for_everybody(guarded, monkeypatch):
         "a machine": (guarded.of_token("operator"), 1),
         **{f"session {role}": (guarded.sessions[role], rank) for rank, role in enumerate(ROLES)},
     }
-    filled = {"rig": "a", "run": run, "replay": "001", "user": "no-one", "token": "none"}
+    filled = {"rig": "a", "run": run, "replay": "001", "number": "0", "fleet": "none",
+              "user": "no-one", "token": "none"}
     wrong: list[Any] = []
     for template, methods in guarded.document["paths"].items():
         path = template.removeprefix(API).format(**filled)

@@ -12,12 +12,15 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import asdict
+from html import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tdhil.service.store import write_json
 from tests.recording.test_log_tail import write
 from tests.service.conftest import Service, wait_for
 
@@ -29,7 +32,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
 ]
 HOSTILE = "<script>window.pwned=1</script><b id=x>bold</b>"
-PAGES = ("/", "/start/a", "/rigs/a", "/runs", "/audit")
+PAGES = ("/", "/start/a", "/rehearse/a", "/rigs/a", "/runs", "/fleets", "/audit")
 PLAN = {
     "excitation": "multisine", "mode": "torque", "duration_s": 100.0, "expected_half_width": 0.021, "stopping": None,
     "speed_rad_s": {"min": 1.0, "max": 5.0}, "torque_nm": {"min": -10.0, "max": 50.0},
@@ -97,6 +100,74 @@ def begin(served: Served, what: str = "hold", rig: str = "a") -> str:
     run = served.service.supervisor.start_run(rig, {"note": what}, "local").request.id
     served.service.wait(run, "awaiting_confirmation" if what == "ask" else "moving")
     return run
+
+
+def estimate(value: float, share: float = 0.01) -> dict[str, float]:
+    return {"value": value, "low": value * (1 - share), "high": value * (1 + share)}
+
+
+def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[str, ...]:
+    """Pages of results, with everything on them that there may be, called and said as badly as can be."""
+    from tdhil.fleet import FleetRow
+    from tdhil.fleet.table import write_table
+
+    store = served.service.store
+    folder = store.place(run)
+    inertia = {**estimate(104.0), "low_total": 100.0, "high_total": 108.0, "half_width_total_rel": 0.04,
+               "repeatability_rel": 0.01}
+    write_json(folder / "result.json", {
+        "verdict": "valid", "inertia_kg_m2": inertia, "reason": HOSTILE, "advice": "", "model": "rigid+lags",
+        "warnings": [HOSTILE, "speed was quantised"], "viscous_nm_s_rad": estimate(8.0), "speed_lag_s": estimate(0.4),
+        "budget": [{"source": "noise", "half_width_kg_m2": 0.2, "note": HOSTILE}],
+        "second_opinions": [{"route": HOSTILE, "inertia_kg_m2": estimate(103.0), "agrees": True, "note": ""}],
+        "friction_curve": [{"speed_rad_s": speed, "torque_nm": estimate(60.0 + 8.0 * speed)} for speed in (2.0, 5.0)],
+    })
+    svg = "<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 9 9'><path d='M0 0L9 9' stroke='red'/></svg>"
+    (folder / "report.html").write_text(
+        f"<h2>Friction over speed</h2><figure>{svg}<figcaption>{escape(HOSTILE)} no lag touches it</figcaption>")
+    row = FleetRow(f"runs/{run}/run.mcap", "valid", rig=HOSTILE, date="2026-05-01T12:00:00", inertia_kg_m2=104.0,
+                   inertia_low_kg_m2=103.0, inertia_high_kg_m2=105.0, inertia_low_total_kg_m2=100.0,
+                   inertia_high_total_kg_m2=108.0, simulated=True, changed=True, stored_verdict="valid_wide",
+                   stored_inertia_kg_m2=99.0)
+    bad = FleetRow(f"../{HOSTILE}.csv", "unread", error_kind="UsageError", error_text=f"no column {HOSTILE}\x1b[2J")
+    place = store.folder / "fleets" / "0123456789ab"
+    place.mkdir(parents=True)
+    asked = {"folder": "", "below": HOSTILE, "settings": {"model": "rigid"}, "root": "", "asked": row.date,
+             "asked_by": HOSTILE}
+    write_json(place / "request.json", asked)
+    summary = {"logs": 2, "verdicts": {"valid": 1}, "failed": {"UsageError": 1}, "changed": [{}], "done_before": 1,
+               "slowest": [{"log": HOSTILE, "cpu_s": 0.5}], "live": 1, "bare_traces": 0, "left": 0, "wall_s": 3.0,
+               "cpu_s": 2.0}
+    write_json(place / "state.json", {"state": "done", "total": 2, "done": 2, "failed": 1, "summary": summary})
+    write_table([row, bad], place / "fleet.csv")
+    point = {"log": run, "date": row.date, **estimate(104.0)}
+    after = {"log": run, "date": "2026-06-01T12:00:00", **estimate(99.0)}
+    change = {"before": run, "after": run, "before_date": point["date"], "after_date": after["date"]}
+    told = {"column": "inertia_kg_m2", "name": "inertia", "unit": "kg·m²", "differs": True, "relative": True,
+            **estimate(-0.05), "change": -0.05}
+    curve = [{"hertz": hertz, **estimate(100.0 + 40 * hertz)} for hertz in (0.1, 0.2)]
+    played = {
+        "trend": {"notes": [HOSTILE], "quantities": [
+            {"name": "inertia", "unit": "kg·m²", "text": f"changed by -5 % {HOSTILE}", "points": [point, after],
+             "changes": [change], "drift": None}]},
+        "compare": {
+            "results": [asdict(row), asdict(row)], "apparent_inertia": [curve, curve], "friction": [[], []],
+            "differences": [{"text": f"the inertias differ {HOSTILE}", "quantities": [
+                told, {**told, "column": "coulomb_nm", "name": HOSTILE}]}],
+            "settings": [{"name": "rig", "values": [HOSTILE, "R7"], "differs": True},
+                         {"name": "load", "values": ["none", "none"], "differs": False}]},
+    }
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": played[what]})
+    write_json(folder / "row.json", asdict(row))
+    return (f"/runs/{run}", f"/compare?runs={run},{second(served, run)}", f"/rigs/{store.request(run).rig}",
+            "/fleets/0123456789ab")
+
+
+def second(served: Served, run: str) -> str:
+    """Another run of the rig."""
+    other = served.service.supervisor.start_run(served.service.store.request(run).rig, {"note": "done"}, "local")
+    served.service.wait(other.request.id, "done")
+    return str(other.request.id)
 
 
 def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
@@ -272,35 +343,95 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
 
-def test_what_a_rig_is_called_is_text_on_every_page(page, served):
+def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypatch):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    results(served, run, monkeypatch)
+    page.goto(f"/runs/{run}")
+    page.get_by_text("speed was quantised").wait_for()
+    page.locator(".pictures img").evaluate("one => one.decode()")
+    page.get_by_text("Friction over speed, in numbers").click()
+    page.get_by_role("row", name="2 76").wait_for()
+    names = [one.inner_text() for one in page.locator(".files a").all()]
+    assert names == ["run.mcap", "report.html", "report.pdf", "result.json", "samples.csv"]
+    again = {"verdict": "valid_wide", "inertia_kg_m2": {**estimate(104.5), "low_total": 99.0, "high_total": 110.0,
+                                                        "half_width_total_rel": 0.05}}
+    monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": again})
+    page.get_by_label("Model").select_option("rigid")
+    page.get_by_label("How tight").fill("0.1")
+    page.get_by_role("button", name="Replay").click()
+    page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99 to 110)").wait_for()
+    page.get_by_role("row", name="the run itself").get_by_text("104 (100 to 108)").wait_for()
+    served.service.supervisor.work = lambda what, run, asked: {"document": {
+        "results": [], "differences": [], "settings": [], "apparent_inertia": [], "friction": []}}
+    page.goto("/runs")
+    button = page.get_by_role("button", name="Compare")
+    boxes = page.get_by_role("checkbox")
+    boxes.first.check()
+    assert button.is_disabled()
+    boxes.nth(1).check()
+    button.click()
+    page.wait_for_url("**/compare?runs=*,*")
+    page.goto("/rehearse/a")
+    page.get_by_label("speed", exact=True).check()
+    page.get_by_label("So long after").fill("1.5")
+    page.get_by_label("internal-limit: share").fill("20%")
+    page.get_by_role("button", name="Rehearse internal-limit").click()
+    page.wait_for_url("**/live")
+    begun = served.service.store.request(served.service.store.ids()[0])
+    assert begun.options["fault"] == ["internal-limit@speed+1.5s=20%"]
+
+
+def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
+    run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
+    served.service.wait(run, "done")
+    results(served, run, monkeypatch)
+    for path, shown in (("/runs", "104"), ("/rigs/a", "inertia, kg·m²"), ("/fleets/0123456789ab", "104")):
+        page.goto(path)
+        page.get_by_text(shown).first.wait_for()
+        page.context.set_offline(True)
+        page.get_by_text("No answer from tdhil serve: what you see is old").wait_for()
+        assert page.evaluate("document.body.classList.contains('stale')")
+        page.context.set_offline(False)
+        page.locator("body:not(.stale)").wait_for()
+
+
+def test_what_comes_from_rigs_drives_and_logs_is_text_on_every_page(page, served, monkeypatch):
     run = served.service.supervisor.start_run("hostile", {"note": "done", "operator": HOSTILE}, "local").request.id
     served.service.wait(run, "done")
-    for path in (*PAGES, "/start/hostile", f"/runs/{run}", f"/runs/{run}/live", f"/runs/{HOSTILE}"):
+    paths = results(served, run, monkeypatch)
+    for path in (*PAGES, "/start/hostile", "/rehearse/hostile", "/rigs/hostile", *paths, f"/runs/{run}/live",
+                 f"/runs/{HOSTILE}", f"/compare?runs={HOSTILE}", f"/fleets/{HOSTILE}"):
         page.goto(path)
         page.wait_for_timeout(600)
         assert page.evaluate("window.pwned === undefined"), path
         assert page.locator("b#x").count() == 0, path
-    page.goto("/")
-    page.get_by_text(HOSTILE).wait_for()
+    for path in ("/", *paths):
+        page.goto(path)
+        page.get_by_text(HOSTILE).first.wait_for()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_page_fits_a_phone_and_can_be_read(browser, served, scheme):
+def test_every_page_fits_a_phone_and_can_be_read(browser, served, monkeypatch, scheme):
     """No page is wider than 390 px; axe-core, where TDHIL_AXE names its file, finds no serious fault."""
     run = served.service.supervisor.start_run("a", {"note": "done"}, "local").request.id
     served.service.wait(run, "done")
     context = browser.new_context(base_url=served.url, viewport={"width": 390, "height": 800}, color_scheme=scheme,
                                   bypass_csp=True)
     page, faults = context.new_page(), []
-    for path in (*PAGES, f"/runs/{run}", f"/runs/{run}/live", "/nothing"):
+    axe = os.environ.get("TDHIL_AXE")
+    for path in (*PAGES, *results(served, run, monkeypatch), f"/runs/{run}/live", "/nothing"):
         page.goto(path)
         page.wait_for_timeout(500)
+        page.evaluate("for (const one of document.querySelectorAll('details')) one.open = true")
         wide = page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
         assert wide <= 0, (path, wide)
-        if axe := os.environ.get("TDHIL_AXE"):
+        if axe:
             page.add_script_tag(path=axe)
             found = page.evaluate("axe.run()")
             faults += [(path, one["id"], [node["target"] for node in one["nodes"]][:4])
                        for one in found["violations"] if one["impact"] in ("serious", "critical")]
     context.close()
     assert faults == []
+    if not axe:
+        pytest.skip("every page fits; no axe-core: npm install axe-core, and TDHIL_AXE=PATH of its axe.min.js")

@@ -129,6 +129,7 @@
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
         rig.run ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
+        rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
         rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
         rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, "Sign off") : null));
   }
@@ -471,146 +472,12 @@
     }, 150);
   }
 
-  // -- one run
-
-  function resultOf(run) {
-    const result = run.result;
-    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
-    if (run.error) parts.push(el("p", { class: "alarm" }, run.error.message));
-    if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
-    if (!result) return parts;
-    const rows = [["verdict", result.verdict]];
-    const J = result.inertia_kg_m2;
-    const estimate = (one, unit) => (one ? `${number(one.value)} (${number(one.low)} to ${number(one.high)}) ${unit}` : null);
-    if (J) rows.push(["J, 95 % interval to quote", `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${number(J.value)} (${number(J.low)} to ${number(J.high)}) kg·m²  ${percent(J.repeatability_rel)}`]);
-    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of speed", "speed_lag_s", "s"], ["lag of torque", "torque_lag_s", "s"]]) {
-      const text = estimate(result[key], unit);
-      if (text) rows.push([name, text]);
-    }
-    if (result.model) rows.push(["model", result.model]);
-    for (const one of result.second_opinions || []) {
-      const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
-      rows.push([`second opinion, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
-    }
-    const card = el("div", { class: "card" },
-      J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),
-      el("div", { class: "scroll" }, el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
-      el("p", {}, result.reason || ""), result.advice ? el("p", {}, result.advice) : null);
-    parts.push(card);
-    for (const one of result.warnings || []) parts.push(el("p", { class: "alarm" }, one));
-    if ((result.budget || []).length) {
-      parts.push(el("h2", {}, "What makes it unsure"), el("div", { class: "scroll" }, el("table", {},
-        el("tbody", {}, ...result.budget.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source), el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`), el("td", { class: "dim" }, one.note)))))));
-    }
-    return parts;
-  }
-
-  function runPage() {
-    const id = document.body.dataset.run;
-    let shown = "", files = null;
-    every(1500, async () => {
-      const run = await call("GET", `/runs/${id}`);
-      if (files !== null && files !== run.files.join() + run.state) location.reload();
-      files = run.files.join() + run.state;
-      const now = JSON.stringify(run);
+  function auditPage() {
+    let shown = "";
+    every(5000, async () => {
+      const found = await call("GET", "/audit"), now = JSON.stringify(found);
       if (now === shown) return;
       shown = now;
-      show(byId("result"), ...resultOf(run));
-      byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
-      const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
-      show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
-        el("th", { scope: "row" }, one.first ? "the run itself" : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || "as the run"),
-        el("td", {}, one.state === "waiting" ? "…" : one.error ? one.error.message : one.result.verdict),
-        el("td", {}, ofResult(one.result) || "–"),
-        el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
-    });
-    const replay = byId("replay");
-    replay.addEventListener("submit", async (event) => {
-      event.preventDefault();
-      const said = byId("replay-said"), body = {};
-      said.hidden = true;
-      if (replay.elements.model.value) body.model = replay.elements.model.value;
-      if (replay.elements.tolerance.value.trim()) body.tolerance = Number(replay.elements.tolerance.value) / 100;
-      try {
-        await call("POST", `/runs/${id}/replays`, body);
-      } catch (error) {
-        said.textContent = error.message;
-        said.hidden = false;
-      }
-    });
-    const sign = byId("sign");
-    if (sign) sign.addEventListener("submit", async (event) => {
-      event.preventDefault();
-      try {
-        await call("POST", `/runs/${id}/sign-off`, { note: sign.elements.note.value });
-        location.reload();
-      } catch (error) {
-        away(error.message);
-      }
-    });
-  }
-
-  // -- lists
-
-  function runsPage() {
-    every(3000, async () => {
-      const runs = await call("GET", "/runs");
-      show(byId("runs"), ...(runs.length ? runs.map((one) => el("tr", {},
-        el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || ""),
-        el("td", {}, STATES[one.state] || one.state), el("td", {}, inertia(one) || "–"), el("td", {}, one.verdict || ""))) : [el("tr", {}, el("td", { colspan: 5, class: "dim" }, "no run yet"))]));
-    });
-  }
-
-  // -- a rig over time
-
-  function historyPlot(where, quantity) {
-    const style = getComputedStyle(document.documentElement), at = (one) => new Date(one.date).getTime() / 1000;
-    const points = quantity.points, ink = style.getPropertyValue("--dim").trim(), line = style.getPropertyValue("--line").trim();
-    const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
-    const low = Math.min(...points.map((one) => one.low)), high = Math.max(...points.map((one) => one.high)), pad = 0.1 * (high - low);
-    const first = at(points[0]), last = at(points[points.length - 1]), side = Math.max(60, 0.08 * (last - first));
-    const plot = new uPlot({
-      width: where.clientWidth || 320, height: 220, legend: { show: false }, cursor: { show: false },
-      scales: { x: { range: () => [first - side, last + side] }, y: { range: () => [low - pad, high + pad] } },
-      axes: [{ ...axis, size: 56 }, { ...axis, size: 58 }],
-      series: [{}, { stroke: style.getPropertyValue("--speed").trim(), width: 0, points: { show: true, size: 7 }, paths: () => null }],
-      hooks: { draw: [(self) => {
-        const c = self.ctx;
-        c.save();
-        c.strokeStyle = style.getPropertyValue("--speed").trim();
-        c.lineWidth = 2 * devicePixelRatio;
-        for (const one of points) {
-          const x = self.valToPos(at(one), "x", true);
-          c.beginPath(); c.moveTo(x, self.valToPos(one.low, "y", true)); c.lineTo(x, self.valToPos(one.high, "y", true)); c.stroke();
-        }
-        c.restore();
-      }] },
-    }, [points.map(at), points.map((one) => one.value)], where);
-    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 220 })).observe(where);
-  }
-
-  async function historyPage() {
-    const rig = document.body.dataset.rig, where = byId("history");
-    try {
-      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend`, undefined, {}, 120000);
-      show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, one)));
-      for (const quantity of trend.quantities.filter((one) => one.points.length)) {
-        const plot = el("div", { class: "plot", role: "img", "aria-label": `${quantity.name} over time` });
-        where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
-          el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
-          el("figure", {}, el("figcaption", {}, "each with its repeatability on this drive"), plot),
-          el("details", {}, el("summary", {}, "Numbers"), el("div", { class: "scroll" }, el("table", {}, el("tbody", {}, ...quantity.points.map((one) => el("tr", {},
-            el("th", { scope: "row" }, el("a", { href: `/runs/${one.log}` }, when(one.date))), el("td", {}, `${number(one.value)} (${number(one.low)} to ${number(one.high)})`)))))))));
-        historyPlot(plot, quantity);
-      }
-    } catch (error) {
-      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
-    }
-  }
-
-  function auditPage() {
-    every(5000, async () => {
-      const found = await call("GET", "/audit");
       byId("chain").className = found.broken ? "alarm" : "dim";
       byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : "The chain of all lines holds.";
       show(byId("entries"), ...found.entries.map((one) => el("tr", {}, el("th", { scope: "row" }, when(one.at)), el("td", {}, one.who), el("td", {}, one.what), el("td", {}, one.rig || ""),
@@ -666,6 +533,7 @@
     try { await call("POST", "/logout", {}); location.assign("/login"); } catch (error) { away("No answer from tdhil serve: you may still be logged in."); }
   });
 
-  const pages = { login: loginPage, accounts: accountsPage, rigs: rigsPage, start: startPage, live: livePage, run: runPage, runs: runsPage, history: historyPage, audit: auditPage };
-  (pages[document.body.dataset.page] || (() => {}))();
+  const pages = { login: loginPage, accounts: accountsPage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
+  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, number, ofResult, pages, percent, show, span, when };
+  document.addEventListener("DOMContentLoaded", () => (pages[document.body.dataset.page] || (() => {}))());
 })();

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import can
 
     from drivers import Clock, Drive, FrameTap, Target
+    from sim_bus import KnownFault
     from sim_bus.canopen import Simulator
     from tdhil.session.connection import PeerPlan
 
@@ -115,6 +116,12 @@ class CanopenKind(BusKind):
         from sim_bus.canopen import parse_all
 
         return parse_all(texts)
+
+    def faults(self) -> tuple[KnownFault, ...]:
+        """Of `sim_bus.canopen`."""
+        from sim_bus.canopen import listed
+
+        return listed()
 
     def fault_listing(self) -> str:
         """All faults of the simulated CANopen drive."""

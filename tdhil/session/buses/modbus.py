@@ -19,6 +19,7 @@ from tdhil.session.connection import BusKind, Connection, one_host
 if TYPE_CHECKING:
     from drivers import Clock, Drive, FrameTap, Target
     from drivers.modbus import Link
+    from sim_bus import KnownFault
     from tdhil.session.connection import PeerPlan
 
 
@@ -109,6 +110,12 @@ class ModbusKind(BusKind):
         from sim_bus.modbus import parse_all
 
         return parse_all(texts, "embedded")
+
+    def faults(self) -> tuple[KnownFault, ...]:
+        """Of `sim_bus.modbus`, as far as the embedded drive has them."""
+        from sim_bus.modbus import listed
+
+        return listed("embedded")
 
     def fault_listing(self) -> str:
         """All faults of the simulated Modbus drive."""

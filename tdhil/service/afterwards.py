@@ -1,0 +1,140 @@
+"""What the API says of runs that are over, and of what might go wrong in one: pictures, samples, many logs, rehearsals.
+
+Each of `ANSWERS` is called with the web, the request and its body, as the web's own are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import anyio
+from starlette.responses import FileResponse, Response
+
+from tdhil.config import MODELS
+from tdhil.errors import UsageError
+from tdhil.service.answers import FaultView, FleetBody, PictureView
+from tdhil.service.fleets import TABLE, FleetView
+from tdhil.service.states import NotAllowed, NotThere
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+    from tdhil.report import Shown
+    from tdhil.service.web import Web
+
+T = TypeVar("T")
+Answer = Callable[["Web", "Request", Any], Awaitable[Any]]
+_PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
+
+
+async def _pictures(web: Web, request: Request, body: None) -> list[PictureView]:
+    found = await _shown(web, request.path_params["run"])
+    return [PictureView(number, one.heading, one.caption) for number, one in enumerate(found)]
+
+
+async def _picture(web: Web, request: Request, body: None) -> Response:
+    number = request.path_params["number"]
+    found = await _shown(web, request.path_params["run"])
+    if not number.isdecimal() or int(number) >= len(found):
+        raise NotThere("there is no such picture", where=f"run {request.path_params['run']}")
+    said = {"content-security-policy": _PICTURE_POLICY}
+    return Response(found[int(number)].svg, media_type="image/svg+xml", headers=said)
+
+
+async def _shown(web: Web, run: str) -> tuple[Shown, ...]:
+    from tdhil.report import pictures_in
+
+    def look() -> tuple[Shown, ...]:
+        report = web.store.place(run) / "report.html"
+        return pictures_in(report.read_text("utf-8")) if report.is_file() else ()
+
+    return await _off(look)
+
+
+async def _samples(web: Web, request: Request, body: None) -> Response:
+    """Made when it is first asked for."""
+    run = request.path_params["run"]
+    folder = await _off(lambda: web.store.place(run))
+    if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
+        if not web.store.status(run).ended:
+            raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended")
+        await web.work("samples", run, {})
+    return await web.file(request, "samples.csv", "text/csv")
+
+
+async def _faults(web: Web, request: Request, body: None) -> list[FaultView]:
+    from tdhil.session import bus_kind
+
+    rig = await _off(lambda: web.supervisor.rigs.get(request.path_params["rig"]))
+    if not rig.simulated:
+        raise NotAllowed("only a simulated rig can be spoilt", where=f"rig {rig.id}",
+                         next_step="Rehearse on a rig whose file says run: {simulate: true}")
+    kind = bus_kind(rig.way()[1].drive)
+    return [FaultView(one.name, one.summary, one.row, one.value, one.takes, one.from_start) for one in kind.faults()]
+
+
+async def _fleet_folders(web: Web, request: Request, body: None) -> list[str]:
+    return list(web.fleets.folders)
+
+
+async def _fleets(web: Web, request: Request, body: None) -> list[FleetView]:
+    return await _off(web.fleets.all)
+
+
+async def _fleet(web: Web, request: Request, body: None) -> FleetView:
+    return await _off(lambda: web.fleets.get(request.path_params["fleet"]))
+
+
+async def _ask_fleet(web: Web, request: Request, body: FleetBody) -> FleetView:
+    if body.model is not None and body.model not in MODELS:
+        raise UsageError(f"there is no model {body.model[:40]!r}", where="model",
+                         next_step=f"There are {', '.join(MODELS)}")
+    if body.confidence is not None and not 0.5 <= body.confidence < 1.0:
+        raise UsageError("must be at least 0.5 and below 1", where="confidence")
+    if body.tolerance is not None and not body.tolerance > 0.0:
+        raise UsageError("must be a positive share", where="tolerance")
+    asked = {"model": body.model, "confidence": body.confidence, "tolerance": body.tolerance}
+    settings = {name: value for name, value in asked.items() if value is not None}
+    who = web.who(request)
+    found = await _off(lambda: web.fleets.ask(body.folder, body.below, settings, who))
+    web.supervisor.note(who, "fleet asked", None, "", folder=body.folder, below=body.below, fleet=found.id, **settings)
+    return found
+
+
+async def _stop_fleet(web: Web, request: Request, body: Any) -> FleetView:
+    found = await _off(lambda: web.fleets.stop(request.path_params["fleet"]))
+    web.supervisor.note(web.who(request), "fleet stopped", None, "", fleet=found.id)
+    return found
+
+
+async def _fleet_rows(web: Web, request: Request, body: None) -> list[dict[str, Any]]:
+    query = request.query_params
+    start, limit = query.get("from", "0"), query.get("limit", "200")
+    if not start.isdecimal() or len(start) > 9:
+        raise UsageError("must be a number", where="from")
+    if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
+        raise UsageError("must be 1 to 1000", where="limit")
+    return await _off(lambda: web.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
+
+
+async def _fleet_table(web: Web, request: Request, body: None) -> Response:
+    which = request.path_params["fleet"]
+    path = await _off(lambda: web.fleets.table(which))
+    web.supervisor.note(web.who(request), f"downloaded {TABLE}", None, "", fleet=which)
+    return FileResponse(path, media_type="text/csv", filename=f"fleet-{which}.csv")
+
+
+async def _off(work: Callable[[], T]) -> T:
+    """In a thread: files may be slow."""
+    found: T = await anyio.to_thread.run_sync(work)
+    return found
+
+
+ANSWERS: Final[Mapping[str, Answer]] = {
+    one.__name__.removeprefix("_"): one for one in (
+        _pictures, _picture, _samples, _faults, _fleet_folders, _fleets, _fleet, _ask_fleet, _stop_fleet, _fleet_rows,
+        _fleet_table,
+    )
+}
+"""By the routes' names."""

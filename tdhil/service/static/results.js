@@ -1,0 +1,375 @@
+// What came of runs: one, several side by side, a rig over time, many logs. As in app.js, what comes from elsewhere is text.
+"use strict";
+(() => {
+  const { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, number, ofResult, pages, percent, show, span, when } = window.tdhil;
+
+  // -- one run
+
+  function resultOf(run) {
+    const result = run.result;
+    const parts = [el("p", { class: "now" }, el("strong", { class: run.state === "stop_not_confirmed" ? "alarm" : "" }, STATES[run.state] || run.state))];
+    if (run.error) parts.push(el("p", { class: "alarm" }, run.error.message));
+    if (!ENDED.includes(run.state)) parts.push(el("p", {}, el("a", { class: "button", href: `/runs/${run.id}/live` }, "Live")));
+    if (!result) return parts;
+    const rows = [["verdict", result.verdict]];
+    const J = result.inertia_kg_m2;
+    const estimate = (one, unit) => (one ? `${number(one.value)} (${number(one.low)} to ${number(one.high)}) ${unit}` : null);
+    if (J) rows.push(["J, 95 % interval to quote", `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${number(J.value)} (${number(J.low)} to ${number(J.high)}) kg·m²  ${percent(J.repeatability_rel)}`]);
+    for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of speed", "speed_lag_s", "s"], ["lag of torque", "torque_lag_s", "s"]]) {
+      const text = estimate(result[key], unit);
+      if (text) rows.push([name, text]);
+    }
+    if (result.model) rows.push(["model", result.model]);
+    for (const one of result.second_opinions || []) {
+      const agrees = one.agrees === null ? "" : one.agrees ? ", agrees" : ", DISAGREES";
+      rows.push([`second opinion, ${one.route}`, `${estimate(one.inertia_kg_m2, "kg·m²")}${agrees}`]);
+    }
+    const card = el("div", { class: "card" },
+      J ? el("p", { class: "figure" }, `J = ${ofResult(result)}`) : el("p", { class: "figure" }, result.verdict),
+      region("Numbers", el("table", {}, el("tbody", {}, ...rows.map(([name, text]) => el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, text)))))),
+      el("p", {}, result.reason || ""), result.advice ? el("p", {}, result.advice) : null);
+    parts.push(card);
+    for (const one of result.warnings || []) parts.push(el("p", { class: "alarm" }, one));
+    if ((result.budget || []).length) {
+      parts.push(el("h2", {}, "What makes it unsure"), region("What makes it unsure", el("table", {},
+        el("tbody", {}, ...result.budget.map((one) => el("tr", {}, el("th", { scope: "row" }, one.source), el("td", {}, `± ${number(one.half_width_kg_m2, 2)} kg·m²`), el("td", { class: "dim" }, one.note)))))));
+    }
+    return parts;
+  }
+
+  /** The report's pictures, and the friction curve in numbers below its own. */
+  async function pictures(id, result) {
+    const found = await call("GET", `/runs/${id}/pictures`);
+    show(byId("pictures"), ...found.flatMap((one) => [
+      el("h2", {}, one.heading),
+      el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, one.caption))]));
+    const curve = (result && result.friction_curve) || [];
+    if (curve.length) byId("pictures").append(numbers("Friction over speed, in numbers", ["speed, rad/s", "torque, N·m"],
+      curve.map((one) => [number(one.speed_rad_s), interval(one.torque_nm)])));
+  }
+  const interval = (one) => (one.value === null || one.value === undefined ? "–" : `${number(one.value)} (${number(one.low)} to ${number(one.high)})`);
+  const region = (label, table) => el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table);
+  /** A table that is folded away. Cells are texts or elements. */
+  const numbers = (label, heads, rows) => el("details", {}, el("summary", {}, label), region(label, el("table", {},
+    el("thead", {}, el("tr", {}, ...heads.map((one) => el("th", { scope: "col" }, one)))),
+    el("tbody", {}, ...rows.map(([first, ...rest]) => el("tr", {}, el("th", { scope: "row" }, first), ...rest.map((one) => el("td", {}, one))))))));
+
+  function runPage() {
+    const id = document.body.dataset.run;
+    const kept = (run) => run.state + run.files.filter((one) => one !== "report.pdf").join();    // what the page was made with
+    let shown = "", files = null;
+    every(1500, async () => {
+      const run = await call("GET", `/runs/${id}`);
+      if (files !== null && files !== kept(run)) location.reload();
+      if (files === null && run.files.includes("report.html")) await pictures(id, run.result);
+      files = kept(run);
+      const now = JSON.stringify(run);
+      if (now === shown) return;
+      shown = now;
+      show(byId("result"), ...resultOf(run));
+      byId("replays").hidden = !ENDED.includes(run.state) || !run.files.includes("run.mcap");
+      const first = run.result ? [{ asked: {}, result: run.result, state: "done", first: true }] : [];
+      show(byId("replay-rows"), ...[...first, ...run.replays].map((one) => el("tr", {},
+        el("th", { scope: "row" }, one.first ? "the run itself" : Object.entries(one.asked).map(([name, value]) => `${name} ${value}`).join(", ") || "as the run"),
+        el("td", {}, one.state === "waiting" ? "…" : one.error ? one.error.message : one.result.verdict),
+        el("td", {}, ofResult(one.result) || "–"),
+        el("td", {}, one.result && one.result.inertia_kg_m2 ? percent(one.result.inertia_kg_m2.half_width_total_rel) : ""))));
+    });
+    const replay = byId("replay");
+    replay.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const said = byId("replay-said"), body = {};
+      said.hidden = true;
+      if (replay.elements.model.value) body.model = replay.elements.model.value;
+      if (replay.elements.tolerance.value.trim()) body.tolerance = Number(replay.elements.tolerance.value) / 100;
+      try {
+        await call("POST", `/runs/${id}/replays`, body);
+      } catch (error) {
+        said.textContent = error.message;
+        said.hidden = false;
+      }
+    });
+    const sign = byId("sign");
+    if (sign) sign.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      try {
+        await call("POST", `/runs/${id}/sign-off`, { note: sign.elements.note.value });
+        location.reload();
+      } catch (error) {
+        away(error.message);
+      }
+    });
+  }
+
+  // -- lists
+
+  function runsPage() {
+    const chosen = new Set(), link = byId("compare");
+    link.addEventListener("click", () => location.assign(`/compare?runs=${[...chosen].sort().join()}`));
+    let shown = "";
+    function choose(id, yes) {
+      if (yes) chosen.add(id); else chosen.delete(id);
+      const enough = chosen.size >= 2 && chosen.size <= 8;
+      link.disabled = !enough;
+      byId("chosen").textContent = chosen.size ? `${chosen.size} chosen${chosen.size > 8 ? ", eight at most" : ""}` : "Choose two to eight runs.";
+    }
+    every(3000, async () => {
+      const runs = await call("GET", "/runs"), now = JSON.stringify(runs);
+      if (now === shown) return;                  // who is at a box with the keyboard stays there
+      shown = now;
+      show(byId("runs"), ...(runs.length ? runs.map((one) => {
+        const box = el("input", { type: "checkbox", "aria-label": `compare ${one.rig}, ${when(one.asked)}`, checked: chosen.has(one.id), disabled: one.verdict === null });
+        box.addEventListener("change", () => choose(one.id, box.checked));
+        return el("tr", {}, el("td", { class: "pick" }, box),
+          el("th", { scope: "row" }, el("a", { href: `/runs/${one.id}` }, when(one.asked))), el("td", {}, one.rig, " ", badge(one.simulated) || ""),
+          el("td", {}, STATES[one.state] || one.state), el("td", {}, inertia(one) || "–"), el("td", {}, one.verdict || ""));
+      }) : [el("tr", {}, el("td", { colspan: 6, class: "dim" }, "no run yet"))]));
+    });
+  }
+
+  // -- pictures of several runs
+
+  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const ALIVE_MS = 3000;
+  const alive = () => every(ALIVE_MS, () => call("GET", "/healthz"));     // a page that asks only once says it when nobody is there any more
+
+  /** Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn anew for another width or scheme. */
+  function points(where, series, { label, time = false, marks = [] }) {
+    const all = series.flatMap((one) => one.points);
+    const xs = [...new Set(all.map((one) => one.x))].sort((a, b) => a - b);
+    const low = Math.min(...all.map((one) => one.low ?? one.value)), high = Math.max(...all.map((one) => one.high ?? one.value));
+    const pad = 0.1 * (high - low) || 0.05 * Math.abs(high) || 1, side = Math.max(0.06 * (xs[xs.length - 1] - xs[0]), time ? 60 : 1e-3);
+    let plot = null;
+    const draw = () => {
+      if (plot) plot.destroy();
+      const axis = { stroke: colour("--dim"), grid: { stroke: colour("--line"), width: 1 }, ticks: { stroke: colour("--line") } };
+      plot = new uPlot({
+        width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
+        scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
+        axes: [{ ...axis, size: 48, label: time ? undefined : label, labelSize: time ? 0 : 22 }, { ...axis, size: 62 }],
+        series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
+        hooks: { draw: [(self) => {
+          const c = self.ctx, px = devicePixelRatio;
+          c.save();
+          c.lineWidth = 2 * px;
+          c.strokeStyle = colour("--limit");
+          c.setLineDash([6 * px, 4 * px]);
+          for (const mark of marks) {
+            const x = self.valToPos(mark, "x", true);
+            c.beginPath(); c.moveTo(x, self.bbox.top); c.lineTo(x, self.bbox.top + self.bbox.height); c.stroke();
+          }
+          c.setLineDash([]);
+          series.forEach((one, k) => {
+            c.strokeStyle = c.fillStyle = colour(one.colour);
+            const shift = (k - (series.length - 1) / 2) * 5 * px;         // those at one place stand beside each other
+            for (const point of one.points) {
+              const x = self.valToPos(point.x, "x", true) + shift;
+              if (point.low !== null && point.high !== null) {
+                c.beginPath(); c.moveTo(x, self.valToPos(point.low, "y", true)); c.lineTo(x, self.valToPos(point.high, "y", true)); c.stroke();
+              }
+              c.beginPath(); c.arc(x, self.valToPos(point.value, "y", true), 3.5 * px, 0, 7); c.fill();
+            }
+          });
+          c.restore();
+        }] },
+      }, [xs, ...series.map(() => xs.map(() => null))], where);
+    };
+    draw();
+    new ResizeObserver(() => plot.setSize({ width: where.clientWidth || 320, height: 240 })).observe(where);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  }
+
+  async function once(where, look) {
+    try {
+      await look();
+    } catch (error) {
+      show(where, el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+    }
+    alive();
+  }
+
+  // -- a rig over time
+
+  function historyPage() {
+    const rig = document.body.dataset.rig, where = byId("history"), at = (date) => new Date(date).getTime() / 1000;
+    once(where, async () => {
+      const { trend } = await call("GET", `/rigs/${encodeURIComponent(rig)}/trend`, undefined, {}, 120000);
+      show(where, ...trend.notes.map((one) => el("p", { class: "dim" }, one)));
+      for (const quantity of trend.quantities.filter((one) => one.points.length)) {
+        const plot = el("div", { class: "plot", role: "img", "aria-label": `${quantity.name} over time` });
+        where.append(el("section", {}, el("h2", {}, `${quantity.name}, ${quantity.unit}`),
+          el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
+          ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
+          el("figure", {}, el("figcaption", {}, "each with its repeatability on this drive; dashed: a change"), plot),
+          numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), interval(one)]))));
+        points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
+          { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
+      }
+    });
+  }
+
+  // -- runs side by side
+
+  function comparePage() {
+    const where = byId("compared"), runs = new URLSearchParams(location.search).get("runs") || "";
+    once(where, async () => {
+      const { runs: ids, comparison } = await call("GET", `/runs/compare?runs=${encodeURIComponent(runs)}`, undefined, {}, 300000);
+      const names = comparison.results.map((one, k) => `${one.rig || "?"}, ${when(one.date) || ids[k]}`);
+      const dot = (k) => el("span", { class: `dot c${k}`, "aria-hidden": "true" });
+      const heads = ids.map((id, k) => el("th", { scope: "col" }, dot(k), " ", el("a", { href: `/runs/${id}` }, names[k]), " ", badge(comparison.results[k].simulated) || ""));
+      const said = comparison.differences.map((one, k) => {
+        const told = one.quantities.find((other) => other.column === "inertia_kg_m2");
+        return el("p", { class: told && told.differs ? "now alarm" : "now" }, dot(0), " ", names[0], " and ", dot(k + 1), ` ${names[k + 1]}: ${one.text}.`);
+      });
+      const others = comparison.differences.flatMap((one, k) => one.quantities.filter((other) => other.column !== "inertia_kg_m2").map((other) => [
+        `${other.name}, ${k + 2} against 1`, other.differs ? "differs" : "no difference seen",
+        other.relative ? `${percentOf(other.change)} (${percentOf(other.low)} to ${percentOf(other.high)})` : `${number(other.change, 3)} (${number(other.low, 3)} to ${number(other.high, 3)}) ${other.unit}`]));
+      const curve = (title, label, key, x) => {
+        const series = comparison[key].map((found, k) => ({ colour: `--c${k}`, points: found.filter((one) => one.value !== null).map((one) => ({ ...one, x: one[x] })) }));
+        if (!series.some((one) => one.points.length)) return [];
+        const plot = el("div", { class: "plot", role: "img", "aria-label": title });
+        setTimeout(() => points(plot, series, { label }), 0);             // once it has a width
+        return [el("h2", {}, title), el("p", { class: "row legend" }, ...names.map((name, k) => el("span", {}, dot(k), ` ${k + 1}: ${name}`))), el("figure", {}, plot),
+          numbers(`${title}, in numbers`, [label, ...names], tabled(series))];
+      };
+      show(where, ...said,
+        region("Results", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...heads)), el("tbody", {},
+          line("J, interval to quote, kg·m²", comparison.results.map((one) => (one.inertia_kg_m2 === null ? "–" : `${number(one.inertia_kg_m2)} (${number(one.inertia_low_total_kg_m2)} to ${number(one.inertia_high_total_kg_m2)})`))),
+          line("J, repeatability, kg·m²", comparison.results.map((one) => interval({ value: one.inertia_kg_m2, low: one.inertia_low_kg_m2, high: one.inertia_high_kg_m2 }))),
+          line("verdict", comparison.results.map((one) => one.verdict))))),
+        others.length ? numbers("Friction and lags", ["quantity", "", "by how much"], others) : null,
+        ...curve("Apparent inertia, line by line, kg·m²", "frequency, Hz", "apparent_inertia", "hertz"),
+        ...curve("Friction, N·m", "speed, rad/s", "friction", "speed_rad_s"),
+        el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks what differs."),
+        region("Settings", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
+          el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.values, one.differs))))));
+    });
+  }
+  const percentOf = (share) => `${share > 0 ? "+" : ""}${(100 * share).toPrecision(2)} %`;
+  const line = (name, values, marked = false) => el("tr", marked ? { class: "differs" } : {}, el("th", { scope: "row" }, name), ...values.map((one) => el("td", {}, one)));
+  /** A row for each place, a cell for each series; the mean where one has several points there. */
+  function tabled(series) {
+    const xs = [...new Set(series.flatMap((one) => one.points.map((point) => Number(point.x.toPrecision(6)))))].sort((a, b) => a - b);
+    return xs.map((x) => [number(x), ...series.map((one) => {
+      const here = one.points.filter((point) => Number(point.x.toPrecision(6)) === x).map((point) => point.value);
+      return here.length ? number(here.reduce((sum, value) => sum + value, 0) / here.length) : "–";
+    })]);
+  }
+
+  // -- rehearsals
+
+  function rehearsePage() {
+    const rig = document.body.dataset.rig, form = byId("rehearse");
+    if (!form) return;
+    form.addEventListener("submit", (event) => event.preventDefault());
+    const seconds = (name) => form.elements[name].value.trim().replace(",", ".").replace(/\s*s$/, "");
+    async function begin(fault, value, button) {
+      const moment = fault.from_start ? "" : `@${form.elements.stage.value}${seconds("after") ? `+${seconds("after")}s` : ""}`;
+      const text = `${fault.name}${moment}${value ? `=${value}` : ""}${!fault.from_start && seconds("duration") ? `/${seconds("duration")}s` : ""}`;
+      button.disabled = true;
+      try {
+        const run = await call("POST", `/rigs/${encodeURIComponent(rig)}/runs`, { fault: [text], note: `rehearsal: ${text}`, real_time: form.elements.real_time.checked }, { "Idempotency-Key": crypto.randomUUID() });
+        location.assign(`/runs/${run.id}/live`);
+      } catch (error) {
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+        byId("said").scrollIntoView({ block: "center" });
+        button.disabled = false;
+      }
+    }
+    once(byId("said"), async () => {
+      const faults = await call("GET", `/rigs/${encodeURIComponent(rig)}/faults`);
+      show(byId("faults"), ...faults.map((one) => {
+        const value = one.takes ? el("input", { value: one.value, "aria-label": `${one.name}: ${one.takes.toLowerCase()}`, autocomplete: "off" }) : null;
+        const button = el("button", { type: "button", class: "quiet", "aria-label": `Rehearse ${one.name}` }, "Rehearse");
+        button.addEventListener("click", () => begin(one, value && value.value.trim() !== one.value ? value.value.trim() : "", button));
+        return el("li", {}, el("strong", {}, one.name, one.row ? el("span", { class: "dim" }, ` ${one.row}`) : ""),
+          el("span", {}, one.summary, one.from_start ? el("span", { class: "dim" }, "; from the start") : ""), value || el("span"), button);
+      }));
+    });
+  }
+
+  // -- many logs
+
+  const FLEET = { running: "identifying", done: "done", interrupted: "ended before all was done", failed: "failed" };
+  const asWhat = (settings) => Object.entries(settings).map(([name, value]) => `${name} ${value}`).join(", ") || "as each run had it";
+  const stateOf = (one) => (one.held ? "waits: a shaft turns, or a drive is in use" : FLEET[one.state]) + (one.total ? `: ${one.done} of ${one.total} logs` : "") + (one.failed ? `, ${one.failed} failed` : "");
+
+  function fleetsPage() {
+    const form = byId("ask");
+    let shown = "";
+    call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || "the runs of this service"))), () => {});
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      const body = { folder: form.elements.folder.value, below: form.elements.below.value.trim() };
+      if (form.elements.model.value) body.model = form.elements.model.value;
+      if (form.elements.tolerance.value.trim()) body.tolerance = Number(form.elements.tolerance.value.replace(",", ".").replace("%", "")) / 100;
+      try {
+        const found = await call("POST", "/fleets", body);
+        location.assign(`/fleets/${found.id}`);
+      } catch (error) {
+        show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));
+      }
+    });
+    every(2000, async () => {
+      const found = await call("GET", "/fleets"), now = JSON.stringify(found);
+      if (now === shown) return;
+      shown = now;
+      show(byId("fleets"), ...(found.length ? found.map((one) => el("tr", {}, el("th", { scope: "row" }, el("a", { href: `/fleets/${one.id}` }, when(one.asked))),
+        el("td", {}, one.folder || "the runs of this service", one.below ? `, ${one.below}` : ""), el("td", {}, asWhat(one.settings)), el("td", {}, stateOf(one))))
+        : [el("tr", {}, el("td", { colspan: 4, class: "dim" }, "none yet"))]));
+    });
+  }
+
+  function fleetRow(row) {
+    const own = /^runs\/([0-9]{8}-[0-9]{6}-[0-9a-f]{6})\/run\.mcap$/.exec(row.log);
+    const J = row.inertia_kg_m2 === null ? "–" : `${number(row.inertia_kg_m2)} (${number(row.inertia_low_total_kg_m2)} to ${number(row.inertia_high_total_kg_m2)})`;
+    const was = row.changed ? `other: ${row.stored_verdict} ${number(row.stored_inertia_kg_m2)}` : row.changed === false ? "the same" : "";
+    return el("tr", row.error_kind ? { class: "refused" } : {}, el("th", { scope: "row" }, own ? el("a", { href: `/runs/${own[1]}` }, own[1]) : row.log),
+      el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : row.verdict), el("td", {}, J), el("td", {}, was));
+  }
+
+  function fleetSummary(found) {
+    const counts = [...Object.entries(found.verdicts), ...Object.entries(found.failed).map(([kind, count]) => [`failed: ${kind}`, count])];
+    const more = [["done before", found.done_before], ["other than the result in the log", found.changed.length], ["being written: left alone", found.live], ["CSV without a .yaml: left out", found.bare_traces], ["left to do", found.left]].filter(([, count]) => count);
+    return [el("h2", {}, "Summary"), el("div", { class: "two" },
+      region("How many", el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
+      el("div", {}, el("p", {}, `${found.logs} logs in ${span(found.wall_s)}, ${span(found.cpu_s)} of the processor.`),
+        found.slowest.length ? numbers("The slowest", ["log", "processor, s"], found.slowest.map((one) => [one.log, one.cpu_s.toFixed(2)])) : null))];
+  }
+
+  function fleetPage() {
+    const id = document.body.dataset.fleet, said = byId("said");
+    let count = 0, state = null, wanted = 200, view = null;
+    async function rows() {
+      if (count >= wanted) return;
+      const found = await call("GET", `/fleets/${id}/rows?from=${count}&limit=${Math.min(200, wanted - count)}`);
+      count += found.length;
+      byId("rows").append(...found.map(fleetRow));
+      byId("more").hidden = count < wanted;
+    }
+    every(1000, async () => {
+      view = await call("GET", `/fleets/${id}`);
+      if (state !== null && view.state !== state) { count = 0; byId("rows").replaceChildren(); }      // the table has those of before, too
+      state = view.state;
+      const going = state === "running";
+      byId("state").textContent = stateOf(view) + (going && view.left_s !== null ? `, about ${span(view.left_s)} left` : "");
+      byId("progress").max = view.total || 1;
+      byId("progress").value = view.done;
+      byId("end").hidden = !going;
+      byId("again").hidden = going;
+      byId("table").hidden = going || !view.summary;
+      said.hidden = !view.error;
+      said.textContent = view.error ? view.error.message : "";
+      if (going || !view.summary) show(byId("summary")); else if (!byId("summary").firstChild) show(byId("summary"), ...fleetSummary(view.summary));
+      await rows();
+    });
+    const press = async (work) => {
+      try { await work(); } catch (error) { away(error instanceof Refused ? error.message : "No answer from tdhil serve."); }
+    };
+    byId("end").addEventListener("click", () => press(() => call("POST", `/fleets/${id}/stop`, {})));
+    byId("again").addEventListener("click", () => press(() => call("POST", "/fleets", { folder: view.folder, below: view.below, ...view.settings })));
+    byId("more").addEventListener("click", () => press(() => { wanted += 200; return rows(); }));
+  }
+
+  Object.assign(pages, { run: runPage, runs: runsPage, history: historyPage, compare: comparePage, rehearse: rehearsePage, fleets: fleetsPage, fleet: fleetPage });
+})();
