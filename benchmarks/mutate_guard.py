@@ -281,7 +281,8 @@ def run_tests(subject: str, changed: Changed) -> int:
 
     forget(SUBJECTS[subject].module)
     sys.meta_path.insert(0, changed)
-    quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts="]
+    quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts=",
+             "--all-but-long"]
     files = [str(TESTS / name) for name in SUBJECTS[subject].tests]
     return int(pytest.main([*quiet, "--import-mode=importlib", *files]))
 

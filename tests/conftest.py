@@ -39,6 +39,7 @@ GROUPS = "one_worker"
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--long", action="store_true", help="also the cases that are left out for their time")
     parser.addoption("--heavy", action="store_true", help="only the heavy cases, which CI runs beside the README's")
+    parser.addoption("--all-but-long", action="store_true", help="the heavy cases, too")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -72,10 +73,11 @@ def pytest_xdist_make_scheduler(config, log):      # type: ignore[no-untyped-def
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--long"):
-        heavy = config.getoption("--heavy")
+        heavy, too = config.getoption("--heavy"), config.getoption("--all-but-long")
         chosen = [
             item for item in items
-            if item.get_closest_marker("long") is None and (item.get_closest_marker("heavy") is not None) is heavy
+            if item.get_closest_marker("long") is None
+            and (too or (item.get_closest_marker("heavy") is not None) is heavy)
         ]
         if len(chosen) < len(items):
             kept = set(chosen)
@@ -97,5 +99,7 @@ def pytest_collection_finish() -> None:
 def pytest_report_header(config: pytest.Config) -> str:
     if config.getoption("--long"):
         return "long and heavy cases: run too"
+    if config.getoption("--all-but-long"):
+        return "long cases: LEFT OUT (--long); heavy cases: run too"
     heavy = "ONLY THESE" if config.getoption("--heavy") else "LEFT OUT, run by .ci/run (--heavy)"
     return f"long cases: LEFT OUT (--long); heavy cases: {heavy}"

@@ -77,6 +77,7 @@ def test_a_result_shows_itself_as_the_card(record, capsys):
     assert "SIMULATED" in repr(record)
 
 
+@pytest.mark.heavy
 def test_a_trace_in_csv_takes_the_options_of_replay(record, capsys, tmp_path):
     rows = zip(record.recording.time_s, record.recording.speed_rad_s, record.recording.torque_nm, strict=True)
     trace = tmp_path / "trace.csv"
@@ -262,6 +263,7 @@ def test_a_library_that_is_missing_is_named(record, monkeypatch):
         record.to_pandas()
 
 
+@pytest.mark.heavy
 def test_the_example_runs(capsys):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     assert "kg·m²" in capsys.readouterr().out

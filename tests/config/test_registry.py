@@ -87,6 +87,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(EXCITATIONS, "stairs", Entry(f"{__name__}:STAIRS", "up and down in steps"))
 
 
+@pytest.mark.heavy
 @pytest.mark.usefixtures("toys")
 def test_a_toy_excitation_is_run_by_the_front_door_and_identified(tmp_path):
     with tdhil.simulate(seed=7) as drive:
@@ -341,6 +342,7 @@ def toy_bus(monkeypatch, tmp_path) -> ToyKind:
     return TOY_BUS
 
 
+@pytest.mark.heavy
 def test_a_run_on_a_toy_bus_goes_all_the_way(toy_bus, capsys):
     code = main(["identify", "--drive", "toy", "--simulate", "--seed", "3", "--json", "--model", "rigid",
                  "--excitation", "multisine", "--periods", "3"])

@@ -90,6 +90,7 @@ def test_torque_drives_speed_of_its_own_sign(torque_run, sign):
     assert last.speed_rad_s == pytest.approx(wanted, rel=0.02, abs=0.6 * run.bench.speed_lsb)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("speed", [5.0, -3.0, 12.5])
 def test_the_steady_speed_is_the_one_commanded(run, speed):
     run.ready()
@@ -319,6 +320,7 @@ def test_closing_without_having_moved(run):
     assert run.bench.settings() == before
 
 
+@pytest.mark.heavy
 def test_a_seed_repeats_a_run(make_bench):
     def once(seed):
         run = Run(make_bench(RigParams(), seed=seed))

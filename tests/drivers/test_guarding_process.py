@@ -38,6 +38,7 @@ def simulated(tmp_path):
     process.stdout.close()
 
 
+@pytest.mark.heavy
 def test_a_host_that_is_gone_leaves_a_shaft_at_rest(simulated):
     port, trace, process = simulated
     bus = can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="can0", tcp_tune=True)

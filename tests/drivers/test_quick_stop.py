@@ -40,6 +40,7 @@ def turning(epos4, tmp_path):
         bus.shutdown()
 
 
+@pytest.mark.heavy
 def test_in_torque_mode_it_is_braked_and_never_let_go_while_it_turns(turning, epos4):
     simulator, bus, trace = turning
     target = Cia402Target(bus, epos4, MonotonicClock(), node=1)

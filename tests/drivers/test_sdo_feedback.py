@@ -63,6 +63,7 @@ def test_a_look_shows_what_the_cycle_shows(run):
     assert run.cycle(speed=2.0).state is PowerState.ENABLED
 
 
+@pytest.mark.heavy
 def test_in_pre_operational_it_sees_rest_and_disables(turning, bench):
     bench.foreign(0x000, bytes((0x80, 1)))
     quietly(turning, 10, speed=2.0)
@@ -92,6 +93,7 @@ def test_a_stopped_node_is_asked_in_pre_operational(turning, bench):
     assert poll is not None and poll.state is not PowerState.ENABLED
 
 
+@pytest.mark.heavy
 def test_after_a_restart_nothing_is_enabled(turning, bench):
     bench.foreign(0x000, bytes((0x81, 1)))
     quietly(turning, 10, speed=2.0)

@@ -72,6 +72,7 @@ def test_jitter_and_dropped_samples(default_run):
         assert any("stale" in warning for warning in found.warnings)
 
 
+@pytest.mark.heavy
 def test_the_same_recording_gives_the_same_bits(one_recording):
     assert repr(identify(one_recording)) == repr(identify(one_recording))
 
@@ -92,6 +93,7 @@ def test_aborted_run_uses_the_whole_periods_that_there_are(one_recording):
     assert any("partial" in warning for warning in found.warnings)
 
 
+@pytest.mark.heavy
 def test_torque_scale_widens_only_the_total(one_recording):
     plain = identify(one_recording).inertia
     found = identify(replace(one_recording, torque_scale_rel_sd=0.02)).inertia

@@ -101,6 +101,7 @@ CSV = (
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("name", CSV)
 def test_as_a_trace_it_ends_in_one_clear_sentence(records, tmp_path, name):

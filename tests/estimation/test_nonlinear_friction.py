@@ -116,6 +116,7 @@ def bent(recording, friction, speed_lag=0.40, torque_lag=0.15):
     return replace(recording, torque_nm=torque)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("friction", [
     lambda w: 25.0 * np.exp(-((w / 1.7) ** 2)), lambda w: 0.7 * w**2, lambda w: 40.0 * np.exp(-((w / 4.0) ** 2)),
 ], ids=["narrow bell", "parabola", "wide bell"])
@@ -131,6 +132,7 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
     assert total == pytest.approx(0.5 * (said.inertia.high - said.inertia.low), rel=0.3)
 
 
+@pytest.mark.heavy
 def test_a_bend_is_seen_behind_short_lags():
     """Reports of 5 and 3 ms: descents that leave a lag in common on the way had ended there, and at p = 1e-158."""
     recording = bent(closed_form(speed_lag=0.005, torque_lag=0.003, noise=0.05),
@@ -155,6 +157,7 @@ def test_straight_friction_is_not_bent():
     assert identify(closed_form()).model == "rigid+lags"
 
 
+@pytest.mark.heavy
 def test_too_near_to_rest_nothing_is_made_of_it():
     near = bent(closed_form(offsets=(2.15, 7.0), noise=0.05), lambda w: 25.0 * np.exp(-((w / 1.0) ** 2)))
     said = identify(near)

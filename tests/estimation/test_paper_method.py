@@ -18,6 +18,7 @@ def slope(hertz, inertia=104.0, viscous=8.0, speed_lag=0.40, torque_lag=0.15):
     return inertia * (1.0 + square * speed_lag * torque_lag) / below + viscous * (speed_lag - torque_lag) / below
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("hertz", "field"), [(0.1, 107.0), (0.3, 118.0), (0.5, 137.0), (1.0, 186.0)])
 def test_single_tone_slopes(hertz, field):
     motion, _ = planned(ExcitationWish(kind="sine", frequency_hz=hertz, periods=max(5, round(50 * hertz))))

@@ -72,6 +72,7 @@ def test_finds_the_truth_of_the_closed_form(inertia, viscous, coulomb, speed_lag
     assert found.coulomb_nm.value == pytest.approx(coulomb, abs=0.3)
 
 
+@pytest.mark.heavy
 def test_a_shaft_that_a_lag_can_impersonate_is_refused_or_wide():
     """J/B = 1 s: (J s + B) = B (1 + s), so the shaft could be a lag of 1 s, and a lag the shaft."""
     found = identify(closed_form(20.0, 20.0, 0.0, 0.0, 0.0, 0.0, noise=0.02))
@@ -167,6 +168,7 @@ def test_only_a_lag_that_both_share_costs_anything(speed, torque, unseen):
     assert by_speed == pytest.approx(slope, abs=1e-4 / unseen)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("speed_lag", "torque_lag", "told"), [
     (0.006, 0.005, (0.0, 0.0)), (0.6, 0.5, (0.6, 0.5)), (0.8, 0.01, (0.8, 0.03)),
 ])

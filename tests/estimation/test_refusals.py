@@ -127,6 +127,7 @@ def test_never_a_number(spoil):
     assert found.advice
 
 
+@pytest.mark.heavy
 def test_friction_that_is_no_straight_line_is_rejected():
     recording = closed_form(noise=0.3)
     torque = recording.torque_nm + 4.0 * (recording.speed_rad_s - 5.0) ** 2

@@ -63,6 +63,7 @@ def usual():
     return {route: np.array(found, dtype=float) for route, found in rows.items()}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("route", ["speed change", "coast-down"])
 def test_its_own_interval_covers(usual, route):
     found = usual[route]

@@ -71,6 +71,7 @@ def test_auto_finds_the_string():
     assert any("a resonance" in warning for warning in found.warnings)
 
 
+@pytest.mark.heavy
 def test_a_pipe_that_is_known_is_held_to_and_one_that_is_wrong_is_told():
     plant = Pipe()
     recording = run(plant, [4], noise=MILD, lag_prior=KNOWN, settle=8)[0]
@@ -101,6 +102,7 @@ def test_waves_on_the_bench_meet_the_bench_s_own_impedance():
         assert seen / late == pytest.approx(pipe.impedance(hz), rel=0.01)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("seed", (2, 17))
 def test_a_string_must_gain_more_than_chance_gives(seed):
     """A spring that weighs nothing, where scatter speaks for a weight: two masses stand, with intervals that hold what

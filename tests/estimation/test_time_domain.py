@@ -119,6 +119,7 @@ def test_known_lags_narrow_the_interval_and_the_torque_scale_widens_the_total_on
     assert known.high_total - known.value >= 1.9 * 0.03 * known.value
 
 
+@pytest.mark.heavy
 def test_holes_and_lost_rows_do_no_harm_and_the_bits_repeat(steps):
     kept = np.random.default_rng(3).random(len(steps.time_s)) > 0.1
     kept &= np.abs(steps.time_s - 50.0) > 4.0
@@ -179,6 +180,7 @@ HOPELESS = [(constant_speed, "constant"), (coasting, "coast"), (no_torque, "torq
             (turned_round, ""), (at_the_limit, "limit")]
 
 
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("spoil", "said"), HOPELESS, ids=lambda value: getattr(value, "__name__", ""))
 def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, spoil, said):
@@ -189,6 +191,7 @@ def test_a_record_that_can_t_tell_is_refused_and_says_which_motion_would(steps, 
     assert refused.advice
 
 
+@pytest.mark.heavy
 def test_what_stands_beside_a_line_need_not_stand_clear():
     """A multisine that nobody declared, in much noise: just above its last line the speed is what noise makes of it.
     Bins there had counted as clear for their neighbours' sake, and spoken against the model."""

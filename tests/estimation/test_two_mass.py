@@ -134,6 +134,7 @@ def recording():
     return run(TwoMass(), [3], noise=MILD, lag_prior=KNOWN)[0]
 
 
+@pytest.mark.heavy
 def test_auto_finds_two_masses_and_says_so(recording):
     found = identify(recording)
     shaft = found.compliant
@@ -167,6 +168,7 @@ def test_the_same_recording_gives_the_same_bits(recording):
     assert identify(recording, asked) == identify(recording, asked)
 
 
+@pytest.mark.heavy
 def test_intervals_hold_over_seeds():
     """Of five seeds and four quantities at 95 %, four misses or more would have a chance of 2 %."""
     plant, misses = TwoMass(), 0

@@ -263,6 +263,7 @@ def test_row_19_the_same_feedback_again_and_again():
     ended.assert_stopped(CommunicationLost, ExitCode.COMMUNICATION, "frozen")
 
 
+@pytest.mark.heavy
 @in_motion
 @pytest.mark.parametrize(
     ("error", "code"),

@@ -26,6 +26,7 @@ class Noise:
         monkeypatch.setattr(EmbeddedLink, "transact", noisy)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("profile", ["generic/modbus", "siemens/g120"])
 def test_row_72_it_comes_to_rest_and_that_is_confirmed(profile, no_bus_of_the_user, monkeypatch, tmp_path, seen):
     """One request a cycle, and three of them at 19,200 baud."""

@@ -57,6 +57,7 @@ def test_a_host_dies_while_another_client_reads(tmp_path, what, runs_on):
     assert bool(shaft.events("host silent")) is not runs_on
 
 
+@pytest.mark.heavy
 def test_row_66_refused_unless_taken_by_name(tmp_path, no_bus_of_the_user, seen):
     """A real drive in a process of its own: nothing moves, and the way out is named."""
     profile, trace, rig = fed_by(tmp_path, "any_request"), tmp_path / "shaft.csv", tmp_path / "rig.yaml"
@@ -115,6 +116,7 @@ def command(control, speed_rad_s, torque_permille=0, mode=0):
     return struct.pack(">BHHBHihH", 16, 0, 5, 10, control, rpm, torque_permille, mode)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("hz", "pdu", "stage"), [
     (5.0, command(15, 5.0), "speed"), (50.0, command(15, 5.0), "speed"), (100.0, command(15, 5.0), "acquire"),
     (20.0, command(15, 0.0, 300, 1), "hold"), (10.0, struct.pack(">BHHBi", 16, 1, 2, 4, 4775), "speed"),
@@ -134,6 +136,7 @@ def test_row_67_another_master_commands(hz, pdu, stage, other, monkeypatch, tmp_
          ended.assert_log_whole(), ended.done.code)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("address", "value", "words"), [
     (40, 0, ("register 40", "time-out", "was 0.5 s, and is 0 s")),
     (41, 0, ("register 41", "reaction", "was 3, and is 0")),

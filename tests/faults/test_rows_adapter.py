@@ -62,6 +62,7 @@ def test_row_13_bus_off(rehearse, adapter, monkeypatch, seen):
     assert_left_to_the_watchdog(run, acted, seen, 13, "bus-off", "termination", "watchdog")
 
 
+@pytest.mark.heavy
 def test_row_14_error_passive(rehearse, adapter, monkeypatch, seen):
     def act(sample):
         adapter().error_frame(CONTROLLER, TX_PASSIVE)
@@ -87,6 +88,7 @@ def test_row_15_transmit_queue_full(rehearse, adapter, monkeypatch, seen):
     assert_left_to_the_watchdog(run, acted, seen, 15, "No buffer space", "watchdog")
 
 
+@pytest.mark.heavy
 def test_row_16_a_bus_that_comes_back_with_queued_setpoints(rehearse, adapter, monkeypatch, seen):
     """The queue took some frames before it was full. They go out when the drive has begun to stop by itself."""
     late = []

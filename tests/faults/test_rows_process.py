@@ -96,6 +96,7 @@ def test_row_7_nothing_is_sent_by_kernel_or_thread():
         assert "threading" not in (root / "drivers" / "canopen" / sender).read_text(encoding="utf-8")
 
 
+@pytest.mark.heavy
 def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):
     """`tdhil simulate canopen --fault …` in a process of its own: it learns of the stages from the host."""
     with peer(tmp_path, "--stepped", "--seed", 1, "--fault", "emcy@speed+15s=4310h") as drive, host(

@@ -106,6 +106,7 @@ LOSSES = (
 )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("row", "fault", "said"), LOSSES, ids=[fault for _, fault, _ in LOSSES])
 def test_row_with_a_run_that_goes_on(row, fault, said, rehearse, seen):
     """M: the stage is marked, and J's interval still holds the truth where one is given."""
@@ -124,6 +125,7 @@ def test_row_with_a_run_that_goes_on(row, fault, said, rehearse, seen):
          run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_a_fault_that_passes(rehearse):
     """A duration: the bus is gone for a shorter time than anybody minds, and the run goes on."""
     run = rehearse("--fault", "feedback-lost@speed+15s/100ms", "--max-time", 40)
@@ -132,6 +134,7 @@ def test_a_fault_that_passes(rehearse):
     assert "error" not in run.done.document or run.done.document["error"] is None
 
 
+@pytest.mark.heavy
 def test_a_script_repeats(rehearse):
     first, second = (rehearse("--fault", "frame-loss@speed+1s=20%", "--fault", "sto@speed+15s") for _ in range(2))
     assert first.message == second.message

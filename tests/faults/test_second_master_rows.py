@@ -33,6 +33,7 @@ def test_noticed_and_stopped(row, fault, notice_s, words, rehearse, seen):
     seen(row, f"`{fault}`: {run.message}", standstill_s, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_a_number_that_is_taken_from_the_start_is_not_the_host_s(rehearse, seen):
     run = rehearse("--fault", "foreign-heartbeat", "--max-time", 40)
     assert run.done.document.get("error") is None, run.done.err
@@ -43,6 +44,7 @@ def test_a_number_that_is_taken_from_the_start_is_not_the_host_s(rehearse, seen)
     seen(56, f"`foreign-heartbeat`: {line}", None, run.assert_log_whole(), run.done.code)
 
 
+@pytest.mark.heavy
 def test_stray_writes_that_the_cycle_undoes_are_told(rehearse, seen):
     run = rehearse(
         "--fault", "tool-writes@speed+15s=6040h=6", "--fault", "tool-writes@speed+18s=6060h=4", "--max-time", 40

@@ -292,6 +292,7 @@ def test_a_name_does_not_take_a_shaft_that_would_be_too_fast(made, bus):
     assert_stopped_in_time(rig)
 
 
+@pytest.mark.heavy
 @both
 def test_a_name_takes_counts_that_are_wrong_where_no_harm_follows(made, bus):
     """A good unit of speed, and an encoder said to have twice the counts that it has."""
@@ -335,6 +336,7 @@ ANGLES = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("kind", ANGLES)
 @pytest.mark.parametrize("factor", [1.0, 10.0])
 def test_other_angles(made, kind, factor):

@@ -66,6 +66,7 @@ def test_one_log_is_what_replay_gives(few):
     assert row.speed_lag_low_s < 0.4 < row.speed_lag_high_s
 
 
+@pytest.mark.heavy
 def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
     task = LogTask(str(few / "R1-000.mcap"), Settings(confidence=0.9), str(tmp_path))
     first, second = identify_log(task), identify_log(task)
@@ -115,6 +116,7 @@ def test_a_cluster_s_processes_killed_at_random(tmp_path, calls):
     assert {row.verdict for row in summary.rows} == {"valid"}
 
 
+@pytest.mark.heavy
 def test_every_kind_of_file_has_its_row(few, tmp_path):
     import tdhil
 
@@ -138,6 +140,7 @@ def test_every_kind_of_file_has_its_row(few, tmp_path):
     assert (summary.bare_traces, summary.exit_code) == (1, 3)
 
 
+@pytest.mark.heavy
 def test_poisoned_logs_are_set_aside(tmp_path, calls):
     bad = (poison.KILLS, poison.HANGS, poison.EATS, poison.OUTSIDE)
     roots = many(tmp_path / "logs", 12, bad)
@@ -149,6 +152,7 @@ def test_poisoned_logs_are_set_aside(tmp_path, calls):
         "bad0.mcap": "ProcessDied", "bad1.mcap": "TimeLimit", "bad2.mcap": "MemoryError", "bad3.mcap": "ProcessDied"}
 
 
+@pytest.mark.heavy
 def test_killed_at_random_and_nothing_is_lost_or_twice(tmp_path, calls):
     rng, pools = random.Random(2), []
 
@@ -170,6 +174,7 @@ def test_killed_at_random_and_nothing_is_lost_or_twice(tmp_path, calls):
     assert {row.verdict for row in summary.rows} == {"valid"}
 
 
+@pytest.mark.heavy
 def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
     class Impatient:
         seen = 0

@@ -77,6 +77,7 @@ def test_the_command_trend(table, tmp_path, capsys):
     assert main(["trend", str(tmp_path / "none.csv"), "--rig", "R7"]) == 2
 
 
+@pytest.mark.heavy
 @pytest.mark.one_worker("fleet")
 def test_the_command_compare(few, tmp_path, capsys):
     """Two runs of one rig, of which the truth is alike."""

@@ -51,6 +51,7 @@ def test_a_fresh_round(name, tmp_path):
     assert "refused" in told
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", YAML)
 @FEW
 @given(text=st.lists(st.one_of(st.text(max_size=12), st.sampled_from(

@@ -20,6 +20,7 @@ KEYS = {
 ESTIMATE = {"value", "low", "high"}
 
 
+@pytest.mark.heavy
 def test_stdout_is_one_json_document_with_the_promised_keys(tmp_path):
     rig = tmp_path / "rig.yaml"
     rig.write_text("gear: {ratio: 2.0}\nreference_inertia_kg_m2: 104.0\nrate_hz: 50\n"
@@ -198,6 +199,7 @@ def test_simulate_goes_before_a_configured_bus(tmp_path, monkeypatch):
     assert "SIMULATED" in done.err
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("node", "code", "said"), [(5, 7, "amplitude of 3 rad/s"), (6, 4, "node 6 does not answer")]
 )
@@ -259,6 +261,7 @@ def test_one_tone_is_not_identifiable_and_the_paper_s_estimate_is_shown(tmp_path
     assert "paper" in card.out
 
 
+@pytest.mark.heavy
 def test_speed_mode_skips_what_belongs_to_torque_mode(tmp_path):
     done = identify(tmp_path, *SHORT, "--mode", "speed")
     assert done.code in (0, 9), done.err
@@ -269,6 +272,7 @@ def test_speed_mode_skips_what_belongs_to_torque_mode(tmp_path):
     assert done.document["inertia_kg_m2"]["value"] == pytest.approx(104.0, rel=0.05)
 
 
+@pytest.mark.heavy
 def test_another_plant_is_another_result(tmp_path):
     plant = tmp_path / "plant.yaml"
     plant.write_text("plant: {inertia_kg_m2: 60.0}\n")

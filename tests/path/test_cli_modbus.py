@@ -202,6 +202,7 @@ def test_what_nobody_verified_is_refused_and_nothing_was_written(tmp_path, real)
         assert written == []
 
 
+@pytest.mark.heavy
 def test_what_was_taken_by_name_stands_in_the_prompt(tmp_path, real):
     done = identify(tmp_path, *real, "--accept-unverified", "likely", "--accept-unverified", "watchdog")
     assert done.code == 4

@@ -22,6 +22,7 @@ TONES = [
 ]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("frequency_hz", "mode", "slope"), TONES)
 def test_the_paper_s_method_gives_the_paper_s_slopes(tmp_path, frequency_hz, mode, slope):
     done = identify(

@@ -31,6 +31,7 @@ WHERE_AND_WHEN = dict.fromkeys(("log", "date", "connection"), "")
 """Of a document: what tells one run from its repetition."""
 
 
+@pytest.mark.heavy
 def test_both_buses_give_the_same_result_and_the_same_samples(tmp_path):
     """Stepped time and a seed: neither bus nor process may make a difference."""
     found = []

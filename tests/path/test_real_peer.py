@@ -171,6 +171,7 @@ def test_end_of_input_moves_nothing(prompt, drive):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy
 def test_ctrl_c_at_the_prompt_moves_nothing(prompt, drive):
     prompt.type("\x03")
     assert prompt.finish() == 130
@@ -178,6 +179,7 @@ def test_ctrl_c_at_the_prompt_moves_nothing(prompt, drive):
     assert_untouched(drive)
 
 
+@pytest.mark.heavy
 def test_the_word_moves_the_shaft_and_the_prompt_fed_the_watchdog(prompt, drive):
     assert not enabled(drive)
     for asked in ("brake released", "pipe handler", "emergency stop", "watchdog        2 s in the drive"):

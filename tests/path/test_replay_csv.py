@@ -57,6 +57,7 @@ def american(t, w, m):
         "utf-16", options
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("dialect", [plain, percent, german, american])
 def test_a_run_in_other_words_has_the_same_inertia(run, tmp_path, dialect):
     document, recording, excitation, _ = run

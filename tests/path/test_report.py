@@ -22,6 +22,7 @@ def run(tmp_path_factory):
     return done
 
 
+@pytest.mark.heavy
 def test_a_run_has_a_second_opinion_and_a_friction_curve(run):
     opinions = run.document["second_opinions"]
     assert [opinion["route"] for opinion in opinions] == ["speed change"]
@@ -56,6 +57,7 @@ def test_json_says_when_on_what_and_by_whom(run):
     assert {name for name in again if again[name] != found[name]} == {"operator"}
 
 
+@pytest.mark.heavy
 def test_a_pdf_is_written_where_the_name_says_so(run):
     page = run.log.parent / "report.PDF"
     assert tdhil("replay", run.log, "--report", page).code == 0

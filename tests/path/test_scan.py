@@ -155,6 +155,7 @@ class Full(ErrorFrames):
         raise can.CanOperationError("No buffer space available", 105)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("command", ["scan", "doctor", "identify"])
 @pytest.mark.parametrize("bus", [ErrorFrames, Full])
 def test_a_wrong_bit_rate(monkeypatch, command, bus):

@@ -83,6 +83,7 @@ def test_a_drive_that_is_off_already_is_left_alone(turning):
     assert drive.shaft.state[-1] == "switch on disabled"
 
 
+@pytest.mark.heavy
 def test_a_quick_stop_that_would_coast_is_replaced_first(turning):
     drive, master = turning
     master.turn(option=0)
@@ -130,6 +131,7 @@ while True:
 """
 
 
+@pytest.mark.heavy
 def test_a_master_that_enables_again_and_again_loses_its_rpdo(turning):
     drive, master = turning
     master.objects.write(0x1400, 1, 0x80000201, 32)
@@ -189,6 +191,7 @@ def test_where_nobody_is_reached(dead, as_json, no_bus_of_the_user):
         assert done.document["exit_code"] == 8 and SENTENCE in done.document["said"]
 
 
+@pytest.mark.heavy
 def test_a_hub_that_dies_while_it_stops(turning):
     drive, master = turning
     master.turn()
@@ -201,6 +204,7 @@ def test_a_hub_that_dies_while_it_stops(turning):
     assert SENTENCE in out + err and "Traceback" not in err
 
 
+@pytest.mark.heavy
 def test_a_drive_that_can_not_brake_is_still_turning(turning, monkeypatch):
     from drivers import quick_stop
 
@@ -233,6 +237,7 @@ def test_without_a_bus_it_says_what_to_name():
     assert "--host" in done.err
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("number", [signal.SIGINT])
 def test_ctrl_c_ends_the_watching_only(turning, number):
     drive, master = turning

@@ -256,6 +256,7 @@ def test_an_exception_in_each_stage(tmp_path, monkeypatch, stage):
     assert tdhil("replay", done.log).code in (3, 9)
 
 
+@pytest.mark.heavy
 def test_a_log_that_can_not_grow_stops_the_shaft(tmp_path):
     """Disk full in mid-run: the stop runs all the same, and the JSON on stdout stays one document."""
     import resource

@@ -35,6 +35,7 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
     assert replayed.document == document
 
 
+@pytest.mark.heavy
 def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
     assert done.code == 0, done.err
@@ -46,6 +47,7 @@ def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
     assert acquire["duration_s"] <= 160.0
 
 
+@pytest.mark.heavy
 def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.1%", "--periods", 4)
     assert done.code == 0, done.err
@@ -57,6 +59,7 @@ def test_periods_fix_the_length_and_the_tolerance_is_only_compared(tmp_path):
 # -- dry run -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rig = tmp_path / "rig.yaml"
@@ -75,6 +78,7 @@ def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == [rig]
 
 
+@pytest.mark.heavy
 def test_a_dry_run_is_readable_in_80_columns(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     done = tdhil("identify", "--dry-run", "--tolerance", "2%")

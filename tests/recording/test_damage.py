@@ -84,6 +84,7 @@ def test_every_byte_that_is_cut_costs_at_most_a_chunk(good, tmp_path):
     assert max(b - a for a, b in pairwise(lengths)) <= 101   # 0.4 s at 250 Hz
 
 
+@pytest.mark.heavy
 @QUIET
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 4))
 def test_flipped_bits(good, tmp_path, seed, flips):

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tdhil.recording.log_reader import read_run
 
 QUICK = ("--rate", "50", "--seed", "1", "--periods", "4")
@@ -41,6 +43,7 @@ def test_a_disk_without_room_refuses_the_run(tmp_path):
     assert "No space left" in done.stderr
 
 
+@pytest.mark.heavy
 def test_a_disk_that_fails_at_the_very_end_does_not_take_the_result_with_it(tmp_path, monkeypatch, capsys):
     from tdhil.cli.main import main
     from tdhil.errors import LogBroken

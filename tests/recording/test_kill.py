@@ -48,6 +48,7 @@ def run_and_kill(path, after_s, script=REAL_TIME):
     return float(rest[-1]) if rest else last_s
 
 
+@pytest.mark.heavy
 def test_a_killed_run_is_replayed_up_to_its_last_half_second(tmp_path):
     for after_s in (1.0, 1.37):
         last_s = run_and_kill(tmp_path / "run.mcap", after_s)

@@ -80,6 +80,7 @@ def test_in_words(data, tmp_path, capsys):
         assert words in said
 
 
+@pytest.mark.heavy
 @SOME
 @given(seed=st.integers(0, 2**32), share=st.floats(0.01, 1.0), flips=st.integers(0, 6))
 def test_a_copy_holds_exactly_what_the_damaged_file_gives(data, tmp_path, seed, share, flips):

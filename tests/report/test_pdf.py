@@ -50,6 +50,7 @@ def texts_of(figure):
     return [one for one in found if one[0]]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("make", [full, bare, open_sided, wordy])
 def test_everything_lies_within_the_margins_and_nothing_on_another(make):
     for figure in sheets_of(report(make(), {**RUN, "note": LONG, "operator": "y" * 300})):
@@ -86,6 +87,7 @@ def test_no_sheet_but_the_last_is_half_empty():
         assert lowest < 0.45 * HIGH
 
 
+@pytest.mark.heavy
 def test_it_is_a_pdf_with_that_many_pages_and_the_same_twice():
     one, other = pdf_bytes(report(full())), pdf_bytes(report(full()))
     assert one == other

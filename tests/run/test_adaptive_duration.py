@@ -165,6 +165,7 @@ def test_the_periods_that_fit_leave_room_for_one_extension():
 # -- the whole of it -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_a_run_on_the_simulated_inverter_covers_and_is_as_tight_as_asked():
     from benchmarks.tolerance_coverage import run
 

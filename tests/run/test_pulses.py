@@ -97,6 +97,7 @@ def test_no_frequency_and_no_more_time_than_there_is(kind):
     assert "not predicted" in planned.said()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("kind", "rate_hz", "mode", "routes"),
     [

@@ -25,6 +25,7 @@ def identified(run):
     return identify(run.recording, Options(tolerance=0.05))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("rate_hz", "modes"), [(10, frozenset(Mode)), (10, SPEED_ONLY), (30, SPEED_ONLY)])
 def test_a_slow_line_identifies(rate_hz, modes):
     found = identified(run_line(LineDrive(Line(1.0 / rate_hz), modes=modes, seed=5)))

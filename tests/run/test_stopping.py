@@ -28,6 +28,7 @@ def simulated_coverage(confidence, dof, threshold, looks, runs=200_000):
     return float(np.mean(np.abs(error) <= half))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("looks", [1, 3])
 @pytest.mark.parametrize("threshold", [0.7, 0.9])
 def test_the_working_confidence_makes_up_for_looking(threshold, looks):

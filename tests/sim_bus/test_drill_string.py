@@ -171,6 +171,7 @@ def test_a_state_that_was_kept_does_not_change() -> None:
     assert once.speed_rad_s == again.speed_rad_s and np.array_equal(once.up_nm, again.up_nm)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("speed", "sticks"), [(4.0, True), (18.0, False)])
 def test_the_bit_sticks_and_slips_at_low_speed_only(speed: float, sticks: bool) -> None:
     drive = DriveParams(rated_torque_nm=20_000.0, torque_limit_nm=30_000.0, speed_gain_nm_s_rad=6000.0,

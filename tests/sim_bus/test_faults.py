@@ -189,6 +189,7 @@ def test_until_the_last_fault_is_over_each_cycle_has_its_end(host):
     assert len(ends) == pytest.approx(31, abs=1)
 
 
+@pytest.mark.heavy
 def test_a_question_is_answered_behind_all_that_came_before_it(host):
     """Also where nothing else gets through, and without a script; of real time nothing is said."""
     for fault in ((), ("bus-dead@100ms",), ("frame-loss@100ms=100%",)):

@@ -103,6 +103,7 @@ def test_generic_map(line: str) -> None:
         assert "Illegal data value" in poll.write(5, 7)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("line", LINES)
 def test_the_shaft_obeys(line: str) -> None:
     with served("generic/modbus", line) as (poll, machine):

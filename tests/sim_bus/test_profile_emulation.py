@@ -109,6 +109,7 @@ def test_answers_toggle_and_tell_the_state(bench: Open) -> None:
     assert not [data for can_id, data in host.heard if can_id == 0x701]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("reaction", "events"), [
     (3, ["host's node guarding lost", "state: quick stop active", "state: switch on disabled"]),
     (1, ["host's node guarding lost", "state: fault reaction active", "state: fault"]),

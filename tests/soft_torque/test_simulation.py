@@ -90,6 +90,7 @@ def poles_of(samples, step_s, order):
     return np.log(values.astype(complex)) / step_s
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", TABLE)
 def test_modes_in_time_are_the_poles(name):
     """Frequency within 1 %, damping within 0.005 (0.012 where it is 0.4 and more)."""
@@ -108,6 +109,7 @@ def test_modes_in_time_are_the_poles(name):
         assert -seen.real / abs(seen) == pytest.approx(mode.damping, abs=0.012 if mode.damping > 0.4 else 0.005)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("law", [STIFF, SOFT_025, HALF], ids=["stiff", "soft", "half"])
 def test_sections_in_time_against_the_chain(law):
     """A jump of the set speed, through pipe, heavy pipe and collars, to the bit."""

@@ -318,6 +318,7 @@ def test_on_a_terminal_a_bar_moves_and_leaves_nothing_behind(studies, monkeypatc
 # -- one of the real ones ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_a_field_study_over_the_bus(tmp_path):
     code, out, err = tdhil("figure23", "--set", "frequencies_hz=[0.5, 1.0]", "--set", "measured_s=5", "--json")
     assert code == 0, err

@@ -80,6 +80,7 @@ def test_the_shaft_obeys_newton_at_every_line() -> None:
 
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["stribeck", "fan"])
 def test_bent_friction_is_where_scipy_s_integrator_has_it(name: str) -> None:
     """The torque of the run as given, taken as straight between steps, through an integrator of scipy's."""

@@ -31,6 +31,7 @@ def gain_of(run_, **changes):
     return (kp * s + ki) / (settings["inertia_kg_m2"] * s * s + (kp + settings["viscous_nm_s_rad"]) * s + ki)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["figure9", "figure10", "figure12", "figure13"])
 def test_gain_and_phase_are_those_of_the_linear_loop(outcomes, name):
     """Dry friction that never reverses is a constant torque: it changes neither."""
@@ -66,6 +67,7 @@ def test_figure10_falls_throughout_where_the_loop_allows_it():
     assert said(found)["the output amplitude falls with every rise in frequency"] is True
 
 
+@pytest.mark.heavy
 def test_figure11_gives_the_sine_its_gain_and_the_step_its_true_one(outcomes):
     document = outcomes["figure11"].document
     assert document["sine_gain"] == pytest.approx(0.96, abs=0.01)
@@ -110,6 +112,7 @@ def test_scatter_of_a_small_design(name):
     assert found.tables[0].columns[-3:] == ("slope_kg_m2", "intercept_nm", "r2")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["figure16", "figure17"])
 def test_effects_of_a_small_design(name):
     found = run(name, **SMALL)
@@ -119,6 +122,7 @@ def test_effects_of_a_small_design(name):
     assert found.statements == ()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", [name for name in STUDIES if name.startswith("figure")])
 def test_every_figure_can_be_drawn(name, outcomes):
     figure_class = pytest.importorskip("matplotlib.figure").Figure

@@ -47,6 +47,7 @@ def test_with_dahl_friction_it_is_the_papers_equations():
     assert np.allclose(speed[500:], expected.y[0][500:], atol=2e-5)
 
 
+@pytest.mark.heavy
 def test_half_the_step_hardly_changes_the_inertia():
     """Sampled alike: only the integration differs."""
     coarse = changed(QUIET, coulomb_nm=82.4, duration_s=10.0, kp_nm_s_rad=10000.0)
