@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     )
     from profiles.visible_text import visible as visible
     from profiles.yaml_loader import (
-        Conversion as Conversion, load_model as load_model, load_with_lines as load_with_lines,
-        messages_of as messages_of, parse_model as parse_model,
+        Conversion as Conversion, Loaded as Loaded, load_model as load_model, load_with_lines as load_with_lines,
+        messages_of as messages_of, parse_model as parse_model, parse_with_lines as parse_with_lines,
     )
     from profiles.yaml_tree import read_tree as read_tree
 else:

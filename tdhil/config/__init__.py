@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     )
     from tdhil.config.rig import (
         DriveData as DriveData, Limits as Limits, Modbus as Modbus, Registered as Registered, Rig as Rig,
-        bit_rate_problem as bit_rate_problem, load_rig as load_rig, require_limits as require_limits,
-        simulated_default_rig as simulated_default_rig,
+        bit_rate_problem as bit_rate_problem, load_rig as load_rig, parse_rig as parse_rig,
+        require_limits as require_limits, simulated_default_rig as simulated_default_rig,
     )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -21,7 +21,7 @@ from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, GetJsonSchema
 from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
-from profiles import Conversion, DataModel, Finding, load_with_lines, messages_of, one_of
+from profiles import Conversion, DataModel, Finding, Loaded, load_with_lines, messages_of, one_of, parse_with_lines
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, names
 
 
@@ -364,7 +364,15 @@ class Rig(DataModel):
 
 def load_rig(path: Path) -> Rig:
     """The bench in a rig.yaml; DataFileError with every problem and its line. Values with a unit become SI."""
-    loaded = load_with_lines(path, Rig, convert=True)
+    return _rig_of(load_with_lines(path, Rig, convert=True))
+
+
+def parse_rig(text: str, name: str) -> Rig:
+    """The same of a text that stands in no file yet; ``name`` is what problems are told of."""
+    return _rig_of(parse_with_lines(text, name, Rig, convert=True))
+
+
+def _rig_of(loaded: Loaded[Rig]) -> Rig:
     rig = loaded.value
     rig._file, rig._lines, rig._conversions = loaded.file, loaded.lines, loaded.conversions
     return rig

@@ -43,6 +43,16 @@ class RigView:
 
 
 @dataclass(frozen=True)
+class RigFileView:
+    """A rig's file as it is; ``editable``: the keys that may be changed over HTTP."""
+
+    rig: str
+    text: str
+    sha256: str
+    editable: list[str]
+
+
+@dataclass(frozen=True)
 class ReplayView:
     """A replay: what it was asked for, and what came of it."""
 
@@ -260,6 +270,14 @@ class ReplayBody:
 
 
 @dataclass(frozen=True)
+class RigFileBody:
+    """The whole file; ``sha256``: of the one that it is to replace."""
+
+    text: str
+    sha256: str
+
+
+@dataclass(frozen=True)
 class LoginBody:
     """A person's."""
 
@@ -351,6 +369,9 @@ def _file(media: str) -> Mapping[int, Any]:
 ROUTES: Final = (
     Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
     Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
+    Route("GET", "/rigs/{rig}/file", "rig_file", "Its file", "viewer", {200: RigFileView}, errors=(404, 422)),
+    Route("POST", "/rigs/{rig}/file", "edit_rig", "Another text of its file: limits and what else is no way to a drive",
+          "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
     Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
           {200: TrendView}, errors=(404, 422)),
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
@@ -411,17 +432,17 @@ ROUTES: Final = (
     Route("POST", "/logout", "logout", "End the session", None, {200: MeView}, Nothing, (403, 422)),
     Route("GET", "/me", "me", "Who asks?", None, {200: MeView}),
     Route("POST", "/password", "password", "One's own password; ends all of one's sessions", "viewer", {200: MeView},
-          PasswordBody, (422, 429)),
+          PasswordBody, (422, 429, 503)),
     Route("GET", "/accounts", "accounts", "People and machines", "admin", {200: AccountsView}),
-    Route("POST", "/users", "add_user", "Somebody new", "admin", {201: AccountView}, UserBody, (422,)),
+    Route("POST", "/users", "add_user", "Somebody new", "admin", {201: AccountView}, UserBody, (422, 503)),
     Route("POST", "/users/{user}/password", "set_password", "Another password; ends all of his sessions", "admin",
-          {200: AccountView}, NewPasswordBody, (404, 422)),
+          {200: AccountView}, NewPasswordBody, (404, 422, 503)),
     Route("POST", "/users/{user}/remove", "remove_user", "Somebody less", "admin", {200: AccountsView}, Nothing,
-          (404, 422)),
+          (404, 422, 503)),
     Route("POST", "/tokens", "add_token", "A machine's token, which is shown this once", "admin", {201: TokenView},
-          TokenBody, (422,)),
+          TokenBody, (422, 503)),
     Route("POST", "/tokens/{token}/remove", "remove_token", "A token less", "admin", {200: AccountsView}, Nothing,
-          (404, 422)),
+          (404, 422, 503)),
     Route("GET", "/healthz", "health", "Is it there?", None, {200: HealthView}),
     Route("GET", "/metrics", "metrics", "For Prometheus", "viewer", {200: "text/plain"}),
     Route("GET", "/openapi.json", "openapi", "This document", None, {200: "application/json"}),

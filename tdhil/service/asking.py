@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers import DataFileError, PreflightRefused
 from profiles.quantities import FREQUENCY, SHARE, SPEED, TIME, Unit, read
-from tdhil.config import Rig, RunOptions, load_rig, resolve
+from tdhil.config import Rig, RunOptions, load_rig, parse_rig, resolve
 from tdhil.errors import UsageError
 from tdhil.service.states import NotAllowed, NotThere
 from tdhil.session import Connection, address_of, connection_of
@@ -182,6 +182,25 @@ def read_rig(path: Path) -> RigFile:
         return RigFile(path.stem, path, digest, load_rig(path))
     except DataFileError as error:
         return RigFile(path.stem, path, digest, None, str(error))
+
+
+EDITABLE: Final = frozenset({
+    "name", "limits", "gear", "load", "make_up_torque_nm", "torque_ramp_nm_s", "drive_data", "expected",
+    "reference_inertia_kg_m2", "accept_unverified", "rate_hz",
+})
+"""Of a rig's file, what may be edited over HTTP. Not where its drive is, nor what it is, nor who may move it how."""
+
+
+def edited(old: str, text: str, name: str) -> tuple[str, ...]:
+    """The keys in which the text differs from the rig's file as it was. Raises DataFileError and NotAllowed."""
+    wanted = parse_rig(text, name)
+    before, after = parse_rig(old, name).model_dump(), wanted.model_dump()
+    keys = tuple(sorted(key for key in before if before[key] != after[key]))
+    if beyond := [key for key in keys if key not in EDITABLE]:
+        raise NotAllowed("isn't changed over HTTP: where a drive is, what it is and who may move it stands at the rig",
+                         where=wanted.source(beyond[0]) or f"{name}: {', '.join(beyond)}",
+                         next_step="Edit the file on the service's computer")
+    return keys
 
 
 def require_motion(rig: RigFile) -> None:

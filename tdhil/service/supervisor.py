@@ -6,8 +6,10 @@ that was killed finds everything again, and nothing moves by that.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import stat
 import subprocess
 import sys
 import threading
@@ -19,11 +21,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers import CommunicationLost
-from tdhil.errors import ExitCode
-from tdhil.service.asking import RigFile, Rigs, options_of, require_motion
+from tdhil.errors import ExitCode, LogError, UsageError
+from tdhil.service.asking import RigFile, Rigs, edited, options_of, require_motion
 from tdhil.service.console import Console
 from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, Watch, blocking, now, way_to
-from tdhil.service.store import Audit, Index, Request, Store, write_json
+from tdhil.service.store import Audit, Index, Request, Store, write_json, write_whole
 from tdhil.service.wire import STOP_FILE, Refused, ask, lives, signal_stop, take_life
 from tdhil.session import Holder, holder_of, holders
 
@@ -242,6 +244,35 @@ class Supervisor:
             raise Conflict(f"there is nothing to sign off: the run is {status.state}", where=f"run {run}")
         self.store.sign_off(run, who, note)
         self.note(who, "signed off", run, status.rig, note=note)
+
+    def edit_rig(self, rig_id: str, text: str, sha256: str, who: str) -> RigFile:
+        """Put the text in place of the rig's file of this hash; the old one is kept.
+
+        Raises NotThere and UsageError, DataFileError and NotAllowed for a text that won't do, Conflict where the file
+        is another one by now or the rig is in use, and LogError where it can't be written.
+        """
+        with self._asking:                     # and nobody begins a run meanwhile
+            rig = self.rigs.get(rig_id)
+            if self.rigs.built_in:
+                raise UsageError("this rig comes with the program", where=f"rig {rig_id}",
+                                 next_step="Name a folder of your own: tdhil serve --rigs")
+            self.refuse_busy(rig)
+            before = rig.path.read_bytes()
+            if sha256 != hashlib.sha256(before).hexdigest():
+                raise Conflict("the rig's file was changed meanwhile", where=rig.path.name, next_step="Load it again")
+            keys = edited(before.decode("utf-8", "replace"), text, rig.path.name)
+            try:
+                kept = self.store.folder / "rigs" / rig.id / f"{sha256}.yaml"
+                kept.parent.mkdir(parents=True, exist_ok=True, mode=0o750)
+                write_whole(kept, before)
+                path = rig.path.resolve()
+                write_whole(path, text.encode(), stat.S_IMODE(path.stat().st_mode))
+            except OSError as error:
+                raise LogError(f"the rig's file can't be written ({error.strerror or error})", where=rig.path.name,
+                               next_step="Edit it on the service's computer") from error
+            found = self.rigs.get(rig_id)
+        self.note(who, "rig file edited", None, rig_id, keys=list(keys), before=sha256, after=found.sha256)
+        return found
 
     # -- looking after them ----------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ A stop never waits for arithmetic, a download or the index: it has threads of it
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import re
 import sqlite3
@@ -38,7 +39,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
-from tdhil.errors import ExitCode, TdhilError, UsageError
+from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
 from tdhil.service.access import (
     NOBODY,
     SOCKET_LOOK_S,
@@ -68,6 +69,7 @@ from tdhil.service.answers import (
     MeView,
     PlanView,
     ReplayView,
+    RigFileView,
     RigView,
     Route,
     RunView,
@@ -78,7 +80,7 @@ from tdhil.service.answers import (
     document,
     plain,
 )
-from tdhil.service.asking import RigFile, options_of, require_motion, require_unwatched
+from tdhil.service.asking import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.attending import LEASE_S
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.fleets import Fleets
@@ -180,6 +182,7 @@ def status_of(error: BaseException) -> int:
     for kind, status in (
         (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
         (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (CommunicationLost, 503),
+        (LogError, 503),
     ):
         if isinstance(error, kind):
             return status
@@ -256,6 +259,7 @@ class Web:
         pages = [
             Way("/", self._page("rigs.html", "rigs")),
             Way("/rigs/{rig}", self._page("history.html", "rigs")),
+            Way("/rigs/{rig}/file", self._page("rig_file.html", "rigs")),
             Way("/start/{rig}", self._page("start.html", "rigs")),
             Way("/runs", self._page("runs.html", "runs")),
             Way("/runs/{run}", self._page("run.html", "runs")),
@@ -326,6 +330,16 @@ class Web:
 
     async def _rig(self, request: Request, body: Any) -> RigView:
         return await self._off(lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
+
+    async def _rig_file(self, request: Request, body: Any) -> RigFileView:
+        return await self._off(lambda: _file_view(self.supervisor.rigs.get(request.path_params["rig"])))
+
+    async def _edit_rig(self, request: Request, body: Any) -> RigFileView:
+        rig, who = request.path_params["rig"], principal(request)
+        if not who.known:
+            raise NotAllowed("a rig's file is edited by who is logged in", where=f"rig {rig}",
+                             next_step="Edit it where it is, or add users")
+        return await self._off(lambda: _file_view(self.supervisor.edit_rig(rig, body.text, body.sha256, who.name)))
 
     async def _plan(self, request: Request, body: dict[str, Any]) -> PlanView:
         rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
@@ -437,6 +451,8 @@ class Web:
         run, who = request.path_params["run"], principal(request).name
         asked = {name: value for name, value in asdict(body).items() if value is not None}
         view = await self._off(lambda: self._new_replay(run, asked, who))
+        rig = (await self._off(lambda: self.store.request(run))).rig
+        self.supervisor.note(who, f"replay {view.name} asked", run, rig, options=asked)
         task = asyncio.get_running_loop().create_task(self._replay_later(run, view))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -865,6 +881,15 @@ def principal(request: HTTPConnection) -> Principal:
     """Who asks."""
     found: Principal = request.scope.get("user", NOBODY)
     return found
+
+
+def _file_view(rig: RigFile) -> RigFileView:
+    """Raises UsageError."""
+    try:
+        data = rig.path.read_bytes()
+        return RigFileView(rig.id, data.decode(), hashlib.sha256(data).hexdigest(), sorted(EDITABLE))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"can't be read as text ({error})", where=rig.path.name) from error
 
 
 def _account_view(one: User | Token) -> AccountView:

@@ -19,6 +19,7 @@ from tdhil.cli.main import main
 from tdhil.errors import ExitCode, UsageError
 from tdhil.service import access as access_module
 from tdhil.service import accounts as accounts_module
+from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
 from tdhil.service.access import SESSION_S, STOPS_S, Access, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
@@ -413,6 +414,65 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
         refused = guarded("POST", "/rigs/a/runs", guarded.sessions["admin"], json={option: True})
         assert "never taken over HTTP" in refused.json()["error"]["what"]
     assert guarded.service.store.ids() == []
+
+
+# -- a rig's file
+
+
+def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs):
+    engineer, path = guarded.sessions["engineer"], rigs / "real.yaml"
+    before = path.read_text()
+    path.chmod(0o640)
+    found = guarded("GET", "/rigs/real/file", guarded.sessions["viewer"]).json()
+    assert found["text"] == before
+
+    def save(text: str, code: int, who: dict[str, str] = engineer, **more: Any) -> Any:
+        answer = guarded("POST", "/rigs/real/file", who, json={"text": text, "sha256": found["sha256"], **more})
+        assert answer.status_code == code, answer.text
+        return answer.json()
+
+    save(before.replace("torque_nm: 400.0", "torque_nm: 300.0"), 403, guarded.sessions["operator"])
+    for wrong in ("port: 2", "host: 192.0.2.9"):
+        key, value = wrong.split(": ")
+        text = before.replace({"port": "port: 1", "host": "host: 127.0.0.1"}[key], wrong)
+        assert "stands at the rig" in save(text, 403)["error"]["what"], value
+    for more in ("allow_reverse: true\n", "run: {simulate: true}\n", "profile: ../../etc/passwd\n", "node: 3\n"):
+        save(before + more, 403)
+    save(before.replace("attended", "watched"), 403)
+    assert "real.yaml:2" in save(before.replace("torque_nm: 400.0", "torque_nm: <b>"), 422)["error"]["message"]
+    save(before.replace("torque_nm: 400.0", "torque_nm: -1"), 422)
+    save("&a [*a, *a]", 422)
+    save("", 422)
+    save(before, 409, sha256="0" * 64)
+    assert path.read_text() == before
+    run = guarded.run("ask", "real")
+    assert save(before, 409)["holder"] == f"run {run}"
+    guarded("POST", f"/runs/{run}/stop", engineer, json={})
+    wait_for("its end", lambda: not guarded.service.supervisor.live())
+    done = save(before.replace("torque_nm: 400.0", "torque_nm: 300.0"), 200)
+    assert guarded("GET", "/rigs/real", engineer).json()["limits"]["torque_nm"] == 300.0
+    assert (path.read_text(), path.stat().st_mode & 0o777) == (done["text"], 0o640)
+    kept = guarded.service.store.folder / "rigs" / "real" / f"{found['sha256']}.yaml"
+    assert kept.read_text() == before
+    wait_for("the audit", lambda: ("engineer", "rig file edited", None) in guarded.audit())
+    for one in guarded.service.audit.entries():
+        if one.what == "rig file edited":
+            assert (one.rig, one.details["keys"], one.details["before"]) == ("real", ["limits"], found["sha256"])
+
+
+def test_a_rig_s_file_is_not_edited_without_a_login_nor_in_a_folder_that_is_read_only(guarded, service, monkeypatch):
+    with TestClient(service.web.asgi, base_url="http://127.0.0.1:8420") as client:
+        assert client.post(f"{API}/rigs/a/file", json={"text": "", "sha256": ""}).status_code == 403
+
+    def read_only(*_: Any) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(supervisor_module, "write_whole", read_only)
+    found = guarded("GET", "/rigs/a/file", guarded.sessions["engineer"]).json()
+    answer = guarded("POST", "/rigs/a/file", guarded.sessions["engineer"],
+                     json={"text": found["text"] + "rate_hz: 50\n", "sha256": found["sha256"]})
+    assert (answer.status_code, guarded.service.supervisor.rigs.get("a").sha256) == (503, found["sha256"])
+    assert "can't be written" in answer.json()["error"]["what"]
 
 
 # -- without accounts, on loopback

@@ -140,3 +140,21 @@ def test_an_admin_s_accounts(page, served):
     page.get_by_role("button", name="Remove anna").wait_for(state="detached")
     assert "anna" not in served.service.access.accounts.known.users
     assert page.evaluate("window.pwned === undefined")
+
+
+def test_an_engineer_edits_limits(page, served, rigs):
+    page.goto("/")
+    log_in(page, "engineer")
+    page.get_by_role("article", name="Rig a").get_by_role("link", name="File").click()
+    field = page.get_by_label("rig.yaml")
+    page.get_by_text("limits").first.wait_for()
+    before = field.input_value()
+    assert before == (rigs / "a.yaml").read_text()
+    field.fill(before + "node: 3\n")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("isn't changed over HTTP").wait_for()
+    field.fill(before + "rate_hz: 50\n")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_text("Saved.").wait_for()
+    assert (rigs / "a.yaml").read_text() == before + "rate_hz: 50\n"
+    fits(page)

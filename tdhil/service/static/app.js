@@ -129,8 +129,9 @@
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
         rig.run ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
-        rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
+        may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
         rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
+        may("engineer") ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}/file` }, "File") : null,
         rig.blocked_by ? el("a", { class: "button", href: `/runs/${rig.blocked_by}` }, "Sign off") : null));
   }
 
@@ -510,6 +511,18 @@
     if (me.roles.length) location.replace(next);
   }
 
+  async function rigFilePage() {
+    const path = `/rigs/${encodeURIComponent(document.body.dataset.rig)}/file`, form = byId("rig-file"), said = byId("rig-file-said");
+    let sha256 = "";
+    const fill = (found) => { sha256 = found.sha256; form.elements.text.value = found.text; byId("editable").textContent = found.editable.join(", "); };
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      byId("rig-file-done").textContent = "";
+      saying(said, async () => { fill(await call("POST", path, { text: form.elements.text.value, sha256 })); byId("rig-file-done").textContent = "Saved."; });
+    });
+    saying(said, async () => fill(await call("GET", path)));
+  }
+
   function accountsPage() {
     const said = byId("accounts-said");
     const given = (form) => Object.fromEntries(new FormData(form));
@@ -533,7 +546,7 @@
     try { await call("POST", "/logout", {}); location.assign("/login"); } catch (error) { away("No answer from tdhil serve: you may still be logged in."); }
   });
 
-  const pages = { login: loginPage, accounts: accountsPage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, number, ofResult, pages, percent, show, span, when };
+  const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
+  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, may, number, ofResult, pages, percent, show, span, when };
   document.addEventListener("DOMContentLoaded", () => (pages[document.body.dataset.page] || (() => {}))());
 })();
