@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
     from tdhil.run import RunOutcome
     from tdhil.session import Connection, RunRequest
+    from tdhil.soft_torque import EvaluationCase
 
 
 def list_faults() -> int:
@@ -50,10 +51,39 @@ def show_settings(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
-    from drivers import own_limits
     from profiles.quantities import FREQUENCY, SPEED, TIME
-    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount, share
+    from tdhil.cli.arguments import amount, share
     from tdhil.config import EXCITATIONS, MODELS
+
+    motion = parser.add_argument_group("motion")
+    motion.add_argument("--excitation", choices=tuple(EXCITATIONS), help="stage 5 (default multisine)")
+    motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
+    motion.add_argument("--frequency", dest="frequency_hz", type=amount(FREQUENCY), metavar="HZ",
+                        help="lowest line or the tone")
+    motion.add_argument("--amplitude", dest="amplitude_rad_s", type=amount(SPEED), metavar="RAD_S",
+                        help="peak of the speed, such as 1.5 or 15rpm")
+    motion.add_argument("--offset", dest="offset_rad_s", type=amount(SPEED), metavar="RAD_S",
+                        help="mean speed, such as 4 or 40rpm")
+    motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
+    motion.add_argument("--max-time", dest="max_time_s", type=amount(TIME), metavar="TIME",
+                        help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
+    motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
+    result = parser.add_argument_group("result")
+    result.add_argument("--tolerance", type=share, metavar="SHARE",
+                        help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
+    result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
+    result.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default auto: the simplest that fits)")
+    result.add_argument("--report", type=Path, metavar="FILE",
+                        help="the result with pictures in one file: report.html, or report.pdf on A4")
+    add_peer_arguments(parser)
+    parser.set_defaults(run=run)
+
+
+def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
+    """Which drive and where, what the operator takes upon himself, the log, and the simulated rig: of any run."""
+    from drivers import own_limits
+    from profiles.quantities import FREQUENCY
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount
 
     drive = add_drive_arguments(parser)
     drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
@@ -72,31 +102,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     drive.add_argument("--accept-speed-unit", action="store_true",
                        help="take the profile's unit of speed without seeing the shaft turn as fast as it says")
     drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
-    motion = parser.add_argument_group("motion")
-    motion.add_argument("--excitation", choices=tuple(EXCITATIONS), help="stage 5 (default multisine)")
-    motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
-    motion.add_argument("--frequency", dest="frequency_hz", type=amount(FREQUENCY), metavar="HZ",
-                        help="lowest line or the tone")
-    motion.add_argument("--amplitude", dest="amplitude_rad_s", type=amount(SPEED), metavar="RAD_S",
-                        help="peak of the speed, such as 1.5 or 15rpm")
-    motion.add_argument("--offset", dest="offset_rad_s", type=amount(SPEED), metavar="RAD_S",
-                        help="mean speed, such as 4 or 40rpm")
-    motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
-    motion.add_argument("--max-time", dest="max_time_s", type=amount(TIME), metavar="TIME",
-                        help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
-    motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
-    motion.add_argument("--yes", action="store_const", const=True, help="no prompt before motion; limits stay")
-    result = parser.add_argument_group("result")
-    result.add_argument("--tolerance", type=share, metavar="SHARE",
-                        help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
-    result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
-    result.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default auto: the simplest that fits)")
-    result.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
-    result.add_argument("--report", type=Path, metavar="FILE",
-                        help="the result with pictures in one file: report.html, or report.pdf on A4")
-    result.add_argument("--operator", metavar="NAME", help="who ran it, for log and report")
-    result.add_argument("--note", metavar="TEXT", help="whatever else log and report shall say of this run")
-    result.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    drive.add_argument("--yes", action="store_const", const=True, help="no prompt before motion; limits stay")
+    kept = parser.add_argument_group("log and output")
+    kept.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
+    kept.add_argument("--operator", metavar="NAME", help="who ran it, for log and report")
+    kept.add_argument("--note", metavar="TEXT", help="whatever else log and report shall say of this run")
+    kept.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
     simulated = parser.add_argument_group("simulated rig")
     simulated.add_argument("--simulate", action="store_const", const=True,
                            help="embedded simulator; the default where nobody says where the drive is")
@@ -108,11 +119,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     simulated.add_argument("--stepped", action="store_const", const=True, help="step a simulator on the bus by SYNC")
     simulated.add_argument("--trace", metavar="shaft.csv", help="true shaft of the embedded rig")
     add_line_arguments(parser)
-    parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:
-    """The whole path. Raises TdhilError before the drive is touched; afterwards everything ends in an exit code."""
+    """The whole path."""
+    return run_with(namespace)
+
+
+def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = None) -> int:
+    """The whole path, with a virtual string in stage 5 where one is to be evaluated.
+
+    Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
+    """
     from tdhil.cli.dry_run import dry_run
     from tdhil.config import load_rig, resolve
     from tdhil.report import stderr_console
@@ -147,7 +165,7 @@ def run(namespace: argparse.Namespace) -> int:
     )
     request = RunRequest.of(
         options, connection, peer, rig, consent=consent, operator=namespace.operator, note=namespace.note,
-        real_time_priority=namespace.real_time_priority,
+        real_time_priority=namespace.real_time_priority, evaluation=evaluation,
     )
     return _run(request, console, namespace.report)
 

@@ -23,6 +23,7 @@ _COMMANDS = {
     "compare": "two runs or more side by side: settings, inertias, whether they differ",
     "watch": "identify new logs in a folder as they come",
     "tune": "from J to a speed controller that damps the drill string; nothing moves",
+    "evaluate": "a virtual drill string on the drive: does a tuned controller do what tune says?",
     "export": "a log's CAN frames or samples in another program's format",
     "profiles": "what is known of which drive, what it needs set, and how sure that is",
     "scan": "find out who is on the bus; writes nothing to any drive",
@@ -105,6 +106,8 @@ def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
         from tdhil.cli.fleet import add_watch_arguments as add_arguments
     elif name == "tune":
         from tdhil.cli.tune import add_arguments
+    elif name == "evaluate":
+        from tdhil.cli.evaluate import add_arguments
     elif name == "trend":
         from tdhil.cli.trend import add_arguments
     elif name == "compare":

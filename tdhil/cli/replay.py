@@ -12,7 +12,7 @@ from tdhil.cli.arguments import amount, share
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session import is_log, read
+from tdhil.session import is_evaluation, is_log, read
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -85,7 +85,27 @@ def run(namespace: argparse.Namespace) -> int:
             ),
             "skew_sd_s": namespace.skew_sd,
         }
-    return _identify(namespace, read(path, **trace).with_said(_said(namespace)))
+    recorded = read(path, **trace).with_said(_said(namespace))
+    return _evaluation(namespace, recorded) if is_evaluation(recorded.configuration) else _identify(namespace, recorded)
+
+
+def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
+    """What the virtual string of this log did, and print it."""
+    from tdhil.report import stderr_console
+    from tdhil.session import conclude_evaluation
+
+    for name in ("report", "model", "confidence", "tolerance"):
+        if getattr(namespace, name) is not None:
+            raise UsageError("is for a run that identifies; this log is of a virtual string", where=f"--{name}")
+    recorded.require_motion()
+    assert recorded.virtual_string is not None
+    found = conclude_evaluation(
+        recorded.virtual_string, recorded.recording, recorded.configuration, recorded.log
+    )
+    for problem in recorded.problems:
+        stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
+    print_result(found.document, namespace.json)
+    return int(ExitCode.PARTIAL if not recorded.whole and found.exit_code is ExitCode.OK else found.exit_code)
 
 
 def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:

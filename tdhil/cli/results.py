@@ -26,15 +26,16 @@ def save_report(document: Mapping[str, Any], recording: Recording, path: Path | 
 
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
-    from tdhil.report import PlainConsole, print_card
+    from tdhil.report import PlainConsole, print_card, print_evaluation
 
+    show = print_evaluation if document.get("kind") == "evaluation" else print_card
     try:
         if as_json:
             json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
             sys.stdout.write("\n")
         else:
-            print_card(document, PlainConsole())
+            show(document, PlainConsole())
         sys.stdout.flush()
     except (BrokenPipeError, OutputLost):
-        print_card(document, PlainConsole(sys.stderr))
+        show(document, PlainConsole(sys.stderr))
         raise

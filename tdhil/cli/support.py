@@ -176,9 +176,9 @@ class Scrub:
         """A message of a log: its numbers as they are, its texts scrubbed."""
         from google.protobuf.descriptor import FieldDescriptor
 
-        from tdhil.recording import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE
+        from tdhil.recording import CAN, CHANNELS, CLASSES, COMMAND, EXCITATION, MODBUS, SAMPLE, VIRTUAL_STRING
 
-        if channel in (SAMPLE, COMMAND, CAN, MODBUS, EXCITATION):
+        if channel in (SAMPLE, COMMAND, CAN, MODBUS, EXCITATION, VIRTUAL_STRING):
             return payload
         message = CLASSES[CHANNELS[channel][1]].FromString(payload)
         for field in message.DESCRIPTOR.fields:

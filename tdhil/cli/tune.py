@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from tdhil.report import TunedFor
     from tdhil.soft_torque import DriveSetting, TuneCase, Tuning
 
+IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
+"""Of the result, that `tdhil evaluate` needs to know of the rig."""
 ASSUMED_LAGS_S = (0.020, 0.010, 0.003)
 """Speed filter, torque loop and sampling of an inverter in vector control: of that order, not measured."""
 
@@ -62,7 +64,7 @@ def run(namespace: argparse.Namespace) -> int:
     _check(namespace)
     if namespace.report is not None:
         check_report_path(namespace.report, namespace.result)
-    result = _result(namespace.result)
+    result = read_result(namespace.result)
     case, lags_from = case_of(result, namespace)
     name = namespace.profile or (result.get("profile") or {}).get("name")
     profile = load_profile(str(name)) if name is not None else None
@@ -101,7 +103,7 @@ def _check(namespace: argparse.Namespace) -> None:
             raise UsageError(f"{lag:g}: must be a time from 0 to 5 s", where="--inner-lags")
 
 
-def _result(path: Path) -> Mapping[str, Any]:
+def read_result(path: Path) -> Mapping[str, Any]:
     """The result's document: as --json wrote it, or identified again from the log."""
     from tdhil.session import is_log
 
@@ -208,4 +210,4 @@ def _tuned_for(
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
                     None if profile is None else profile.name, ratio, namespace.loop, lags_from,
-                    settings, tuple(warnings))
+                    settings, tuple(warnings), {key: result.get(key) for key in IDENTIFIED})

@@ -1,19 +1,20 @@
 """What run.mcap holds: the channels, their numbers and their messages.
 
-====  ==============  =============  =====================================================================
-  id  topic           message        when
-====  ==============  =============  =====================================================================
-   1  /sample         Sample         every cycle, SI at the motor shaft
-   2  /command        Command        every cycle
-   3  /can            Frames         the frames of a cycle, as they stood on the bus
-   4  /stage          Stage          when a stage has ended
-   5  /excitation     Motion         excitation, levels and ramps; the last one counts
-   6  /event          Event          when something happened
-   7  /configuration  Text           JSON: {"run": …, "recording": …}; the last one counts
-   8  /result         Text           JSON; the last one counts
-   9  /log            foxglove.Log   the same events again, for viewers; never read back
-  10  /modbus         Frames         requests and replies (PDU), in place of /can; older logs have them there
-====  ==============  =============  =====================================================================
+====  ===============  =============  =====================================================================
+  id  topic            message        when
+====  ===============  =============  =====================================================================
+   1  /sample          Sample         every cycle, SI at the motor shaft
+   2  /command         Command        every cycle
+   3  /can             Frames         the frames of a cycle, as they stood on the bus
+   4  /stage           Stage          when a stage has ended
+   5  /excitation      Motion         excitation, levels and ramps; the last one counts
+   6  /event           Event          when something happened
+   7  /configuration   Text           JSON: {"run": …, "recording": …}; the last one counts
+   8  /result          Text           JSON; the last one counts
+   9  /log             foxglove.Log   the same events again, for viewers; never read back
+  10  /modbus          Frames         requests and replies (PDU), in place of /can; older logs have them there
+  11  /virtual_string  VirtualString  every cycle of a virtual string, at its main shaft
+====  ===============  =============  =====================================================================
 
 A message's log time is the epoch handed in at the start plus its control time, in nanoseconds.
 """
@@ -186,6 +187,13 @@ CONFIGURATION: Final = 7
 RESULT: Final = 8
 LOG: Final = 9
 MODBUS: Final = 10
+VIRTUAL_STRING: Final = 11
+
+VIRTUAL_COLUMNS: Final = (
+    "time_s", "phase", "set_rad_s", "top_rad_s", "innovation_rad_s", "string_nm", "drive_nm", "share", "bit_rad_s",
+    "unknown_nm", "put_in_j", "clamped",
+)
+"""Of a `VirtualString`, all doubles: what `tdhil.soft_torque.HostLoop.row` is."""
 
 CHANNELS: Final = {
     SAMPLE: ("/sample", "Sample"),
@@ -198,6 +206,7 @@ CHANNELS: Final = {
     RESULT: ("/result", "Text"),
     LOG: ("/log", "Log"),
     MODBUS: ("/modbus", "Frames"),
+    VIRTUAL_STRING: ("/virtual_string", "VirtualString"),
 }
 
 MODES: Final = {None: 0, Mode.SPEED: 1, Mode.TORQUE: 2}
@@ -243,6 +252,7 @@ MESSAGES: Final = {
     "Motion": {"excitation": "Excitation?", "levels": "Level*", "ramps": "Ramp*"},
     "Event": fields_of(Event),
     "Text": {"json": "string"},
+    "VirtualString": dict.fromkeys(VIRTUAL_COLUMNS, "double"),
 }
 CLASSES: Final[dict[str, Any]] = message_classes(PACKAGE, ENUMS, MESSAGES) | {"Log": LOG_CLASS}
 

@@ -14,7 +14,19 @@ from typing import Any, Final, NamedTuple
 from drivers import Command, RawFrame, Sample
 from tdhil.errors import LogError
 from tdhil.recording.builder import plain
-from tdhil.recording.log_format import CLASSES, CONFIGURATION, EVENT, EXCITATION, MODES, RESULT, STAGE, STATES, Event
+from tdhil.recording.log_format import (
+    CLASSES,
+    CONFIGURATION,
+    EVENT,
+    EXCITATION,
+    MODES,
+    RESULT,
+    STAGE,
+    STATES,
+    VIRTUAL_COLUMNS,
+    VIRTUAL_STRING,
+    Event,
+)
 from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -126,6 +138,16 @@ def event_message(event: Event) -> Cold:
         "traceback": _clean(event.traceback),
     }
     return Cold(EVENT, event.time_s, _bytes("Event", content), flush=False)
+
+
+_VIRTUAL = Struct("<" + "Bd" * len(VIRTUAL_COLUMNS))
+_VIRTUAL_TAGS = [number << 3 | 1 for number in range(1, len(VIRTUAL_COLUMNS) + 1)]      # below 16, so one byte each
+
+
+def virtual_message(row: Sequence[float]) -> Cold:
+    """A `VirtualString`, laid out by hand: there is one a cycle."""
+    fields = [part for pair in zip(_VIRTUAL_TAGS, row, strict=True) for part in pair]
+    return Cold(VIRTUAL_STRING, row[0], _VIRTUAL.pack(*fields), flush=False)
 
 
 def configuration_message(run: Mapping[str, Any], facts: Mapping[str, Any]) -> Cold:

@@ -1,13 +1,15 @@
 """run.mcap back into a Recording, from a file that may be whole, cut, damaged or hostile."""
 
 import json
+from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from struct import Struct
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 from google.protobuf.message import DecodeError
 
 from drivers import Command, PowerState, RawFrame, Sample
@@ -19,7 +21,7 @@ from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, PACKAGE, RECO
 from tdhil.recording.log_messages import TEXT_LIMIT
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.mcap_recovery import Contents, Damage, Library, Whole, walk
-from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
+from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The records inside a chunk that passed its CRC: pure, over bytes that may still be hostile.
@@ -228,7 +230,8 @@ class LoggedRun:
     """A run as the log has it. ``complete`` is False where the file wasn't closed or some of it is lost.
 
     ``problems`` says what was stepped over, a line each; ``result`` is None where the run got none. ``epoch_ns`` is the
-    wall clock at control time zero, 0 where the log doesn't tell.
+    wall clock at control time zero, 0 where the log doesn't tell; ``virtual_string``: a row a cycle, with the columns
+    of `log_format.VIRTUAL_COLUMNS`.
     """
 
     recording: Recording
@@ -239,6 +242,7 @@ class LoggedRun:
     complete: bool
     problems: tuple[str, ...]
     epoch_ns: int = 0
+    virtual_string: FloatArray = field(default_factory=lambda: np.empty((0, len(log_format.VIRTUAL_COLUMNS))))
 
 
 def read_run(path: Path, *, salvage: bool = False, batch: int = BATCH) -> LoggedRun:
@@ -299,6 +303,7 @@ class _Reading:
         self._builder = RecordingBuilder()
         self._texts: dict[int, dict[str, Any]] = {}
         self._events: list[Event] = []
+        self._virtual = array("d")
         self._stages: list[Stage] = []
         self._problems: list[str] = []
         self._budget = RARE_BYTES
@@ -310,6 +315,7 @@ class _Reading:
             log_format.STAGE: self._stage,
             log_format.EXCITATION: self._excitation,
             log_format.EVENT: self._event,
+            log_format.VIRTUAL_STRING: self._virtual_row,
         }
 
     def run(self, path: Path, salvage: bool) -> LoggedRun:
@@ -335,6 +341,7 @@ class _Reading:
             complete=complete,
             problems=tuple(self._problems),
             epoch_ns=self._epoch_ns or 0,
+            virtual_string=np.array(self._virtual).reshape(-1, len(log_format.VIRTUAL_COLUMNS)),
         )
 
     def _chunks(self, batch: list[Contents], declared: _Declared) -> bool:
@@ -408,6 +415,9 @@ class _Reading:
     def _sample(self, message: Any) -> None:
         self._builder.add_values(
             message.time_s, message.speed_rad_s, message.torque_nm, fresh=message.fresh, limited=message.limit_active)
+
+    def _virtual_row(self, message: Any) -> None:
+        self._virtual.extend(getattr(message, name) for name in log_format.VIRTUAL_COLUMNS)
 
     def _stage(self, message: Any) -> None:
         if len(self._stages) < RARE:

@@ -30,7 +30,9 @@ _RECORD: Final = Struct("<BQ")
 _MESSAGE_HEAD: Final = Struct("<HIQQ")         # channel, sequence, log time, publish time
 _MESSAGE: Final = 0x05
 _NUMBERS: Final = {number: number for number in CHANNELS}
-_SKIPPED: Final = frozenset({log_format.COMMAND, log_format.CAN, log_format.MODBUS, log_format.LOG})
+_SKIPPED: Final = frozenset({
+    log_format.COMMAND, log_format.CAN, log_format.MODBUS, log_format.LOG, log_format.VIRTUAL_STRING,
+})
 MOST: Final = 2**20
 """Bytes of the file at a time, about: whoever comes late to a long run is not to hold everything up."""
 

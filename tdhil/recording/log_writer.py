@@ -395,6 +395,11 @@ class RunWriter:
         """One frame from the bus; a `FrameTap`, may be called from any thread."""
         self._backlog.put(frame)
 
+    def virtual(self, row: Sequence[float]) -> None:
+        """One cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
+        if not self._backlog.put(log_messages.virtual_message(row)):
+            self._refused()
+
     def stage(self, stage: Stage) -> None:
         """A stage that has ended."""
         self._rare(log_messages.stage_message(stage))

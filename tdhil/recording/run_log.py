@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 import traceback
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from drivers import Command, RawFrame, Sample, TdhilError
 from tdhil.errors import ExitCode, Interrupted, exit_code
 from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import FAILURE, INTERRUPTED, Event
+from tdhil.recording.log_format import FAILURE, INTERRUPTED, VIRTUAL_COLUMNS, Event
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.recording import Excitation, Level, Ramp, Recording, Stage
+from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recording, Stage
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What ended a run before its time: written into its log as typed fields, and found there again, in older logs too.
@@ -90,6 +93,7 @@ class RunLog:
         self._builder = RecordingBuilder()
         self._run = dict(run)
         self._dropped = 0
+        self._virtual = array("d")
         writer.configuration(self._run, {})
 
     @property
@@ -106,6 +110,16 @@ class RunLog:
         self._builder.add(sample)
         self._writer.command(sample.time_s, command)
         self._writer.sample(sample)
+
+    def virtual(self, row: Sequence[float]) -> None:
+        """One cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""
+        self._virtual.extend(row)
+        self._writer.virtual(row)
+
+    @property
+    def virtual_string(self) -> FloatArray:
+        """(cycles, columns) of it."""
+        return np.array(self._virtual).reshape(-1, len(VIRTUAL_COLUMNS))
 
     def event(self, time_s: float, kind: str, text: str) -> None:
         """Something worth a line."""

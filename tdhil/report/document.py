@@ -49,7 +49,7 @@ def result_document(
         "simulated": recording.simulated,
         "complete": recording.complete,
         "ended": _mapping(run.get("ended")),
-        **_provenance(run),
+        **provenance(run),
         "log": log,
         "cycles": run.get("counters"),
         "cycle": run.get("cycle"),
@@ -67,7 +67,7 @@ def result_document(
     return cleaned
 
 
-def _provenance(run: Mapping[str, Any]) -> dict[str, Any]:
+def provenance(run: Mapping[str, Any]) -> dict[str, Any]:
     """When, where, by whom and on which drive; None for what the log doesn't say. A log may say anything."""
     bench, drive, profile = (_mapping(run.get(name)) or {} for name in ("bench", "identity", "profile"))
     limits = _mapping(bench.get("limits")) or {}

@@ -69,6 +69,8 @@ class TunedFor:
     settings: Mapping[str, tuple[DriveSetting, ...]] = field(default_factory=dict)
     """In the drive's own parameters, by the controller's kind."""
     warnings: tuple[str, ...] = ()
+    identified: Mapping[str, Any] = field(default_factory=dict)
+    """Of the result, at the motor: what a virtual string on the same rig has to know."""
 
 
 def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
@@ -85,6 +87,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             "source": tuned_for.source, "simulated": tuned_for.simulated, "profile": tuned_for.profile,
             "loop": tuned_for.loop, "gear_ratio": ratio,
         },
+        "identified": dict(tuned_for.identified),
         "main_shaft": {
             "inertia_kg_m2": asdict(case.inertia_kg_m2),
             "viscous_nm_s_rad": case.drive.viscous_nm_s_rad,

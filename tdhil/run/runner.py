@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
 from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
@@ -38,14 +39,18 @@ from tdhil.run.stages import (
     TorqueResult,
     measure_offsets,
     probe_sign,
+    refuse_longer,
+    refuse_other_rig,
     run_hold,
     run_plan,
     run_speed,
     run_torque,
+    run_virtual_string,
     slow_down,
 )
 from tdhil.run.stop import StopReport, StopSequence
 from tdhil.run.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
+from tdhil.soft_torque import EvaluationCase, Program, Window, program_for, refuse_untrue
 
 
 def _nothing(text: str) -> None:
@@ -127,6 +132,7 @@ class Runner:
             limits, assumptions = task.limits, task.assumptions
             mode = choose_mode(task.request, limits, preflight)
             _, torque_offset = measure_offsets(loop, limits)
+            program = None if task.evaluation is None else self._program(task, task.evaluation, loop)
             self._log.learn(torque_offset_nm=torque_offset)
             self._confirm(task, preflight, lambda: self._idle(loop))
             self._stop = StopSequence(
@@ -170,6 +176,9 @@ class Runner:
             why = no_torque(task.request.mode, preflight)
             self._book.skip("torque", f"{why}: no switch, and no second look at the inertia by a drift")
         model = self._model(loop, speed, drifted)
+        if task.evaluation is not None and program is not None and drifted is not None:
+            self._run_virtual_string(task, task.evaluation, program, loop, speed, drifted, resolution)
+            return
         planner = StagePlanner(loop, self._log, self._display, self._say)
         planned = planner.plan(task, speed, mode, self._prior)
         plan = planned.plan
@@ -189,6 +198,42 @@ class Runner:
                 loop, limits, plan, control, assumptions, announced, planner.enough(planned),
                 preflight.speed_resolution_rad_s,
             )
+
+    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop) -> Program:
+        """The virtual string's course, before anything moves. Raises what refuses it."""
+        limits = task.limits
+        if limits.load != "none":
+            raise PreflightRefused(
+                f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
+                next_step="Evaluate before the string is below the drive",
+            )
+        refuse_untrue(case, loop.period_s)
+        window = Window(
+            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
+        )
+        program = loop.compute(partial(program_for, case, window), Command(Mode.SPEED, 0.0, 0.0))
+        refuse_longer(program, limits)
+        self._log.configure(evaluation={"case": case.plain(), "program": asdict(program)})
+        return program
+
+    def _run_virtual_string(
+        self, task: Task, case: EvaluationCase, program: Program, loop: ControlLoop, speed: SpeedResult,
+        drifted: TorqueResult, resolution_rad_s: float,
+    ) -> None:
+        """Stages 4 and 5 with a virtual string."""
+        limits, assumptions = task.limits, task.assumptions
+        refuse_other_rig(case, speed.model)
+        if loop.guard.no_braking:
+            raise PreflightRefused(
+                f"a virtual string brakes the shaft: {loop.guard.no_braking}", where="braking probe",
+                next_step=loop.guard.to_brake,
+            )
+        start = program.start_rad_s * case.rig.gear_ratio
+        with self._book.stage("hold", 15.0):
+            control = MeanSpeedControl(speed.model, 0.25 * limits.torque_nm, assumptions)
+            run_hold(loop, limits, speed.model, control, start, drifted.speed_rad_s, resolution_rad_s)
+        with self._book.stage("acquire", program.longest_s):
+            run_virtual_string(loop, limits, case, program, self._log.virtual, self._say)
 
     def _prepare(self) -> tuple[Task, ControlLoop, Preflight]:
         identity = self._drive.connect()

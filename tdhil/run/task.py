@@ -11,6 +11,7 @@ from tdhil.recording import Stage
 from tdhil.run.excitation import Plan, SwingPlan
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.run.stop import StopReport
+from tdhil.soft_torque import EvaluationCase
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
@@ -55,6 +56,7 @@ class Task:
     request: ExcitationRequest
     facts: Mapping[str, Any] = field(default_factory=dict)
     assumptions: ControlAssumptions = field(default_factory=ControlAssumptions)
+    evaluation: EvaluationCase | None = None       # a virtual string in stage 5, in place of an excitation
 
 
 MakeTask = Callable[[Identity], Task]

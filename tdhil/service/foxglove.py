@@ -25,6 +25,7 @@ from tdhil.recording import (
     COMMAND,
     MODBUS,
     SAMPLE,
+    VIRTUAL_STRING,
     LogChunks,
     LogTail,
     messages_in,
@@ -40,7 +41,7 @@ LOOK_S: Final = 1.0
 LATE_S: Final = 10.0
 FIRST_S: Final = 60.0
 """What may be needed for all that was logged before one came."""
-_EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, CAN, MODBUS})
+_EACH_CYCLE: Final = frozenset({SAMPLE, COMMAND, CAN, MODBUS, VIRTUAL_STRING})
 _DATA: Final = Struct("<BIQ")              # opcode 1, subscription, log time in ns; then the message
 _INFO, _WARNING, _ERROR = 0, 1, 2
 _WAITS: Final = "run"

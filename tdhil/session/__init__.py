@@ -17,6 +17,10 @@ if TYPE_CHECKING:
         UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
         is_accepted as is_accepted,
     )
+    from tdhil.session.evaluation import (
+        conclude_evaluation as conclude_evaluation, evaluation_case as evaluation_case, is_evaluation as is_evaluation,
+        load_tuning as load_tuning,
+    )
     from tdhil.session.holder import (
         DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
         holders as holders,

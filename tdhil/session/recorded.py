@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from tdhil.recording import Ended, LagPrior, Recording
+    from tdhil.recording import Ended, FloatArray, LagPrior, Recording
 
 _REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
 """Exit codes of a run that tell of the run; the others tell of the process that it was."""
@@ -32,7 +32,8 @@ class RunRecord:
     """One run or one trace. ``configuration``: the run's, as its log has it; ``log``: the file.
 
     ``assumed``: what was assumed in reading a foreign trace, None for a run of ours; ``problems``: what of the file was
-    stepped over, a line each; ``stored_result``: the result document that the run itself left in its log.
+    stepped over, a line each; ``stored_result``: the result document that the run itself left in its log;
+    ``virtual_string``: a row a cycle of one, with the columns of `tdhil.recording.VIRTUAL_COLUMNS`.
     """
 
     recording: Recording
@@ -42,6 +43,7 @@ class RunRecord:
     problems: tuple[str, ...] = ()
     ended: Ended | None = None
     stored_result: Mapping[str, Any] | None = None
+    virtual_string: FloatArray | None = None
 
     @property
     def whole(self) -> bool:
@@ -171,7 +173,8 @@ def _read_log(path: Path) -> RunRecord:
     if "started" not in configuration and found.epoch_ns:      # a log of before 0.2, of a run in real time
         began = datetime.fromtimestamp(found.epoch_ns / 1e9, UTC).astimezone()
         configuration["started"] = began.isoformat(timespec="seconds")
-    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended, found.result)
+    return RunRecord(found.recording, configuration, str(path), None, found.problems, ended, found.result,
+                     found.virtual_string)
 
 
 def _read_trace(

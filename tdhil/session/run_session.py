@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from tdhil.config import Rig, RunOptions
 from tdhil.errors import LogError
 from tdhil.recording import RunLog, RunWriter
-from tdhil.run import Display, Idle, Runner, RunOutcome, StopRequest, Task
+from tdhil.run import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
 from tdhil.session.connection import Connection, PeerPlan
 from tdhil.session.consent import accepted_lines, note, require_accepted
 from tdhil.session.log_place import LogPlace
@@ -30,6 +30,8 @@ from tdhil.version import __version__
 if TYPE_CHECKING:
     from drivers import Identity, Preflight
     from tdhil.session.conclusion import Conclusion
+    from tdhil.session.evaluation import EvaluationConclusion
+    from tdhil.soft_torque import EvaluationCase
 
 
 @dataclass(frozen=True)
@@ -55,16 +57,20 @@ class RunRequest:
     operator: str | None = None
     note: str | None = None
     real_time_priority: bool = False
+    evaluation: EvaluationCase | None = None
+    """A virtual string in stage 5, in place of an excitation."""
 
     @classmethod
     def of(
         cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, consent: Consent,
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
+        evaluation: EvaluationCase | None = None,
     ) -> RunRequest:
         """The rig suited to the simulated plant. Raises PreflightRefused for what no shaft could do in its limits."""
         bench = suited(rig, peer.plant)
-        refuse_hopeless(options, bench, connection.profile.can_torque)
-        return cls(options, connection, peer, bench, consent, operator, note, real_time_priority)
+        if evaluation is None:
+            refuse_hopeless(options, bench, connection.profile.can_torque)
+        return cls(options, connection, peer, bench, consent, operator, note, real_time_priority, evaluation)
 
 
 class Attendant(Protocol):
@@ -155,11 +161,17 @@ class RunSession:
             attendant.warn(f"tdhil: --fault {fault} never came: this run did not reach its moment")
         return outcome
 
-    def conclude(self) -> Conclusion:
-        """Identify from what was recorded, and put the result into the log."""
+    def conclude(self) -> Conclusion | EvaluationConclusion:
+        """Identify from what was recorded, or look what the virtual string did, and put the result into the log."""
         from tdhil.session.conclusion import conclude
+        from tdhil.session.evaluation import conclude_evaluation, is_evaluation
 
-        found = conclude(self.log.recording(complete=True), self.log.run, str(self.path))
+        recording, run, path = self.log.recording(complete=True), self.log.run, str(self.path)
+        found: Conclusion | EvaluationConclusion
+        if is_evaluation(run):
+            found = conclude_evaluation(self.log.virtual_string, recording, run, path)
+        else:
+            found = conclude(recording, run, path)
         with suppress(LogError):  # a log that has just failed must not take the result with it; closing it says so
             self.log.result(found.document)
         return found
@@ -200,7 +212,10 @@ class RunSession:
             accept_wider=consent.wider_limits,
             accept_speed_unit=consent.speed_unit,
         )
-        return Task(limits, excitation_request(request.options), facts(bench))
+        asked = excitation_request(request.options)
+        if request.evaluation is not None:
+            asked = ExcitationRequest(mode="torque")
+        return Task(limits, asked, facts(bench), evaluation=request.evaluation)
 
 
 def configuration(request: RunRequest) -> dict[str, Any]:

@@ -15,6 +15,11 @@ if TYPE_CHECKING:
         inner_lags as inner_lags, margins as margins, reflection as reflection, reflection_at as reflection_at,
         softest_allowed as softest_allowed, stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
+    from tdhil.soft_torque.evaluation import (
+        Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
+        Outcome as Outcome, Prediction as Prediction, Trial as Trial, Window as Window, case_of as case_of,
+        evaluate as evaluate, program_for as program_for, refuse_untrue as refuse_untrue,
+    )
     from tdhil.soft_torque.own_units import (
         DriveSetting as DriveSetting, drive_settings as drive_settings,
     )

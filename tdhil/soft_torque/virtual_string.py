@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from math import exp, expm1, pi
+from math import exp, expm1, inf, pi
 
 import numpy as np
 
@@ -271,6 +271,8 @@ class Program:
     """A bit that sticks after it does not turn."""
     resolution_rad_s: float = 1.0 * RPM
     most_trials: int = 8
+    peak_nm: float = inf
+    """Of the torque that moves the rotor, as simulated: no 5 s of it may have as much rms."""
 
     @property
     def longest_s(self) -> float:
@@ -313,6 +315,12 @@ class Course:
         self._phase_s = 0.0
         self._stuck_s = self._time_s
         return self.phase
+
+    def end(self) -> None:
+        """Fade out from wherever it is, and be done."""
+        self._trials = self._program.most_trials
+        if self.phase is not Phase.DONE:
+            self.phase, self._phase_s = Phase.FADE_OUT, (1.0 - self.share) * self._program.fade_s
 
     @property
     def _calm(self) -> bool:
@@ -421,7 +429,8 @@ class HostLoop:
         self._course = Course(program, period_s)
         self._torque_nm = self._acted_nm = 0.0     # acts until the next one does, and the one before; main shaft
         self._share = 0.0
-        self._put_in_j = 0.0
+        self._put_in_j = self._net_nm = 0.0
+        self._clamped = False
         self.row: tuple[float, ...] = ()
 
     @property
@@ -430,9 +439,33 @@ class HostLoop:
         return self._course.phase
 
     @property
-    def rig_string_nm(self) -> float:
-        """The string's torque as the rig's motor gets it, N·m."""
-        return self.scale * self._course.share * self._string.torque_nm
+    def set_rpm(self) -> float:
+        """Of the main shaft."""
+        return self._course.set_rad_s / RPM
+
+    @property
+    def innovation_rad_s(self) -> float:
+        """What the last report was away from what was expected, at the main shaft."""
+        return self._observer.innovation_rad_s
+
+    @property
+    def net_nm(self) -> float:
+        """That moves the meant rotor: of its drive, less the string's."""
+        return self._net_nm
+
+    @property
+    def put_in_j(self) -> float:
+        """By the loop's errors, into the meant shaft."""
+        return self._put_in_j
+
+    @property
+    def clamped(self) -> bool:
+        """Did the torque limit cut the last torque?"""
+        return self._clamped
+
+    def end(self) -> None:
+        """Fade the string out, and be done."""
+        self._course.end()
 
     def begin(self, reported_rad_s: float, torque_nm: float) -> None:
         """Steady rotation at the program's start with that torque of the motor."""
@@ -473,11 +506,13 @@ class HostLoop:
         drive_nm = self._controller.step(course.set_rad_s, speed)
         moving_nm = self._meant.inertia_kg_m2 * course.slope_rad_s2
         self._put_in_j -= share * string_nm * self._observer.innovation_rad_s * period_s
-        wanted = self.scale * (drive_nm + moving_nm - share * string_nm + self._more_friction(speed))
+        self._net_nm = drive_nm + moving_nm - share * string_nm
+        wanted = self.scale * (self._net_nm + self._more_friction(speed))
         torque = min(self._limit_nm, max(-self._limit_nm, wanted))
         self._acted_nm, self._torque_nm = self._torque_nm, torque / self.scale
+        self._clamped = torque != wanted
         self.row = (
             time_s, float(course.phase), course.set_rad_s, speed, self._observer.innovation_rad_s, string_nm, drive_nm,
-            share, string.bit_rad_s, self._observer.unknown_nm, self._put_in_j, float(torque != wanted),
+            share, string.bit_rad_s, self._observer.unknown_nm, self._put_in_j, float(self._clamped),
         )
         return torque

@@ -17,10 +17,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from drivers.drive import Command, Mode
 from tdhil.recording.builder import FACTS as FACT_NAMES
 from tdhil.recording.builder import RecordingBuilder
-from tdhil.recording.log_format import Event
+from tdhil.recording.log_format import VIRTUAL_COLUMNS, Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import LagPrior, Recording
+from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
 from tests.recording.test_wire import SAMPLES
 
@@ -134,3 +135,20 @@ def test_a_time_that_is_none_is_logged_at_the_one_before(tmp_path, time_s):
         times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
     assert max(times) == 400_000_000
     assert read_run(path).events[0].text == "odd ? name"
+
+
+def test_a_virtual_string_comes_back_bit_for_bit(tmp_path):
+    rng = random.Random(4)
+    rows = [(PERIOD_S * cycle, *(rng.gauss(0.0, 1e3) for _ in VIRTUAL_COLUMNS[1:])) for cycle in range(700)]
+    path = tmp_path / "virtual.mcap"
+    with RunWriter(path, epoch_ns=0, block=True) as writer:
+        log = RunLog(writer, {})
+        for cycle, row in enumerate(rows):
+            log.cycle(Command(Mode.TORQUE, 3.0, 100.0), sample(cycle, rng))
+            log.virtual(row)
+    for batch in (0, 2**21):
+        found = read_run(path, batch=batch)
+        assert found.virtual_string.tolist() == [list(row) for row in rows] == log.virtual_string.tolist()
+        assert len(found.recording.time_s) == len(rows)
+    make_run(tmp_path / "plain.mcap")
+    assert read_run(tmp_path / "plain.mcap").virtual_string.shape == (0, len(VIRTUAL_COLUMNS))

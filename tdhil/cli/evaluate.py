@@ -1,0 +1,41 @@
+"""`tdhil evaluate`: a virtual drill string on a real drive, under a controller that `tune` made."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+CONTROLLERS = ("soft", "stiff", "compensated", "broadband")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of evaluate."""
+    from tdhil.cli.identify import add_peer_arguments
+
+    what = parser.add_argument_group("what is evaluated")
+    what.add_argument("--virtual-string", type=Path, required=True, metavar="string.yaml",
+                      help="drill string, bottom and bit (docs/soft_torque.md), simulated in this host")
+    what.add_argument("--controller", type=Path, required=True, metavar="tune.json",
+                      help="what tdhil tune --json wrote for that string: the speed controller, run in this host")
+    what.add_argument("--use", choices=CONTROLLERS, default="soft", help="which controller of it (soft)")
+    what.add_argument("--result", type=Path, metavar="result.json",
+                      help="of tdhil identify on the rig that turns, where that isn't the machine that was tuned for")
+    add_peer_arguments(parser)
+    parser.set_defaults(run=run, report=None, dry_run=False)
+
+
+def run(namespace: argparse.Namespace) -> int:
+    """Read the three files, then the road of every run."""
+    from tdhil.cli.identify import run_with
+    from tdhil.cli.tune import read_result
+    from tdhil.session import evaluation_case, load_tuning
+    from tdhil.soft_torque import load_string
+
+    if "list" not in (namespace.fault or ()):
+        tuning = load_tuning(namespace.controller)
+        rig = tuning["identified"] if namespace.result is None else read_result(namespace.result)
+        case = evaluation_case(
+            load_string(namespace.virtual_string), tuning, namespace.use, rig, str(namespace.controller)
+        )
+        return run_with(namespace, case)
+    return run_with(namespace)

@@ -1,0 +1,138 @@
+"""Stage 5 with a virtual string: the drive in torque mode, string, bit and speed controller in the host.
+
+What may end it beside the guard, which holds speed, torque and time as ever: a shaft that does not do what its torque
+says, a loop that swings more than string and bit can, and energy that the loop's own errors put into the shaft. However
+it ends, the string's torque goes first: on the regular way it is faded out, and in every other case the stop's first
+cycle commands none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
+from tdhil.run.control_loop import ControlLoop
+from tdhil.run.excitation import RigGuess
+from tdhil.run.settings import MachineLimits
+from tdhil.soft_torque import EvaluationCase, HostLoop, Phase, Program
+
+STRANGE_SHARE = 0.1
+"""Of the speed limit, that the report may be away from what the observer expects."""
+RMS_S = 5.0
+ENERGY_SHARE = 0.05
+"""Of what the string holds as the bit breaks away, that may have been put in."""
+SAME_RIG = 0.5
+"""By so much, or by what it is uncertain by, stage 2's rough inertia may differ from the result's."""
+RESERVE_S = 20.0
+BEFORE_S = 150.0
+"""Stages 1 to 4, about: what is left of the time limit is looked at before anything moves."""
+
+_TOLD = {
+    Phase.HOLD: "virtual string: coupled; the bit shall stick and slip",
+    Phase.RAMP: "virtual string: ramp of the set speed",
+    Phase.STEADY: "virtual string: the bit turns",
+    Phase.RELEASED: "virtual string: the bit is off bottom",
+}
+
+Keep = Callable[[Sequence[float]], None]
+
+
+def refuse_longer(program: Program, limits: MachineLimits) -> None:
+    """PreflightRefused where the time limit has no room for the course."""
+    needed_s = program.longest_s + BEFORE_S + RESERVE_S
+    if needed_s > limits.time_s:
+        raise PreflightRefused(
+            f"the virtual string takes up to {needed_s:.0f} s, and the run may take {limits.time_s:g} s",
+            where="limits.time_s in rig.yaml", next_step="Raise it",
+        )
+
+
+def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
+    """PreflightRefused where the shaft that turns can't be the one of the result."""
+    ratio = model.inertia_kg_m2 / case.rig.inertia_kg_m2
+    open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
+    if not 1.0 / open_by <= ratio <= open_by:
+        raise PreflightRefused(
+            f"the result says {case.rig.inertia_kg_m2:.4g} kg·m² at the motor, and this shaft has about "
+            f"{model.inertia_kg_m2:.4g}",
+            where="--controller and --result", next_step="Identify this rig, and tune with what comes of it",
+        )
+
+
+def run_virtual_string(
+    loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program, keep: Keep,
+    say: Callable[[str], None],
+) -> None:
+    """All of the course, from steady rotation at its first speed in torque mode; ``keep`` gets a row a cycle.
+
+    Raises LimitHit, and what the bench raises.
+    """
+    host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm)
+    ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program)
+    last = loop.last
+    speed = last.speed_rad_s if last is not None else program.start_rad_s * ratio
+    torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
+    host.begin(speed, torque)
+    phase: Phase = host.phase
+    clamped = False
+    while host.phase is not Phase.DONE:
+        wanted = max(0.0, min(limits.speed_max_rad_s, program.start_rad_s * ratio))
+        sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
+        torque = host.step(sample.time_s, sample.speed_rad_s if sample.fresh else None)
+        keep(host.row)
+        watch.see(host, sample)
+        if host.clamped and not clamped:
+            clamped = True
+            loop.log.event(loop.now_s, "limits", "virtual string: the torque limit acts; it is faded out")
+            say("the torque limit acts: the virtual string is faded out, and there will be no result")
+            host.end()
+        if host.phase is not phase:
+            phase = host.phase
+            text = _TOLD.get(phase, "")
+            if phase is Phase.TRIAL:
+                text = f"virtual string: does the bit end turning at {host.set_rpm:.1f} rpm?"
+            if text:
+                loop.log.event(loop.now_s, "string", text)
+                say(text)
+
+
+class _Watch:
+    """Looks at every cycle of the loop, and raises LimitHit."""
+
+    def __init__(self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program) -> None:
+        assert case.string.bit is not None
+        self._strange_rad_s = STRANGE_SHARE * limits.speed_max_rad_s
+        self._gear = case.rig.gear_ratio
+        self._peak_nm = program.peak_nm
+        wound_up_j = 0.5 * case.string.bit.static_nm**2 / case.string.stiffness_nm_rad
+        self._most_j = ENERGY_SHARE * wound_up_j
+        self._squares: deque[float] = deque(maxlen=loop.cycles(RMS_S))
+        self._sum = 0.0
+
+    def see(self, host: HostLoop, sample: Sample) -> None:
+        where = f"virtual string at {sample.time_s:.3f} s"
+        apart = abs(host.innovation_rad_s) * self._gear
+        if not apart <= self._strange_rad_s:
+            raise LimitHit(
+                f"the shaft does not do what its torque says: {apart:.2f} rad/s away from what was expected",
+                where=where, next_step="The shaft was stopped. Is the torque lost or limited, or is this another rig "
+                "than the one that was identified?",
+            )
+        if not host.put_in_j <= self._most_j:
+            raise LimitHit(
+                f"the loop's errors have put {host.put_in_j:.0f} J into the shaft", where=where,
+                next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+            )
+        if len(self._squares) == self._squares.maxlen:
+            self._sum -= self._squares[0]
+        self._squares.append(host.net_nm**2)
+        self._sum += self._squares[-1]
+        if len(self._squares) == self._squares.maxlen:
+            rms = math.sqrt(max(0.0, self._sum) / len(self._squares))
+            if rms > self._peak_nm:
+                raise LimitHit(
+                    f"the loop swings by {rms:.0f} N·m rms at the main shaft, more than string and bit could",
+                    where=where, next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+                )

@@ -1,0 +1,328 @@
+"""A virtual string on a real drive: what can be asked of it, the course of set speeds, and what its log says. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from math import inf, pi, sqrt
+from typing import Any
+
+import numpy as np
+
+from profiles import TdhilError
+from tdhil.soft_torque.controller import SpeedController, TopDrive
+from tdhil.soft_torque.drill_string import DrillString
+from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
+from tdhil.soft_torque.tuning import Interval
+from tdhil.soft_torque.virtual_string import COLUMNS, Phase, Program, Rig
+
+LOWEST_RATE_HZ = 20.0
+MOST_CROSSOVER = 0.35
+"""P/J times a cycle: a controller as quick as that swings by the cycle alone."""
+MOST_LAG_S, MOST_LAG_ERROR_S = 0.5, 0.05
+"""Of the reported speed: beyond them nobody has shown that the loop is the string's and not the observer's."""
+LEAST_DRAG_NM_S_RAD_M = 0.001
+"""Of the virtual mud, per metre: what the loop's own errors put into the string has to go somewhere."""
+
+BELOW_RPM = (12.0, 10.0, 8.0, 6.0, 4.0)
+"""Below the predicted critical speed, where the bit may be made to stick; the first that the shaft can bear."""
+ABOVE_RPM, ABOVE_SHARE = 20.0, 0.15
+"""So far above it the ramp goes, at least the first of both."""
+ROOM_SHARE = 0.95
+"""Of the torque limit, that may be needed."""
+TOLERANCE_RPM, TOLERANCE_DAMPING = 3.0, 0.03
+"""Beyond the predicted intervals that still counts as predicted: as near as this has been seen to come to real strings
+on simulated drives."""
+
+
+class EvaluationRefused(TdhilError):
+    """A virtual string would not be true on this rig, or can't be turned by it; nothing has moved."""
+
+    exit_code = 4
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """By `tune`, at the main shaft."""
+
+    kind: str
+    cure_rpm: Interval
+    least_damping: Interval
+    string_modes_hz: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Window:
+    """What the rig may do, at the motor: speed, torque, and by how much its guard looks ahead."""
+
+    lowest_rad_s: float
+    highest_rad_s: float
+    torque_nm: float
+    foresight_s: float
+
+
+@dataclass(frozen=True)
+class EvaluationCase:
+    """Everything but the rig's limits: what is meant, by which controller, on which rig."""
+
+    string: DrillString
+    meant: TopDrive
+    law: SpeedController
+    rig: Rig
+    prediction: Prediction
+    speed_lag_error_s: float = 0.0
+    """Half of the lag's 95 % interval."""
+
+    @property
+    def scale(self) -> float:
+        """κ: of the meant machine's torque at its main shaft, to the rig's at its motor."""
+        return self.rig.inertia_kg_m2 * self.rig.gear_ratio / self.meant.inertia_kg_m2
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it; infinite numbers as None."""
+        found = asdict(self)
+        bit = found["string"]["bit"]
+        if bit is not None and bit["stribeck_speed_rad_s"] == inf:
+            bit["stribeck_speed_rad_s"] = None
+        return found
+
+
+def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
+    """EvaluationRefused where rate, lag or mud don't let the loop be the string's."""
+    rate_hz, law = 1.0 / period_s, case.law
+    if case.string.bit is None:
+        raise EvaluationRefused("no bit is stated: nothing would stick", where="string.yaml, bottom",
+                                next_step="State its friction: coulomb_nm, static_nm, stribeck_speed_rad_s")
+    if any(line.drag_nm_s_rad_m < LEAST_DRAG_NM_S_RAD_M for line in case.string.lines):
+        raise EvaluationRefused(
+            f"a virtual string needs a drag of {LEAST_DRAG_NM_S_RAD_M:g} N·m·s/rad per metre or more in every section: "
+            "what the loop's own errors put into it has to go somewhere",
+            where="string.yaml, drag_nm_s_rad_m", next_step="Leave it out for that of mud, 0.005")
+    quickest = law.gain_nm_s_rad / (case.meant.inertia_kg_m2 - law.compensated_kg_m2) * period_s
+    if rate_hz < LOWEST_RATE_HZ * (1.0 - 1e-9) or quickest > MOST_CROSSOVER:
+        needed = max(LOWEST_RATE_HZ, rate_hz * quickest / MOST_CROSSOVER)
+        raise EvaluationRefused(
+            f"at {rate_hz:.3g} cycles a second the loop would swing by its cycle, not by the string",
+            where="--rate", next_step=f"This controller takes {needed:.3g} cycles a second or more")
+    if case.rig.speed_lag_s > MOST_LAG_S or case.speed_lag_error_s > MOST_LAG_ERROR_S:
+        raise EvaluationRefused(
+            f"the reported speed lags by {case.rig.speed_lag_s:.3g} ± {case.speed_lag_error_s:.2g} s; up to "
+            f"{MOST_LAG_S:g} s, known to ±{MOST_LAG_ERROR_S:g} s, can be undone",
+            where="speed_lag_s of the result", next_step="Lower the drive's filter of the reported speed, or identify "
+            "again with a multisine, for longer")
+
+
+def program_for(case: EvaluationCase, window: Window) -> Program:
+    """The course for this rig. EvaluationRefused where its speed window or its torque has no room for it."""
+    cure, ratio = case.prediction.cure_rpm, case.rig.gear_ratio
+    ends = cure.high + max(ABOVE_RPM, ABOVE_SHARE * cure.high)
+    below = [cure.low - one for one in BELOW_RPM if cure.low - one > 0.0]
+    speeds = np.array([[*below, cure.high]]) * RPM
+    trace = simulate(case.string, [(case.meant, case.law)], Begin("stuck", speeds), speeds, 1.0, 24.0, 0.02,
+                     2.0 * LONGEST_TICK_S)
+    top = trace.top_rad_s[:, 0] * ratio
+    rate = np.gradient(top, trace.time_s, axis=0)
+    ahead = top + window.foresight_s * rate
+    lowest, highest = np.minimum(top, np.maximum(ahead, 0.0)).min(axis=0), np.maximum(top, ahead).max(axis=0)
+    backwards = ahead.min(axis=0) < -0.01 * window.highest_rad_s
+    bearable = [k for k in range(len(below)) if top[:, k].min() > window.lowest_rad_s and not backwards[k]]
+    if not bearable:
+        raise EvaluationRefused(
+            f"the top swings down to {lowest[:-1].max() / ratio / RPM:.1f} rpm before the bit turns: this window "
+            f"begins at {window.lowest_rad_s / ratio / RPM:.1f} rpm, and the shaft must not be about to turn back",
+            where="limits.speed_min_rad_s", next_step="Lower it, or take a stiffer controller (--use)")
+    room = window.highest_rad_s - float(highest[-1]) + cure.high * RPM * ratio
+    if room < (cure.high + TOLERANCE_RPM) * RPM * ratio:
+        raise EvaluationRefused(
+            f"the top swings up to {highest[-1]:.3g} rad/s at the motor where the bit begins to turn; the window ends "
+            f"at {window.highest_rad_s:.3g} rad/s", where="limits.speed_max_rad_s",
+            next_step="Raise it, if machine and drive allow")
+    friction = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * float(highest[-1])
+    peak_nm = float(np.abs(rate).max()) * case.rig.inertia_kg_m2 + friction
+    if peak_nm > ROOM_SHARE * window.torque_nm:
+        raise EvaluationRefused(
+            f"the virtual string takes up to {peak_nm:.3g} N·m of the motor, and its limit is "
+            f"{window.torque_nm:.3g} N·m: it would be cut off", where="limits.torque_nm",
+            next_step="Raise it, if machine and drive allow, or take a softer controller (--use)")
+    # Of the meant rotor, in its first second too, which a bit that breaks away kicks.
+    moving_nm = case.meant.inertia_kg_m2 * float(np.abs(rate).max()) / ratio
+    return Program(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From the rows of a log.
+
+
+class Outcome(StrEnum):
+    """Of an evaluation."""
+
+    AS_PREDICTED = "as_predicted"
+    DIFFERS = "differs"
+    NOT_FOUND = "not_found"
+    """No critical speed: the bit did not stick, or never turned."""
+    INVALID = "invalid"
+    """What turned was not the string: the torque limit acted, or the rig isn't the one that was identified."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """At one steady set speed, from the bit about to break away."""
+
+    set_rpm: float
+    turns: bool
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Speeds and torques of the meant machine's main shaft."""
+
+    outcome: Outcome
+    why: str
+    critical_rpm: Interval | None
+    """Lowest set speed from which a bit about to break away ends turning, and the bracket: *cure*, as `tune` has it."""
+    ramp_rpm: float | None
+    """Set speed at which the bit stood still last on the ramp."""
+    trials: tuple[Trial, ...]
+    sticking_rms_nm: float | None
+    """Of the drive's torque about its mean, while the bit sticks and slips."""
+    turning_rms_nm: float | None
+    """The same over the last 10 s in which it turns."""
+    damping: float | None
+    """The least of the lowest modes', from the decay after the bit is let go."""
+    damped_hz: float | None
+    clamped_cycles: int
+    innovation_rms_rad_s: float
+    unknown_rms_nm: float
+    """Torque that the observer had to suppose."""
+    put_in_j: float
+
+
+FOREIGN_SHARE = 0.1
+"""Of the torque that moves the shaft, that may be unknown: more, and the rig isn't the one that was identified."""
+
+
+def evaluate(rows: Array, case: EvaluationCase, program: Program) -> Evaluation:
+    """What the log of a run shows. ValueError where no row is there."""
+    if not len(rows):
+        raise ValueError("the virtual string was never turned")
+    column = {name: rows[:, number] for number, name in enumerate(COLUMNS)}
+    phase, set_rad_s, stuck = column["phase"], column["set_rad_s"], column["bit_rad_s"] == 0.0
+    period_s = float(np.median(np.diff(column["time_s"]))) if len(rows) > 1 else 1.0
+    trials = _trials(rows, program, period_s)
+    sticks = [one.set_rpm for one in trials if not one.turns]
+    turns = [one.set_rpm for one in trials if one.turns]
+    holding = phase == Phase.HOLD
+    did_stick = bool(stuck[holding][len(stuck[holding]) // 2 :].any())
+    lower = max([one for one in sticks if not turns or one < min(turns)], default=program.start_rad_s / RPM)
+    critical = Interval(min(turns), lower, min(turns)) if turns and did_stick else None
+    on_ramp = (phase == Phase.RAMP) & stuck
+    ramp = float(set_rad_s[on_ramp][-1]) / RPM if on_ramp.any() else None
+    steady = phase == Phase.STEADY
+    decay = _decay(rows[phase == Phase.RELEASED], case, period_s)
+    coupled = column["share"] == 1.0
+    net = column["drive_nm"] - column["share"] * column["string_nm"]
+    unknown = float(np.sqrt(np.mean(column["unknown_nm"][coupled] ** 2))) if coupled.any() else 0.0
+    clamped = int(column["clamped"].sum())
+    foreign = unknown / max(1e-9, float(np.sqrt(np.mean(net[coupled] ** 2)))) if coupled.any() else 0.0
+    outcome, why = _verdict(case, clamped, foreign, did_stick, critical, decay, unknown)
+    return Evaluation(
+        outcome, why, critical, ramp, trials, _rms(column["drive_nm"][holding]),
+        _rms(column["drive_nm"][steady][-round(10.0 / period_s) :]), None if decay is None else decay[0],
+        None if decay is None else decay[1], clamped, _rms(column["innovation_rad_s"]) or 0.0, unknown,
+        float(column["put_in_j"].max()),
+    )
+
+
+def _verdict(
+    case: EvaluationCase, clamped: int, foreign: float, did_stick: bool, critical: Interval | None,
+    decay: tuple[float, float] | None, unknown_nm: float,
+) -> tuple[Outcome, str]:
+    predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
+    if clamped:
+        return Outcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
+    if foreign > FOREIGN_SHARE:
+        return Outcome.INVALID, (
+            f"{unknown_nm:.0f} N·m rms of torque that nobody commanded, {100.0 * foreign:.0f} % of what moved the "
+            "shaft: inertia, friction or lags are not those of the result")
+    if not did_stick:
+        return Outcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
+    if critical is None:
+        return Outcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
+    off = max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
+    words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
+    if off > TOLERANCE_RPM:
+        return Outcome.DIFFERS, words
+    if decay is not None and not damping.low - TOLERANCE_DAMPING <= decay[0] <= damping.high + TOLERANCE_DAMPING:
+        return Outcome.DIFFERS, (
+            f"damping {decay[0]:.3f}, predicted {damping.low:.3f} to {damping.high:.3f}; {words}")
+    return Outcome.AS_PREDICTED, words
+
+
+def _rms(values: Array) -> float | None:
+    return float(np.std(values)) if len(values) else None
+
+
+def _trials(rows: Array, program: Program, period_s: float) -> tuple[Trial, ...]:
+    at = np.flatnonzero(rows[:, COLUMNS.index("phase")] == Phase.TRIAL)
+    if not len(at):
+        return ()
+    found = []
+    for one in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1):
+        still = np.flatnonzero(rows[one, COLUMNS.index("bit_rad_s")] == 0.0)
+        calm_s = (len(one) - 1 - (int(still[-1]) if len(still) else 0)) * period_s
+        whole = len(one) * period_s >= min(program.calm_s, program.trial_s) - 2.0 * period_s
+        if whole:
+            found.append(Trial(float(rows[one[0], COLUMNS.index("set_rad_s")]) / RPM,
+                               calm_s >= program.calm_s - 3.0 * period_s))
+    return tuple(found)
+
+
+DECAY_EVERY_S, DECAY_ORDER = 0.1, 9
+LEAST_DECAY_S = 8.0
+
+
+def _decay(rows: Array, case: EvaluationCase, period_s: float) -> tuple[float, float] | None:
+    """(damping, Hz) of the least damped of the lowest modes, from the top's speed once the bit is let go.
+
+    A matrix pencil (Hua and Sarkar 1990): the speed's rows span as many exponentials as move it, a constant and four
+    pairs here, and how one row becomes the next gives their poles.
+    """
+    each = max(1, round(DECAY_EVERY_S / period_s))
+    speed = rows[:, COLUMNS.index("top_rad_s")]
+    count = len(speed) // each
+    if count * each * period_s < LEAST_DECAY_S:
+        return None
+    means = speed[: count * each].reshape(count, each).mean(axis=1)
+    width = count // 3
+    windows = np.lib.stride_tricks.sliding_window_view(means, width + 1)
+    basis = np.linalg.svd(windows, full_matrices=False)[2][:DECAY_ORDER]
+    steps = np.linalg.eigvals(np.linalg.pinv(basis[:, :-1].T) @ basis[:, 1:].T)
+    poles = np.log(steps[np.abs(steps) > 1e-6]) / (each * period_s)
+    first, *others = case.prediction.string_modes_hz
+    second = others[0] if others else 4.0 * first
+    swinging = [
+        (-float(pole.real) / abs(pole), abs(pole) / (2.0 * pi)) for pole in poles
+        if pole.imag > 0.0 and 0.4 * first <= abs(pole) / (2.0 * pi) <= sqrt(first * second)
+    ]
+    return min(swinging, default=None)
+
+
+def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
+    """What `EvaluationCase.plain` made a mapping of, as a log's configuration gives it back. Raises as its types do."""
+    from tdhil.soft_torque.drill_string import BitFriction, Line
+
+    string, bit = plain["string"], plain["string"]["bit"]
+    if bit is not None and bit["stribeck_speed_rad_s"] is None:
+        bit = {**bit, "stribeck_speed_rad_s": inf}
+    prediction = plain["prediction"]
+    return EvaluationCase(
+        DrillString(tuple(Line(**line) for line in string["lines"]), string["bottom_inertia_kg_m2"],
+                    string["bottom_viscous_nm_s_rad"], None if bit is None else BitFriction(**bit), string["name"]),
+        TopDrive(**{**plain["meant"], "inner_lags_s": tuple(plain["meant"]["inner_lags_s"])}),
+        SpeedController(**plain["law"]),
+        Rig(**plain["rig"]),
+        Prediction(prediction["kind"], Interval(**prediction["cure_rpm"]), Interval(**prediction["least_damping"]),
+                   tuple(prediction["string_modes_hz"])),
+        plain["speed_lag_error_s"],
+    )

@@ -1,0 +1,153 @@
+"""A virtual string on a drive: what is refused beforehand, and what is read off a log's rows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.recording import VIRTUAL_COLUMNS
+from tdhil.soft_torque import (
+    COLUMNS,
+    RPM,
+    EvaluationCase,
+    EvaluationRefused,
+    Interval,
+    Outcome,
+    Phase,
+    Prediction,
+    Program,
+    Rig,
+    Window,
+    case_of,
+    evaluate,
+    program_for,
+    refuse_untrue,
+)
+from tests.soft_torque.cases import DRIVE, SOFT_025, STIFF, STRING, string_with
+
+PREDICTED = Prediction("soft", Interval(57.0, 56.0, 59.0), Interval(0.226, 0.213, 0.240), (0.1299, 0.567, 1.079))
+CASE = EvaluationCase(STRING, DRIVE, SOFT_025, Rig(1500.0, 8.0, 60.0, 0.4), PREDICTED, 0.01)
+WINDOW = Window(0.5, 15.0, 15_000.0, 0.857)
+PROGRAM = Program(45.0 * RPM, 79.0 * RPM)
+
+
+@pytest.mark.parametrize(("case", "period_s", "said"), [
+    (CASE, 0.1, "cycles a second"),
+    (replace(CASE, law=STIFF), 0.05, "cycles a second"),
+    (replace(CASE, rig=replace(CASE.rig, speed_lag_s=0.6)), 0.02, "lags by"),
+    (replace(CASE, speed_lag_error_s=0.06), 0.02, "lags by"),
+    (replace(CASE, string=string_with(drag=0.0)), 0.02, "drag"),
+    (replace(CASE, string=replace(STRING, bit=None)), 0.02, "no bit"),
+], ids=["10 Hz", "stiff at 20 Hz", "lag", "lag unknown", "no mud", "no bit"])
+def test_what_can_not_be_true_is_refused(case, period_s, said):
+    with pytest.raises(EvaluationRefused, match=said):
+        refuse_untrue(case, period_s)
+
+
+@pytest.mark.parametrize(("law", "period_s"), [(SOFT_025, 0.05), (SOFT_025, 0.01), (STIFF, 0.02), (STIFF, 0.01)])
+def test_what_can_be_true_is_not(law, period_s):
+    refuse_untrue(replace(CASE, law=law), period_s)
+
+
+def test_the_course_is_laid_where_the_shaft_can_bear_it():
+    program = program_for(CASE, WINDOW)
+    assert program.start_rad_s == pytest.approx(44.0 * RPM)
+    assert program.highest_rad_s == pytest.approx(79.0 * RPM)
+    assert 4000.0 < program.peak_nm < 9000.0
+    higher = program_for(CASE, replace(WINDOW, lowest_rad_s=2.55)).start_rad_s
+    assert 46.0 * RPM <= higher <= 52.0 * RPM
+    # at a motor eight times as fast, the same machine takes the same course with an eighth of the torque
+    geared = replace(CASE, rig=Rig(1500.0 / 64.0, 0.125, 7.5, 0.4, 8.0))
+    assert program_for(geared, Window(4.0, 120.0, 15_000.0 / 8.0, 0.857)) == program
+
+
+@pytest.mark.parametrize(("window", "said"), [
+    (replace(WINDOW, torque_nm=5000.0), "of the motor, and its limit"),
+    (replace(WINDOW, lowest_rad_s=4.0), "swings down"),
+    (replace(WINDOW, highest_rad_s=9.0), "swings up"),
+], ids=["torque", "low", "high"])
+def test_a_window_without_room_is_refused(window, said):
+    with pytest.raises(EvaluationRefused, match=said):
+        program_for(CASE, window)
+
+
+def test_a_case_comes_back_from_json():
+    smooth = replace(CASE, string=string_with(friction="coulomb", static_nm=None, stribeck_speed_rad_s=None))
+    for case in (CASE, smooth):
+        assert case_of(json.loads(json.dumps(case.plain(), allow_nan=False))) == case
+
+
+def test_the_log_keeps_what_the_loop_tells():
+    assert VIRTUAL_COLUMNS == COLUMNS
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
+    """A log as the course would leave it, at 10 Hz; the columns of ``more`` are the same all along."""
+    parts = []
+
+    def add(phase, seconds, set_rpm, stuck, top=0.0):
+        block = np.zeros((round(seconds * 10), len(COLUMNS)))
+        block[:, 1], block[:, 2], block[:, 3], block[:, 7] = phase, set_rpm * RPM, top, 1.0
+        block[:, 6] = 1000.0 * np.sin(np.arange(len(block)))
+        time_s = 0.1 * np.arange(len(block))
+        block[:, 8] = np.where((time_s % 6.0 < 1.0) & stuck, 0.0, 5.0)
+        parts.append(block)
+        return time_s
+
+    add(Phase.HOLD, 20.0, 45.0, turns_from_rpm > 45.0)
+    climb = np.linspace(45.0, 70.0, 500)
+    add(Phase.RAMP, 50.0, climb, climb < turns_from_rpm)
+    add(Phase.STEADY, 20.0, 70.0, False)
+    time_s = 0.1 * np.arange(150)
+    omega = 2.0 * np.pi * hertz
+    decay = 7.0 + np.exp(-damping * omega * time_s) * np.cos(omega * np.sqrt(1.0 - damping**2) * time_s)
+    add(Phase.RELEASED, 15.0, 70.0, False, decay)
+    for rpm in trials:
+        add(Phase.MOVE, 2.0, rpm, False)
+        add(Phase.TRIAL, 60.0 if rpm < turns_from_rpm else 15.0, rpm, rpm < turns_from_rpm)
+    table = np.concatenate(parts)
+    table[:, 0] = 0.1 * np.arange(len(table))
+    for name, value in more.items():
+        table[:, COLUMNS.index(name)] = value
+    return table
+
+
+def test_critical_speed_and_damping_are_read_off_the_rows():
+    found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.15), CASE, PROGRAM)
+    assert found.outcome is Outcome.DIFFERS                   # by the damping, which is 0.15
+    assert "damping" in found.why
+    assert (found.critical_rpm.value, found.critical_rpm.low) == (pytest.approx(57.2), pytest.approx(56.3))
+    assert [one.turns for one in found.trials] == [True, False, False, True, True]
+    assert found.ramp_rpm == pytest.approx(57.0, abs=3.5)
+    assert found.damping == pytest.approx(0.15, abs=1e-3)
+    assert found.damped_hz == pytest.approx(0.13, abs=1e-3)
+    assert found.turning_rms_nm == pytest.approx(1000.0 / np.sqrt(2.0), rel=0.02)
+    found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.22), CASE, PROGRAM)
+    assert found.outcome is Outcome.AS_PREDICTED
+
+
+@pytest.mark.parametrize(("log", "outcome", "said"), [
+    (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), Outcome.DIFFERS, "critical speed 66.1 rpm, predicted 56 to 59"),
+    (rows(49.0, (49.5, 48.6), damping=0.22), Outcome.DIFFERS, "critical"),
+    (rows(40.0, ()), Outcome.NOT_FOUND, "did not stick"),
+    (rows(99.0, (60.0, 70.0)), Outcome.NOT_FOUND, "never ended turning"),
+    (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), Outcome.INVALID, "torque limit"),
+    (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), Outcome.INVALID, "nobody commanded"),
+], ids=["higher", "lower", "never stuck", "never turned", "clamped", "another rig"])
+def test_the_verdict(log, outcome, said):
+    found = evaluate(log, CASE, PROGRAM)
+    assert found.outcome is outcome and said in found.why
+
+
+def test_a_log_that_ends_early_has_no_critical_speed():
+    whole = rows(57.0, (57.5, 56.6))
+    assert evaluate(whole[:300], CASE, PROGRAM).outcome is Outcome.NOT_FOUND
+    assert evaluate(whole[:1], CASE, PROGRAM).critical_rpm is None
+    with pytest.raises(ValueError, match="never"):
+        evaluate(whole[:0], CASE, PROGRAM)
