@@ -45,10 +45,14 @@ WATCHED: Final = {
 EXPECTED_S: Final = {"setup": 10.0, "speed": 50.0, "torque": 15.0, "hold": 15.0, "acquire": 300.0}
 
 class Board:
-    """The run's status; whoever changes it is done at once, a thread writes it down."""
+    """The run's status; whoever changes it is done at once, a thread writes it down.
+
+    Some of the disk is reserved for it: how a run ended is told even where the disk has run full, which ends it.
+    """
 
     def __init__(self, store: Store, status: Status) -> None:
         self._store = store
+        store.reserve(status.id)
         self._status = status
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -81,6 +85,7 @@ class Board:
         self._end = True
         self._wake.set()
         self._thread.join(10.0)
+        self._store.release(self._status.id)
 
     def _write(self) -> None:
         last: Status | None = None

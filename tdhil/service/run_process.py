@@ -198,7 +198,7 @@ class RunProcess:
         confirmed = None if outcome.stop is None else outcome.stop.confirmed
         if outcome.stop is not None and not outcome.stop.confirmed:
             error, code = not_confirmed(outcome.stop), ExitCode.STOP_NOT_CONFIRMED
-        self._end(end_of(code, stop_confirmed=confirmed), int(code), error=None if error is None else Told.of(error))
+        self._end(_cut_short(code, confirmed), int(code), error=None if error is None else Told.of(error))
         return int(code)
 
     def _failed(self, error: BaseException) -> int:
@@ -210,8 +210,7 @@ class RunProcess:
         code = int(exit_code(error))
         if not isinstance(error, TdhilError):
             traceback.print_exception(error)
-        state = end_of(code, stop_confirmed=None)
-        self._end(state, code, error=Told.of(error))
+        self._end(_cut_short(code, None), code, error=Told.of(error))
         return code
 
     def _end(self, state: State, code: int, **known: Any) -> None:
@@ -224,6 +223,12 @@ class RunProcess:
             return way_to(status, end, at, exit_code=code, confirmation=None, **known)
 
         self.board.change(step)
+
+
+def _cut_short(code: int, stop_confirmed: bool | None) -> State:
+    """The end of a run that has no result, whatever its exit code: a log that broke off is `partial` to a terminal."""
+    state = end_of(code, stop_confirmed=stop_confirmed)
+    return State.FAILED if state is State.DONE else state
 
 
 def main(arguments: list[str]) -> int:

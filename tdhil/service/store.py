@@ -29,6 +29,9 @@ from tdhil.service.states import NotThere, State, Status, now
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 """Of a run: date, time (UTC), and what keeps two of one second apart."""
 _FILE_LIMIT: Final = 16 * 2**20
+RESERVE: Final = 2**16
+"""Bytes of the disk that are kept for how a run ended."""
+_RESERVE, _USED = ".reserve", ".state.json"
 
 
 def write_whole(path: Path, data: bytes, mode: int | None = None) -> None:
@@ -173,7 +176,8 @@ class Store:
 
     def status(self, run: str) -> Status:
         """As its file has it; that of a file that can't be read is `interrupted`."""
-        plain = read_json(self.place(run) / "state.json")
+        folder = self.place(run)
+        plain = read_json(folder / _USED) or read_json(folder / "state.json")
         try:
             return Status.of_plain(plain or {})
         except (TypeError, ValueError, KeyError):
@@ -200,8 +204,32 @@ class Store:
         return status
 
     def save(self, status: Status) -> None:
-        """Raises OSError."""
-        write_json(self.runs / status.id / "state.json", status.plain())
+        """Where the disk is full, into what was reserved on it. Raises OSError where that isn't there, either."""
+        folder, plain = self.runs / status.id, status.plain()
+        try:
+            write_json(folder / "state.json", plain)
+        except OSError:
+            kept = next((one for one in (folder / _USED, folder / _RESERVE) if one.exists()), None)
+            text = json.dumps(plain, ensure_ascii=False).encode().ljust(RESERVE)
+            if kept is None or len(text) > RESERVE:
+                raise
+            with kept.open("r+b") as file:         # in place: that takes no room
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            kept.replace(folder / _USED)
+        else:
+            (folder / _USED).unlink(missing_ok=True)
+
+    def reserve(self, run: str) -> None:
+        """Keep some of the disk for the run's state, until `release`; where there is none left, nothing is."""
+        with suppress(OSError):
+            (self.runs / run / _RESERVE).write_bytes(b" " * RESERVE)
+
+    def release(self, run: str) -> None:
+        """What was kept and not needed."""
+        with suppress(OSError):
+            (self.runs / run / _RESERVE).unlink(missing_ok=True)
 
     def signed_off(self, run: str) -> dict[str, Any] | None:
         """Who took a stop that wasn't confirmed upon himself."""

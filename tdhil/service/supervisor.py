@@ -352,11 +352,24 @@ class Supervisor:
                     "" if seen else "Use the hard-wired stop, then sign it off", int(ExitCode.COMMUNICATION))
         stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None)
         status = way_to(status, state, now(), error=told, exit_code=int(told.exit_code), stop=stop, confirmation=None)
-        with suppress(OSError):
-            self.store.save(status)
+        self._save(status)
+        self.store.release(run)
         self._say(f"run {run}: {what}")
         self._in_background(lambda: self._recover(run))
         return status
+
+    def _save(self, status: Status) -> None:
+        """At last: as long as the disk is full, nobody takes the rig."""
+        told = False
+        while not self._end.is_set():
+            try:
+                self.store.save(status)
+                return
+            except OSError as error:
+                if not told:
+                    self._say(f"run {status.id}: its end can't be written yet: {error}")
+                told = True
+                self._end.wait(1.0)
 
     def _recover(self, run: str) -> None:
         """What the log of a lost run still holds, as a clean copy and as a result."""

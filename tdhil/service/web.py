@@ -91,6 +91,7 @@ from tdhil.service.states import (
     NotLoggedIn,
     NotThere,
     State,
+    Status,
     Told,
     TooManyTries,
     iso,
@@ -436,8 +437,8 @@ class Web:
     async def _stop(self, request: Request, body: Any) -> RunView:
         run, who = request.path_params["run"], principal(request).name
         self._stopped.inc()
-        await anyio.to_thread.run_sync(self.supervisor.stop, run, who, limiter=self._stops)
-        found: RunView = await anyio.to_thread.run_sync(self.run_view, run, limiter=self._stops)
+        status = await anyio.to_thread.run_sync(self.supervisor.stop, run, who, limiter=self._stops)
+        found: RunView = await anyio.to_thread.run_sync(self.run_view, run, status, limiter=self._stops)
         return found
 
     async def _sign_off(self, request: Request, body: Any) -> RunView:
@@ -482,7 +483,10 @@ class Web:
         path = self.store.place(run) / "replays" / f"{view.name}.json"
         try:
             await self._off(lambda: write_json(path, plain(done, ReplayView)))
-        finally:
+        except OSError as error:
+            lost = told_of(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
+            self._waiting[run, view.name] = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=lost)
+        else:
             self._waiting.pop((run, view.name), None)
 
     async def _replay(self, request: Request, body: Any) -> ReplayView:
@@ -708,10 +712,10 @@ class Web:
         waiting = {name: one for (at, name), one in tuple(self._waiting.items()) if at == run and name not in made}
         return [one for _, one in sorted((made | waiting).items())]
 
-    def run_view(self, run: str) -> RunView:
-        """Everything but the samples. Raises NotThere."""
+    def run_view(self, run: str, status: Status | None = None) -> RunView:
+        """Everything but the samples. ``status``: as the run itself has just said it. Raises NotThere."""
         request, folder = self.store.request(run), self.store.place(run)
-        status = self.store.status(run)
+        status = status or self.store.status(run)
         rig_name = request.rig
         with suppress(TdhilError):
             rig_name = self.supervisor.rigs.get(request.rig).name

@@ -520,6 +520,24 @@ def test_a_run_whose_process_is_killed_is_told_of_and_its_drive_stopped(call, se
     assert call("GET", "/rigs/a", 200)["state"] == "free"
 
 
+def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
+    save, room = service.store.save, threading.Event()
+
+    def full(status):
+        if not room.is_set():
+            raise OSError(28, "No space left on device")
+        save(status)
+
+    run = call.start(what="die")["id"]
+    service.wait(run, "moving")
+    monkeypatch.setattr(service.store, "save", full)
+    wait_for("that it is told", lambda: any("can't be written yet" in one for one in service.said))
+    assert call("GET", "/rigs/a", 200)["state"] == "busy"          # nobody takes it meanwhile
+    room.set()
+    service.wait(run, "interrupted")
+    wait_for("its end", lambda: not service.supervisor.live())
+
+
 def test_a_real_drive_that_no_stop_reaches_blocks_its_rig_until_somebody_signs(call, service):
     run = call.start("real", what="ask")["id"]
     service.wait(run, "awaiting_confirmation")

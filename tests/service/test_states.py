@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tdhil.errors import ExitCode, UsageError
+from tdhil.service.run_process import _cut_short
 from tdhil.service.states import (
     ENDED,
     FOLLOWS,
@@ -74,6 +75,13 @@ def test_every_end_is_reached_from_wherever_a_run_was(state, end):
 ])
 def test_an_exit_code_is_a_state(code, confirmed, state):
     assert end_of(code, stop_confirmed=confirmed) == state
+
+
+@pytest.mark.parametrize(("code", "confirmed", "state"), [
+    (3, True, "failed"), (9, None, "failed"), (143, True, "stopped"), (4, None, "refused"),
+    (3, False, "stop_not_confirmed")])
+def test_what_was_cut_short_is_never_done(code, confirmed, state):
+    assert _cut_short(code, confirmed) == state
 
 
 def test_every_exit_code_has_its_end():

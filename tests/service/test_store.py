@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.service.states import NotThere, State, now, way_to
+from tdhil.service.states import NotThere, State, Status, now, way_to
 from tdhil.service.store import Audit, Index, Request, Store, summary_of, write_json, write_whole
 
 
@@ -27,6 +27,37 @@ def a_run(store: Store, rig: str = "a", end: State | None = State.REFUSED) -> st
     if end is not None:
         store.save(way_to(status, end, now()))
     return run
+
+
+def test_how_a_run_ended_is_told_on_a_full_disk(store, monkeypatch):
+    """In the room that was kept for it; and where there is room again, in its file."""
+    run = a_run(store, end=None)
+    store.reserve(run)
+    folder, status = store.place(run), store.status(run)
+    with monkeypatch.context() as patched:
+        patched.setattr("tdhil.service.store.write_json", full)
+        for state in (State.PREFLIGHT, State.REFUSED):
+            status = status.to(state, now())
+            store.save(status)
+            assert store.status(run) == status
+        assert {one.stat().st_size for one in folder.glob(".*state*")} == {2**16}
+        other = a_run_without_room(store)
+        with pytest.raises(OSError, match="No space"):
+            store.save(other)
+    (folder / ".state.json").write_bytes(b'{"id": "torn')            # by a loss of power
+    assert store.status(run).state is State.REQUESTED
+    store.save(status)
+    store.release(run)
+    assert store.status(run) == status
+    assert sorted(one.name for one in folder.iterdir()) == ["request.json", "state.json"]
+
+
+def full(path: Path, plain: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def a_run_without_room(store: Store) -> Status:
+    return Status.begun(store.new_id(), "a", now())
 
 
 def test_a_run_comes_back_as_it_was_written(store):

@@ -1,0 +1,400 @@
+"""What `tdhil serve` promises of its safe path, with the service as processes and simulated rigs; 1 where it doesn't.
+
+    python benchmarks/service_proofs.py kill [--full]      # the web is killed at random moments of runs
+    python benchmarks/service_proofs.py stop [--full]      # a stop over HTTP beside all that could be in its way
+    python benchmarks/service_proofs.py cycles [--full]    # the control loop with server and viewers, and without
+    python benchmarks/service_proofs.py lost [--full]      # the run's process is killed
+
+- kill: SIGKILL of the web, and a new one, again and again (5 times; --full: 50) while stepped runs of one seed go. A
+  new web knows the run, and what it is, within 3 s of its start; the log has the samples of a run that nobody
+  disturbed, to the bit; there is one result, one run in the list, and after the index was deleted the same list.
+- stop: runs in real time at 100 Hz with 20 viewers, replays without a pause, a locked index and, every other one, a
+  full disk; from POST to the first sample of a drive in quick stop at most 100 ms and one cycle in 99 of 100 (4 stops;
+  --full: 50). Each run ends at rest, and says how it came to that.
+  The full disk is a tmpfs of a name space of its own (unshare), so that nobody else has it.
+- cycles: one run at 100 Hz; by turns the web is there with 20 viewers, and is killed (2 turns of 20 s; --full: 6 of
+  60 s). Cycles missed (no new feedback, or begun late by half a period): at most 0.1 % more with them; the web takes
+  at most 5 % of a core.
+- lost: SIGKILL of the run's process, while it turns a drive in another process whose watchdog has 5 s (2 times; --full:
+  10). `tdhil stop` is on its way within 5 s, the drive brakes, and the run says what became of it.
+
+`cycles` and `stop` want a machine with nothing else to do, and say the load that they had.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import errno
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from datetime import datetime
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT)]
+
+from drivers.clock import quantile  # noqa: E402
+from tdhil.recording import Recording, read_run  # noqa: E402
+from tdhil.service.states import ENDED  # noqa: E402
+from tdhil.service.wire import ask, lives  # noqa: E402
+from tests.service.conftest import wait_for  # noqa: E402
+from tests.service.test_lost_run import LIMITS, simulated_drive, speed_rad_s  # noqa: E402
+from tests.service.test_serve import Server, served  # noqa: E402
+
+RIG = "simulated-canopen"
+FOUND_S, STOP_S, LOST_S = 3.0, 0.1, 5.0
+MORE_MISSED, WEB_SHARE = 1e-3, 0.05
+RATE_HZ, VIEWERS = 100.0, 20
+TMPFS_MB = 260                     # a log isn't begun where less than 200 MB are free
+
+
+def load() -> str:
+    """Of this machine, for whoever reads the figures."""
+    return f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+
+
+def state_of(server: Server, run: str) -> str:
+    found: str = server.client.run(run)["state"]
+    return found
+
+
+def stage_of(server: Server, run: str) -> str | None:
+    found: str | None = server.client.run(run)["stage"]
+    return found
+
+
+def ended_early(server: Server, run: str) -> bool:
+    """Never; a run that has ended is told of."""
+    if (found := server.client.run(run))["state"] in ENDED:
+        raise SystemExit(f"run {run} is {found['state']}: {found['error']}")
+    return False
+
+
+# -- kill -------------------------------------------------------------------------------------------------------------
+
+
+def same(one: Recording, other: Recording) -> bool:
+    """To the bit, in all that is an array."""
+    names = [name.name for name in fields(Recording) if isinstance(getattr(one, name.name), np.ndarray)]
+    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in names)
+
+
+def kill(folder: Path, times: int, seed: int) -> bool:
+    """Prints a line a run."""
+    random, data, options = Random(seed), folder / "data", {"seed": 7, "rate_hz": 50}
+    with served(data) as server:
+        first = server.client.start(RIG, **options)["id"]
+        server.client.wait(first)
+    undisturbed = read_run(data / "runs" / first / "run.mcap")
+    runs, found_s, good, server = [first], [], True, Server(data)
+    try:
+        while len(found_s) < times:
+            run = server.client.start(RIG, **options)["id"]
+            runs.append(run)
+            before = len(found_s)
+            while state_of(server, run) not in ENDED:
+                time.sleep(random.uniform(0.0, 2.0))
+                if len(found_s) >= times:
+                    continue
+                server.process.kill()
+                server.process.wait()
+                server.log.close()
+                begun_s = time.monotonic()
+                server = Server(data)
+                known = server.client.run(run)
+                found_s.append(time.monotonic() - begun_s)
+                if known["state"] not in ENDED and run not in server.client._object("GET", "/healthz")["live"]:
+                    print(f"run {run}: {known['state']}, and the new web doesn't hold it")
+                    good = False
+            wait_for("the end of its process", lambda run=run: not lives(data / "runs" / run))
+            log, view = read_run(data / "runs" / run / "run.mcap"), server.client.run(run)
+            one = json.loads((data / "runs" / run / "result.json").read_bytes()) == log.result == view["result"]
+            whole = log.complete and not log.problems and same(log.recording, undisturbed.recording)
+            good &= one and whole and view["state"] == "done"
+            print(f"run {run}: {len(found_s) - before} kills, {view['state']}, {len(log.recording.time_s)} samples "
+                  f"{'the same' if whole else 'NOT THE SAME'}, {'one result' if one else 'NOT ONE RESULT'}",
+                  flush=True)
+        wait_for("the index", lambda: len(server.client.runs(state="done")) == len(runs))
+        listed = server.client.runs()
+        server.process.kill()
+        server.process.wait()
+        (data / "index.sqlite").unlink()
+        server.log.close()
+        server = Server(data)
+        again = server.client.runs() == listed and sorted(one["id"] for one in listed) == sorted(runs)
+        chain = server.client.audit()["broken"] is None
+    finally:
+        server.process.kill()
+        server.process.wait()
+    print(f"{len(found_s)} kills: found again within {max(found_s):.2f} s (median {np.median(found_s):.2f}); index"
+          f" deleted: {'the same list' if again else 'ANOTHER LIST'}; audit {'holds' if chain else 'BROKEN'}; {load()}")
+    return good and again and chain and max(found_s) <= FOUND_S
+
+
+# -- viewers ----------------------------------------------------------------------------------------------------------
+
+
+def view(url: str, run: str, count: int) -> None:
+    """That many pages' sockets, in a process of its own, until it is ended."""
+    import asyncio
+
+    from websockets.asyncio.client import connect
+
+    async def one() -> None:
+        while True:
+            with contextlib.suppress(Exception):
+                async with connect(f"{url.replace('http', 'ws', 1)}/api/v1/live/{run}", max_size=None) as socket:
+                    async for _ in socket:
+                        pass
+            await asyncio.sleep(0.2)
+
+    async def all_of_them() -> None:
+        await asyncio.gather(*(one() for _ in range(count)))
+
+    asyncio.run(all_of_them())
+
+
+@contextlib.contextmanager
+def viewers(server: Server, run: str, count: int = VIEWERS) -> Iterator[None]:
+    child = subprocess.Popen([sys.executable, __file__, "view", server.url, run, str(count)])
+    try:
+        wait_for("the viewers", lambda: f"tdhil_live_viewers {count}.0" in metrics(server))
+        yield
+    finally:
+        child.kill()
+        child.wait()
+
+
+def metrics(server: Server) -> str:
+    with server.client._open("GET", "/metrics") as answer:
+        found: str = answer.read().decode()
+    return found
+
+
+# -- stop -------------------------------------------------------------------------------------------------------------
+
+
+def mounted(arguments: list[str]) -> int:
+    """This program again, where it may mount a disk of its own to fill."""
+    return subprocess.call(["unshare", "--map-root-user", "--mount", sys.executable, __file__, *arguments, "--mounted"])
+
+
+def fill(folder: Path) -> None:
+    """Nothing more can be written there."""
+    free = os.statvfs(folder)
+    with contextlib.suppress(OSError), (folder / "filler").open("ab") as file:
+        os.posix_fallocate(file.fileno(), 0, free.f_bavail * free.f_frsize)
+    with (folder / "rest").open("ab", buffering=0) as file:
+        try:
+            while True:
+                file.write(b"0" * 4096)
+        except OSError as error:
+            assert error.errno == errno.ENOSPC
+
+
+def stop(folder: Path, times: int, disk: bool) -> bool:
+    """``disk``: there is one that may be filled."""
+    if disk:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={TMPFS_MB}m", "tmpfs", str(folder)], check=True)
+    data, took_s, good = folder / "data", [], True
+    with served(data) as server:
+        old = server.client.start(RIG, seed=7, rate_hz=50)["id"]
+        server.client.wait(old)
+        for number in range(times):
+            run = server.client.start(RIG, real_time=True, rate_hz=RATE_HZ)["id"]
+            going = threading.Event()
+            replays = threading.Thread(target=replay_on, args=(server, old, going), daemon=True)
+            with viewers(server, run), contextlib.closing(sqlite3.connect(data / "index.sqlite")) as base:
+                wait_for("motion", lambda run=run: ended_early(server, run) or stage_of(server, run) == "speed")
+                replays.start()
+                base.execute("begin exclusive")
+                time.sleep(1.0)
+                if full := disk and number % 2 == 1:      # which ends the run as well, if only a little later
+                    fill(folder)
+                asked_s = time.time()
+                answer = server.client.stop(run)
+                answered_s = time.time()
+                status = wait_for("the drive's answer", lambda run=run: seen(data / "runs" / run))
+                took_s.append(datetime.fromisoformat(status["stop"]["seen"]).timestamp() - asked_s)
+                print(f"stop {number + 1}: answered after {1e3 * (answered_s - asked_s):.0f} ms ({answer['state']}),"
+                      f" seen by the drive {1e3 * took_s[-1]:.0f} ms after it was asked for by {status['stop']['by']}",
+                      flush=True)
+                wait_for("its end", lambda run=run: state_of(server, run) in ENDED and not lives(data / "runs" / run))
+                for name in ("filler", "rest"):
+                    (folder / name).unlink(missing_ok=True)
+            going.set()
+            replays.join(60.0)
+            end = server.client.run(run)
+            good &= end["stop"]["confirmed"] is True and end["state"] in ("stopped", *(("failed",) if full else ()))
+            print(f"        then it is {end['state']}: {end['error']['what']}", flush=True)
+    p99_s = quantile(sorted(took_s), 0.99)
+    print(f"{times} stops with {VIEWERS} viewers, replays, a locked index"
+          f"{' and, every other one, a full disk' if disk else ''}: p99 {1e3 * p99_s:.0f} ms, median"
+          f" {1e3 * np.median(took_s):.0f} ms to quick stop; {load()}")
+    if not disk:
+        print("No disk could be filled here (unshare, mount): that was NOT tried")
+    return good and p99_s <= STOP_S + 1.0 / RATE_HZ
+
+
+def seen(folder: Path) -> dict[str, Any] | None:
+    """The run's status, from its own mouth: a full disk has an old one."""
+    found: dict[str, Any] = ask(folder, {"do": "status"})["status"]
+    return found if found["stop"]["seen"] else None
+
+
+def replay_on(server: Server, run: str, ended: threading.Event) -> None:
+    while not ended.is_set():
+        with contextlib.suppress(Exception):
+            server.client.replay(run)
+        ended.wait(0.1)
+
+
+# -- cycles -----------------------------------------------------------------------------------------------------------
+
+
+def missed(time_s: np.ndarray, fresh: np.ndarray) -> tuple[int, int]:
+    """(cycles, those without new feedback or begun late by more than half a period)."""
+    late = np.diff(time_s) > 1.5 / RATE_HZ
+    return len(late), int(np.count_nonzero(late | ~fresh[1:]))
+
+
+def cpu_s(pid: int) -> float:
+    """All that a process has had of a processor."""
+    found = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(found[11]) + int(found[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def cycles(folder: Path, turns: int, seconds: float) -> bool:
+    """One run; its log says what it missed while the web was there and while it wasn't."""
+    data, spans, shares, server = folder / "data", [], [], Server(folder / "data")
+    try:
+        run = server.client.start(RIG, real_time=True, rate_hz=RATE_HZ, excitation="sine", frequency_hz=0.2,
+                                  periods=200, real_time_priority=True)["id"]
+        wait_for("motion", lambda: ended_early(server, run) or stage_of(server, run) == "speed")
+        for _ in range(turns):
+            with viewers(server, run):
+                time.sleep(2.0)                # whoever comes gets all of it so far
+                begun, used_s = time.time(), cpu_s(server.process.pid)
+                time.sleep(seconds)
+                spans.append((True, begun, time.time()))
+                shares.append((cpu_s(server.process.pid) - used_s) / seconds)
+            server.process.kill()
+            server.process.wait()
+            server.log.close()
+            time.sleep(1.0)
+            begun = time.time()
+            time.sleep(seconds)
+            spans.append((False, begun, time.time()))
+            server = Server(data)
+            time.sleep(1.0)
+            if state_of(server, run) in ENDED:
+                print(f"the run ended: {server.client.run(run)['error']}")
+                return False
+        server.client.stop(run)
+        server.client.wait(run)
+    finally:
+        server.process.kill()
+        server.process.wait()
+    log = read_run(data / "runs" / run / "run.mcap")
+    wall_s, found = log.epoch_ns / 1e9 + log.recording.time_s, {True: [0, 0], False: [0, 0]}
+    for there, begun, ended in spans:
+        inside = (wall_s >= begun) & (wall_s < ended)
+        of, bad = missed(log.recording.time_s[inside], log.recording.fresh[inside])
+        found[there][0] += of
+        found[there][1] += bad
+        print(f"{'with' if there else 'without'} server and viewers: {bad} of {of} cycles missed", flush=True)
+    with_them, without = (found[there][1] / found[there][0] for there in (True, False))
+    print(f"missed with {100 * with_them:.3f} %, without {100 * without:.3f} %; the web takes"
+          f" {100 * np.mean(shares):.1f} % of a core with {VIEWERS} viewers;"
+          f" {log.configuration.get('real_time_priority')}; {load()}")
+    return with_them - without <= MORE_MISSED and float(np.mean(shares)) <= WEB_SHARE
+
+
+# -- lost -------------------------------------------------------------------------------------------------------------
+
+
+def braking(trace: Path, since: int) -> bool:
+    """Does a later row of the simulator's trace have the drive told to stop?"""
+    rows = trace.read_text()[since:].splitlines()
+    return any("quick stop" in row for row in rows)
+
+
+def lost(folder: Path, times: int, seed: int) -> bool:
+    """On a machine that has the time, it is `tdhil stop` that makes it brake, and not the watchdog."""
+    random, good, took, ended = Random(seed), True, [], []
+    rigs = folder / "rigs"
+    rigs.mkdir()
+    for number in range(times):
+        trace = folder / f"shaft-{number}.csv"
+        with simulated_drive(trace) as port, contextlib.ExitStack() as stack:
+            (rigs / "real.yaml").write_text(
+                f"rate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{LIMITS}service: {{motion: attended}}\n")
+            server = stack.enter_context(served(folder / "data", "--rigs", str(rigs)))
+            run = server.client.start("real")["id"]
+            wait_for("motion", lambda server=server, run=run, trace=trace: ended_early(server, run)
+                     or speed_rad_s(trace) > 1.0)
+            time.sleep(random.uniform(0.0, 2.0))
+            at, pid = trace.stat().st_size, json.loads((folder / "data/runs" / run / "state.json").read_bytes())["pid"]
+            os.kill(pid, signal.SIGKILL)
+            killed_s = time.monotonic()
+            wait_for("tdhil stop", lambda server=server, run=run: f"{run}: its process is gone" in server.said())
+            took.append(time.monotonic() - killed_s)
+            wait_for("braking", lambda trace=trace, at=at: braking(trace, at))
+            braked_s = time.monotonic() - killed_s
+            status = server.client.wait(run)
+            ended.append(time.monotonic() - killed_s)
+            told = status["state"] == "interrupted" and status["stop"]["confirmed"] and run in server.said()
+            good &= bool(told) and abs(speed_rad_s(trace)) < 0.1
+            print(f"run {run}: tdhil stop on its way {took[-1]:.2f} s after the kill, braking after {braked_s:.2f} s,"
+                  f" {status['state']} after {ended[-1]:.2f} s: {status['error']['what']}", flush=True)
+    print(f"{times} kills of the run's process: a stop on its way within {max(took):.2f} s, reported within"
+          f" {max(ended):.2f} s; {load()}")
+    return good and max(took) <= LOST_S
+
+
+def main(arguments: list[str]) -> int:
+    """0 where all holds."""
+    if arguments[:1] == ["view"]:
+        view(arguments[1], arguments[2], int(arguments[3]))
+        return 0
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("kill", "stop", "cycles", "lost"))
+    parser.add_argument("--full", action="store_true", help="as many as the promise is for")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--mounted", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.what == "stop" and not options.mounted and subprocess.call(
+        ["unshare", "--map-root-user", "--mount", "true"], stderr=subprocess.DEVNULL) == 0:
+        return mounted(arguments)
+    short: dict[str, Callable[[Path], bool]] = {
+        "kill": lambda folder: kill(folder, 50 if options.full else 5, options.seed),
+        "stop": lambda folder: stop(folder, 50 if options.full else 4, options.mounted),
+        "cycles": lambda folder: cycles(folder, *((6, 60.0) if options.full else (2, 20.0))),
+        "lost": lambda folder: lost(folder, 10 if options.full else 2, options.seed),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            good = short[options.what](Path(folder))
+        finally:
+            if options.mounted:
+                subprocess.run(["umount", "--lazy", folder], check=False)
+    print("holds" if good else "DOES NOT HOLD")
+    return int(not good)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
