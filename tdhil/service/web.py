@@ -473,7 +473,7 @@ class Web:
 
     async def _replay_later(self, run: str, view: ReplayView) -> None:
         """A replay has time: it waits as long as a shaft of this service may turn."""
-        while self.supervisor.turning():
+        while await self._off(self.supervisor.turning):
             await anyio.sleep(0.5)
         try:
             found = await self.work("replay", run, view.asked)

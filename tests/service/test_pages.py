@@ -11,6 +11,7 @@ import shutil
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from html import escape
@@ -380,6 +381,26 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     page.wait_for_url("**/live")
     begun = served.service.store.request(served.service.store.ids()[0])
     assert begun.options["fault"] == ["internal-limit@speed+1.5s=20%"]
+
+
+@pytest.mark.heavy
+def test_a_newcomer_clicks_twice_and_has_a_result(browser, tmp_path):
+    """The service as a process, its own simulated rigs, a real run; how long it took is said (`pytest -s`)."""
+    from tests.service.test_serve import served as process
+
+    began_s = time.monotonic()
+    with process(tmp_path / "data") as server:
+        page = browser.new_context(base_url=server.url).new_page()
+        page.goto("/")
+        page.get_by_role("article", name="Simulated rig, CANopen").get_by_role("link", name="Start").click()
+        clicked_s = time.monotonic()
+        page.get_by_role("button", name="Start").click()
+        page.get_by_role("link", name="To the result").click(timeout=300_000)
+        page.get_by_text("J = 104").wait_for()
+        took_s = time.monotonic() - clicked_s
+        page.locator(".pictures img").nth(4).evaluate("one => { one.loading = 'eager'; return one.decode() }")
+        print(f"a click to a result: {took_s:.0f} s, {clicked_s - began_s:.0f} s from the command to the click;"
+              f" load {os.getloadavg()[0]:.1f}")
 
 
 def test_a_page_says_when_nobody_answers_any_more(page, served, monkeypatch):
