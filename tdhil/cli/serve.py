@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from profiles import visible
+
 DATA = Path("tdhil-data")
 
 
@@ -77,7 +79,7 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError("needs the other one, too", where="--tls-cert" if key is None else "--tls-key")
 
     def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)  # noqa: T201
+        print(visible(text, keep="\n"), file=sys.stderr, flush=True)  # noqa: T201
 
     if namespace.check_idle:
         return check_idle(namespace.data, say)

@@ -87,10 +87,10 @@ class Session:
 
 
 class Tries:
-    """How often a password may be tried in a minute. Nobody waits longer than that, so nobody is locked out for long.
+    """How often a password may be tried in a minute: by one address 5 times for a name, and 20 times for all.
 
-    For a name from one address 5, from one address 20, for a name from all the addresses that it never came from 30:
-    who tries from elsewhere doesn't keep him away whose name it is.
+    For a name, 30 times from all addresses that it never came from: who tries from elsewhere keeps nobody away from
+    where he logs in, but may keep him from logging in at a new place for as long as he goes on.
     """
 
     WINDOW_S: Final = 60.0

@@ -91,7 +91,8 @@ def matches(password: str, kept: str | None) -> bool:
     nobody = f"scrypt${_N}${_R}${_P}${bytes(16).hex()}${bytes(_BYTES).hex()}"
     kind, n, r, p, salt, key = (kept or nobody).split("$")
     found = _derive(password[:LONGEST], bytes.fromhex(salt), int(n), int(r), int(p))
-    return hmac.compare_digest(found, bytes.fromhex(key)) and kept is not None and kind == "scrypt"
+    good = kept is not None and kind == "scrypt" and len(password) <= LONGEST
+    return hmac.compare_digest(found, bytes.fromhex(key)) and good
 
 
 def _derive(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:

@@ -192,6 +192,9 @@ def _uvicorn(
         h11_max_incomplete_event_size=32 * 1024, proxy_headers=False,      # who asks is who is connected
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
+    if tls is not None:
+        config.load()
+        config.ssl = tls.context()             # the one that was looked at, with the ciphers of Python
     server = uvicorn.Server(config)
     former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}
     object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM brakes before it ends anything

@@ -557,6 +557,8 @@ def test_what_is_kept_tells_nothing(tmp_path):
     assert matches(PASSWORD, accounts.known.users["anna"].password)
     assert not matches(PASSWORD + "x", accounts.known.users["anna"].password)
     assert not matches(PASSWORD, None)
+    accounts.set_password("bert", "x y" * 66 + "ab")
+    assert not matches("x y" * 66 + "abc", accounts.known.users["bert"].password)
     assert accounts.known.of_token(token).name == "meter"
     assert accounts.known.of_token("") is None
 
@@ -610,6 +612,13 @@ def test_a_name_that_is_tried_is_text_in_the_audit(guarded):
 
 
 # -- on the terminal
+
+
+def test_nothing_on_the_terminal_of_serve_is_obeyed_by_it(monkeypatch, capsys):
+    """Whatever says it: a rig's name, a drive's, an error's text."""
+    monkeypatch.setattr("tdhil.service.serve", lambda rigs, data, host, port, say, **_: say("a\x1b[2Jb\x07\nc") or 0)
+    assert main(["serve"]) == 0
+    assert capsys.readouterr().err == "a␛[2Jb␇\nc\n"
 
 
 def test_users_and_tokens_on_the_terminal(tmp_path, capsys, monkeypatch):
