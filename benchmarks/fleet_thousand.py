@@ -1,11 +1,12 @@
 """A thousand logs of twenty rigs, ten of them poisoned: the same table by every road, whoever is killed; what it costs.
 
     python benchmarks/fleet_thousand.py [--logs 1000] [--roads pool one dask] [--kills 50] [--folder DIR]
-    python benchmarks/fleet_thousand.py --quick
+    python benchmarks/fleet_thousand.py --quick [--interrupt 20]
     python benchmarks/fleet_thousand.py --cost [--copies 20]
 
-With --quick logs are hashed and not identified: the machinery alone, within minutes. The logs are real
-run.mcap files of the studies' batch simulator. With --cost: CPU seconds a log of a real run's size (simulated once, 8.7
+With --quick logs are hashed and not identified: the machinery alone, within minutes; with --interrupt it is `tdhil
+fleet` in a terminal, where Ctrl-C is pressed so often, and each time started again. The logs are real run.mcap files of
+the studies' batch simulator. With --cost: CPU seconds a log of a real run's size (simulated once, 8.7
 MB), cold and from the cache, beside a plain replay; memory; how soon the pool starts.
 """
 
@@ -28,13 +29,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tdhil.fleet import FleetRequest, FleetRow, Settings, run_fleet  # noqa: E402
+from tdhil.fleet import FleetRequest, FleetRow, Settings, read_table, run_fleet  # noqa: E402
 from tdhil.process_pool import Pool, TaskLimits  # noqa: E402
 from tests.fleet import poison  # noqa: E402
 from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
+from tests.fleet.terminal import fleet_with_ctrl_c  # noqa: E402
 from tests.recording.test_damage import bomb  # noqa: E402
 
-LIMITS = TaskLimits(25.0, 1_500_000_000)
+LIMITS = TaskLimits(60.0, 1_500_000_000)
 POISONED = {
     "kills": (2, poison.KILLS), "hangs": (2, poison.HANGS), "bomb": (1, bomb("zstd", 500_000_000, 500_000_000)),
     "corrupt": (2, b"\x89MCAP0\r\n" + random.Random(1).randbytes(100_000)), "empty": (1, b""),
@@ -155,6 +157,29 @@ def thousand(asked: argparse.Namespace, folder: Path) -> None:
         print(f"{road}: {differ} rows differ from {next(iter(tables))}'s")
 
 
+def interrupted(asked: argparse.Namespace, folder: Path) -> None:
+    """Ctrl-C in a terminal, again and again: what was done is done once, but for what was in hand."""
+    logs, out, calls = folder / "logs", folder / "interrupted.csv", folder / "interrupted_calls.txt"
+    if not logs.exists():
+        generate(logs, asked.logs, asked.rigs)
+    calls.write_text("")
+    os.environ["TDHIL_CALLS"] = str(calls)
+    arguments = [str(logs), "--out", str(out), "--jobs", "2", "--no-cache", "--time-limit", str(LIMITS.time_s)]
+    rng, codes = random.Random(3), Counter[int]()
+
+    def begun() -> int:
+        return calls.read_text().count("\n")
+
+    for _ in range(asked.interrupt):
+        least = begun() + rng.randint(1, max(2, asked.logs // asked.interrupt))
+        codes[fleet_with_ctrl_c("quick", arguments, lambda least=least: begun() >= least)] += 1
+    codes[fleet_with_ctrl_c("quick", arguments, lambda: False)] += 1
+    rows, twice = read_table(out), Counter(Counter(calls.read_text().split("\n")[:-1]).values())
+    logged, good = {row.log for row in rows}, sum(not row.failed for row in rows)
+    print(f"{asked.interrupt} times Ctrl-C: exit codes {dict(codes)}; {len(rows)} rows of {len(logged)} logs, {good} "
+          f"results; begun so often: {dict(sorted(twice.items()))}")
+
+
 def cost(asked: argparse.Namespace, folder: Path) -> None:
     import tdhil
     from tdhil.recording.log_format import CLASSES, CONFIGURATION
@@ -211,13 +236,14 @@ def main() -> None:
     parser.add_argument("--kill-workers", action="store_true", help="kill Dask's own workers, too")
     parser.add_argument("--quick", action="store_true", help="the machinery alone: rows without identifying")
     parser.add_argument("--folder", type=Path, help="where logs and tables stay")
+    parser.add_argument("--interrupt", type=int, default=0, metavar="N", help="press Ctrl-C so often")
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--copies", type=int, default=20)
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tdhil-thousand-") as folder:
         place = asked.folder or Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        (cost if asked.cost else thousand)(asked, place)
+        (cost if asked.cost else interrupted if asked.interrupt else thousand)(asked, place)
 
 
 if __name__ == "__main__":

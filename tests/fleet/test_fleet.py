@@ -5,11 +5,7 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
-import threading
-import time
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -226,44 +222,19 @@ def test_told_to_stop_it_leaves_what_is_in_hand(tmp_path, calls):
 
 def test_ctrl_c_in_a_terminal_and_the_same_command_again(tmp_path, calls):
     """The whole foreground group gets the signal, as from a keyboard: the processes at work are in none of it."""
-    pty = pytest.importorskip("pty")
+    pytest.importorskip("pty")
+    from tests.fleet.terminal import fleet_with_ctrl_c
+
     (folder,) = many(tmp_path / "logs", 120)
     out = tmp_path / "fleet.csv"
-    script = (
-        "import functools, os, sys\n"
-        "os.open(os.ttyname(0), os.O_RDWR)                  # its controlling terminal from now on\n"
-        "import tdhil.fleet\n"
-        "from tdhil.cli.main import main\n"
-        "from tests.fleet import poison\n"
-        "tdhil.fleet.run_fleet = functools.partial(tdhil.fleet.run_fleet, function=poison.quick)\n"
-        "sys.exit(main(sys.argv[1:]))\n"
-    )
-    ours, theirs = pty.openpty()
-    command = [sys.executable, "-c", script, "fleet", folder, "--out", str(out), "--jobs", "2"]
-    try:
-        with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
-                              cwd=Path(__file__).parents[2]) as host:
-            os.close(theirs)
-            reader = threading.Thread(target=drain, args=(ours,), daemon=True)
-            reader.start()
-            while len(calls.read_text().split()) < 20 and host.poll() is None:
-                time.sleep(0.01)
-            os.write(ours, b"\x03")
-            assert host.wait() == 130
-    finally:
-        os.close(ours)
+    arguments = [folder, "--out", str(out), "--jobs", "2"]
+    assert fleet_with_ctrl_c("quick", arguments, lambda: len(calls.read_text().split()) >= 20) == 130
     done = {row.log for row in read_table(out)}
     assert 10 <= len(done) < 120                       # of twenty begun, what was in hand is gone
     calls.write_text("")
     summary = run_fleet(FleetRequest((folder,), out, jobs=2), function=poison.quick)
     assert (summary.done_before, len(summary.rows)) == (len(done), 120)
     assert sorted(calls.read_text().split()) == sorted({row.log for row in summary.rows} - done)
-
-
-def drain(terminal):
-    with suppress(OSError):
-        while os.read(terminal, 4096):
-            pass
 
 
 def test_live_logs_and_pipes_are_left_alone(tmp_path):
