@@ -112,9 +112,11 @@ def pool_processes(of: int) -> list[int]:
     return processes(of, b"tdhil.process_pool")
 
 
-def cluster_processes(workers_too: bool) -> list[int]:
-    """The process that each worker of Dask keeps; and the workers."""
-    workers = processes(os.getpid(), b"spawn_main")
+def cluster_processes(cluster: Any, workers_too: bool) -> list[int]:
+    """The process that each worker of Dask keeps; and the workers, but for those that are still beginning: one that is
+    killed then is given up by its nanny.
+    """
+    workers = [nanny.pid for nanny in cluster.workers.values() if nanny.status.name == "running" and nanny.pid]
     return (workers if workers_too else []) + [pid for worker in workers for pid in pool_processes(worker)]
 
 
@@ -126,7 +128,7 @@ def by_road(road: str, request: FleetRequest, kills: int, function: Any, workers
 
         dask.config.set({"distributed.scheduler.allowed-failures": 10})
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40) as cluster:
-            killer = Killer(kills, lambda: cluster_processes(workers_too))
+            killer = Killer(kills, lambda: cluster_processes(cluster, workers_too))
             there = replace(request, scheduler=cluster.scheduler_address)
             summary = run_fleet(there, killer, function=function)
     else:

@@ -104,7 +104,7 @@ def test_a_cluster_s_processes_killed_at_random(tmp_path, calls):
     with dask.config.set({"distributed.scheduler.allowed-failures": 10}), distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
     ) as cluster:
-        killer = Killer(6, lambda: cluster_processes(workers_too=True))
+        killer = Killer(6, lambda: cluster_processes(cluster, workers_too=True))
         request = FleetRequest(roots, tmp_path / "fleet.csv", scheduler=cluster.scheduler_address)
         summary = run_fleet(request, killer, function=poison.quick)
     assert killer.kills == 6
@@ -330,6 +330,8 @@ def test_a_cluster_gives_the_same_table(tmp_path, calls, monkeypatch):
         request = FleetRequest(roots, tmp_path / "there.csv", scheduler=cluster.scheduler_address)
         there = run_fleet(request, function=poison.quick)
         assert [repr(row) for row in there.rows] == [repr(row) for row in here.rows]
+        stopped = run_fleet(replace(request, again=True), function=poison.quick, stop=lambda: True)
+        assert (stopped.interrupted, stopped.left) == (True, 7)
         monkeypatch.setattr(cluster_module, "versions", their_versions)
         with pytest.raises(UsageError, match=r"has numpy 1.0 \(here 2"):
             run_fleet(replace(request, again=True), function=poison.quick)
