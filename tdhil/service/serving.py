@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
 NEEDED = ("starlette", "uvicorn", "websockets", "prometheus_client", "jinja2")
 HOST, PORT = "127.0.0.1", 8420
+ON_ITS_WAY = 64 * 1024
+"""Bytes for one connection that the system takes beyond what it can send now. With more, a viewer on a slow line would
+be asked, behind all of that, whether it is still there, and be cut off before it comes to it."""
+SILENT_S = 60.0
+"""Who has not answered for so long has gone."""
 Say = Callable[[str], None]
 
 
@@ -188,7 +193,7 @@ def _uvicorn(
 
     config = uvicorn.Config(
         app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_ping_interval=10.0,
-        ws_ping_timeout=10.0, timeout_graceful_shutdown=2, lifespan="on", server_header=False, date_header=True,
+        ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on", server_header=False, date_header=True,
         h11_max_incomplete_event_size=32 * 1024, proxy_headers=False,      # who asks is who is connected
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
@@ -234,6 +239,8 @@ def _listen(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if hasattr(socket, "TCP_NOTSENT_LOWAT"):       # who reads slowly has little on its way: see ON_ITS_WAY
+        found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, ON_ITS_WAY)
     try:
         found.bind((host, port))
     except (OSError, OverflowError) as error:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import struct
 import threading
+import time
 from base64 import b64decode
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +24,15 @@ from websockets.sync.client import connect
 from tdhil.recording import RunWriter, Stage
 from tdhil.recording.log_format import Event
 from tdhil.service import foxglove
+from tdhil.service import web as web_module
 from tdhil.service.answers import API
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
+from tdhil.service.serving import _listen
 from tdhil.service.web import Web
 from tests.recording.test_log_tail import COMMAND, sample, write
-from tests.service.conftest import HANGS_S, URL, wait_for
+from tests.service.conftest import HANGS_S, URL, Service, wait_for
 
-SOCKET = URL.replace("http", "ws")
+SOCKETS = URL.replace("http", "ws")
 Message = tuple[str, int, bytes]           # topic, log time in ns, payload
 
 
@@ -83,44 +88,90 @@ class Viewer:
         return [one["message"] for one in self.told if one["op"] == "status"]
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
-    """Over a real socket, by `websockets`: every message of a growing log, byte for byte, under the log's schemas."""
-    config = uvicorn.Config(service.web.asgi, port=0, log_level="error", ws="websockets-sansio", ws_max_size=4096)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, daemon=True)
+@contextmanager
+def listening(web: Web) -> Iterator[int]:
+    """The web on a socket as `tdhil serve` opens it: its port."""
+    config = uvicorn.Config(web.asgi, log_level="error", ws="websockets-sansio", ws_max_size=4096)
+    server, opened = uvicorn.Server(config), _listen("127.0.0.1", 0)
+    thread = threading.Thread(target=server.run, args=([opened],), daemon=True)
     thread.start()
-    wait_for("the server", lambda: server.started)
-    port = server.servers[0].sockets[0].getsockname()[1]
     try:
-        with connect(f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol]) as socket:
-            assert socket.subprotocol == protocol
-            viewer = Viewer(socket.send)
-            while not viewer.statuses():
-                viewer.take(socket.recv(HANGS_S))
-            assert viewer.told[0]["name"] == "tdhil, rig a"
-            assert viewer.told[0]["capabilities"] == []
-            viewer.subscribe()
-            run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
-            service.wait(run, "moving")
-            path = service.store.place(run) / "run.mcap"
-            path.unlink(missing_ok=True)
-            write(path)
-            wanted = logged(path)
-            while len(viewer.messages) < len(wanted):
-                viewer.take(socket.recv(HANGS_S))
-            said = [one for one in viewer.told if one["op"] == "serverInfo"]
-            assert said[-1]["sessionId"] == run
-            assert said[-1]["name"] == "tdhil, rig a SIMULATED"
-            assert said[-1]["metadata"]["simulated"] == "true"
+        wait_for("the server", lambda: server.started)
+        yield opened.getsockname()[1]
     finally:
         server.should_exit = True
         thread.join(10.0)
+
+
+def moving(service: Service, samples: int = 200) -> tuple[str, Path]:
+    """A run whose log is there, and it."""
+    run = service.supervisor.start_run("a", {"note": "hold"}, "test").request.id
+    service.wait(run, "moving")
+    path = service.store.place(run) / "run.mcap"
+    write(path.with_name("whole.mcap"), samples)
+    path.with_name("whole.mcap").replace(path)
+    return run, path
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
+    """Over a real socket, by `websockets`: every message of a growing log, byte for byte, under the log's schemas."""
+    with listening(service.web) as port, connect(f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol]) as peer:
+        assert peer.subprotocol == protocol
+        viewer = Viewer(peer.send)
+        while not viewer.statuses():
+            viewer.take(peer.recv(HANGS_S))
+        assert viewer.told[0]["name"] == "tdhil, rig a"
+        assert viewer.told[0]["capabilities"] == []
+        viewer.subscribe()
+        run, path = moving(service)
+        wanted = logged(path)
+        while len(viewer.messages) < len(wanted):
+            viewer.take(peer.recv(HANGS_S))
+        said = [one for one in viewer.told if one["op"] == "serverInfo"]
+        assert said[-1]["sessionId"] == run
+        assert said[-1]["name"] == "tdhil, rig a SIMULATED"
+        assert said[-1]["metadata"]["simulated"] == "true"
     assert by_topic(viewer.messages) == by_topic(wanted)
     assert len(wanted) > 400
     assert {one["topic"]: (one["schemaName"], b64decode(one["schema"])) for one in viewer.channels.values()} == (
         declared(path))
     assert {(one["encoding"], one["schemaEncoding"]) for one in viewer.channels.values()} == {("protobuf", "protobuf")}
+
+
+def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
+    """So that what is asked of him, is he still there, doesn't wait behind what he hasn't read: he isn't cut off."""
+    sent: list[int] = []
+
+    def counted(*words: Any) -> Relay:
+        relay = Relay(*words)
+        send = relay.send_bytes
+
+        async def count(data: bytes) -> None:
+            await send(data)
+            sent.append(len(data))
+
+        relay.send_bytes = count
+        return relay
+
+    monkeypatch.setattr(web_module, "Relay", counted)
+    _, path = moving(service, 6_000)
+    total = sum(len(payload) for *_, payload in logged(path))
+    with listening(service.web) as port, socket.create_connection(("127.0.0.1", port)) as raw:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        raw.sendall(f"GET /foxglove/a HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+                    f"Sec-WebSocket-Key: {'A' * 22}==\r\nSec-WebSocket-Version: 13\r\n"
+                    f"Sec-WebSocket-Protocol: {PROTOCOLS[0]}\r\n\r\n".encode())
+        raw.recv(1)                                        # it has said yes
+        wanted = json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1},
+                                                                  {"id": 2, "channelId": 2}]}).encode()
+        raw.sendall(b"\x81" + bytes([0x80 | len(wanted)]) + bytes(4) + wanted)          # masked by zeros
+        wait_for("something", lambda: sent, 20.0)
+        before = -1
+        while len(sent) > before:
+            before = len(sent)
+            time.sleep(0.3)
+        assert 1000 < sum(sent) < 350_000 < total
 
 
 # -- one relay, without a socket -------------------------------------------------------------------------------------
@@ -282,10 +333,10 @@ def test_a_rig_that_is_none_and_a_protocol_that_is_none_are_refused(service):
         for path, protocols, code in (("/foxglove/none", PROTOCOLS[:1], 4404), ("/foxglove/a", ["foxglove.v9"], 1002),
                                       (f"{API}/foxglove/a", [], 1002)):
             with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect(
-                    f"{SOCKET}{path}", subprotocols=protocols):
+                    f"{SOCKETS}{path}", subprotocols=protocols):
                 pass
             assert refused.value.code == code
-        with client.websocket_connect(f"{SOCKET}{API}/foxglove/a", subprotocols=list(PROTOCOLS)[::-1]) as socket:
+        with client.websocket_connect(f"{SOCKETS}{API}/foxglove/a", subprotocols=list(PROTOCOLS)[::-1]) as socket:
             assert socket.receive_json()["op"] == "serverInfo"
             assert "tdhil_foxglove_viewers 1.0" in client.get("/metrics").text
 
@@ -297,11 +348,11 @@ def test_a_viewer_in_a_browser_reads_where_its_origin_is_named_and_does_nothing_
                             (web.asgi, "/live/20260101-000000-aaaaaa", False)):
         client = TestClient(asgi, base_url=URL, headers=origin)
         if may:
-            with client.websocket_connect(f"{SOCKET}{path}", subprotocols=list(PROTOCOLS)) as socket:
+            with client.websocket_connect(f"{SOCKETS}{path}", subprotocols=list(PROTOCOLS)) as socket:
                 assert socket.receive_json()["op"] == "serverInfo"
         else:
             with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect(
-                    f"{SOCKET}{path}", subprotocols=list(PROTOCOLS)):
+                    f"{SOCKETS}{path}", subprotocols=list(PROTOCOLS)):
                 pass
             assert refused.value.code == 4403
     assert TestClient(web.asgi, base_url=URL, headers=origin).post(f"{API}/rigs/a/runs", json={}).status_code == 403
