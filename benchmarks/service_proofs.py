@@ -292,6 +292,7 @@ def cycles(folder: Path, turns: int, seconds: float) -> bool:
                 time.sleep(seconds)
                 spans.append((True, begun, time.time()))
                 shares.append((cpu_s(server.process.pid) - used_s) / seconds)
+                print(f"the web takes {100 * shares[-1]:.1f} % of a core with {VIEWERS} viewers", flush=True)
             server.process.kill()
             server.process.wait()
             server.log.close()
@@ -319,7 +320,7 @@ def cycles(folder: Path, turns: int, seconds: float) -> bool:
         print(f"{'with' if there else 'without'} server and viewers: {bad} of {of} cycles missed", flush=True)
     with_them, without = (found[there][1] / found[there][0] for there in (True, False))
     print(f"missed with {100 * with_them:.3f} %, without {100 * without:.3f} %; the web takes"
-          f" {100 * np.mean(shares):.1f} % of a core with {VIEWERS} viewers;"
+          f" {100 * np.mean(shares):.1f} % of a core;"
           f" {log.configuration.get('real_time_priority')}; {load()}")
     return with_them - without <= MORE_MISSED and float(np.mean(shares)) <= WEB_SHARE
 

@@ -171,15 +171,22 @@ def serve(
 
 
 def check_idle(data: Path, say: Say) -> int:
-    """May the program be replaced now? Exit code 4, and who is in the way, where a run of this folder lives, or
-    whatever tdhil of this computer holds a drive. Asks files and locks; neither the web nor a drive.
+    """May the program be replaced now? Exit code 4, and who is in the way, where a run of this folder lives, where a
+    shaft was not seen at rest and nobody has signed it off, or whatever tdhil of this computer holds a drive. Asks
+    files and locks; neither the web nor a drive.
     """
+    from tdhil.service.states import State
     from tdhil.service.store import Store
     from tdhil.service.wire import lives
     from tdhil.session import holders
 
     store = Store(data.resolve())
-    busy = [f"run {run} has not ended" for run in store.ids() if lives(store.place(run))]
+    busy = []
+    for run in store.ids():
+        if lives(store.place(run)):
+            busy.append(f"run {run} has not ended")
+        elif store.status(run).state is State.STOP_NOT_CONFIRMED and store.signed_off(run) is None:
+            busy.append(f"run {run} was not seen at rest, and nobody has signed that it is")
     busy += [f"a drive is held by {one}" for one in holders()]
     for one in busy:
         say(f"not idle: {one}")

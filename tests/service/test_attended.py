@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import pytest
 
-from tdhil.service.states import Conflict
+from drivers import Identity, PreflightRefused
+from tdhil.service.asking import read_rig, run_request
+from tdhil.service.run_process import RunProcess
+from tdhil.service.states import Conflict, now
+from tdhil.service.store import Request, Store
 from tests.path.path_runs import REAL, Peer, peer
 from tests.path.test_real_peer import RIG, enabled
 from tests.service.conftest import Service, wait_for
@@ -18,6 +23,33 @@ def rig_of(drive: Peer) -> str:
         f"bus: {{interface: socketcand, channel: {drive.options[3]}, options: {{host: {options['host']},"
         f" port: {options['port']}, tcp_tune: true}}}}\n{RIG}service: {{motion: attended}}\n"
     )
+
+
+@pytest.mark.parametrize("changed", ["profile.yaml", "rig.yaml"])
+def test_a_code_is_void_once_the_rig_s_file_or_its_profile_is_another(tmp_path, changed):
+    from profiles.library import profile_path
+
+    for name, text in (
+        ("profile.yaml", profile_path("generic/modbus").read_text()),
+        ("rig.yaml", f"drive: modbus\nprofile: profile.yaml\nmodbus: {{host: 127.0.0.1, port: 1}}\n{RIG}"),
+    ):
+        (tmp_path / name).write_text(text)
+    store = Store(tmp_path / "data")
+    store.prepare()
+    rig, run = read_rig(tmp_path / "rig.yaml"), store.new_id()
+    store.begin(Request(run, "rig", str(rig.path), rig.sha256, {}, "local", now(), False, "attended"))
+    process = RunProcess(store.place(run))
+    process._asked = run_request(rig, {})
+    found = SimpleNamespace(checks=(), identity=Identity(1, 2, 3, 4, "a drive", False))
+    first, second = process._bind(found), process._bind(found)
+    first.take(first.code, first.binding, "local")
+    path = tmp_path / changed
+    for old, new in (("torque_nm: 400.0", "torque_nm: 300.0"), ("per_lsb: 0.1", "per_lsb: 0.2")):
+        path.write_text(path.read_text().replace(old, new))
+    for _ in range(2):
+        with pytest.raises(PreflightRefused, match="was changed"):
+            second.take(second.code, second.binding, "local")
+    process.board.close()
 
 
 @pytest.mark.heavy

@@ -17,6 +17,7 @@ import pytest
 from tdhil.cli.main import build_parser, main
 from tdhil.errors import ExitCode
 from tdhil.service import supervisor
+from tdhil.service.wire import lives
 from tdhil.session import hold, holder_of, holders
 from tdhil.session.holder import FOLDERS
 from tdhil.session.real_time import PRIORITY
@@ -52,6 +53,16 @@ def test_a_run_that_lives_is_in_the_way_of_an_upgrade_with_or_without_its_web(se
     assert idle(service.store.folder) == ExitCode.REFUSED
     service.supervisor.stop(run, "test")
     wait_for("the end", lambda: idle(service.store.folder) == ExitCode.OK)
+
+
+def test_so_is_a_shaft_that_nobody_saw_at_rest_until_somebody_signs(service, capsys):
+    run = service.supervisor.start_run("a", {"note": "unseen"}, "test").request.id
+    service.wait(run, "stop_not_confirmed")
+    wait_for("its end", lambda: not lives(service.store.place(run)))
+    assert idle(service.store.folder) == ExitCode.REFUSED
+    assert "was not seen at rest" in capsys.readouterr().err
+    service.supervisor.sign_off(run, "test", "it stands")
+    assert idle(service.store.folder) == ExitCode.OK
 
 
 def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys):
