@@ -40,8 +40,9 @@ class Console:
             if code and self._shown.get(run) != code:
                 self._shown[run] = code
                 text = status.confirmation.text if status.confirmation is not None else ""
-                self._say(f"{text}\nTo let it move, type this code into the page within {found['left_s']:.0f} s"
-                          f" (run {run}):   {code[:3]} {code[3:]}\n")
+                by = visible(self._store.request(run).asked_by)
+                self._say(f"{text}\nAsked for by {by}, run {run}. To let it move, type this code into the page within"
+                          f" {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
 
     def forget(self, run: str) -> bool:
         """Was its code shown?"""

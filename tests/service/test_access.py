@@ -143,6 +143,26 @@ def test_every_route_for_everybody(guarded, monkeypatch):
     assert guarded.document["components"]["securitySchemes"].keys() == {"token", "session"}
 
 
+def test_who_may_what_is_as_it_was_agreed(guarded):
+    """Written down here once more, since the document comes from the table that it is to judge: everybody who is known
+    sees and stops; what else somebody may, stands here."""
+    least = {
+        "operator": {"start", "confirm", "renew", "ask_replay", "ask_fleet", "stop_fleet"},
+        "engineer": {"edit_rig", "sign_off"},
+        "admin": {"audit", "accounts", "add_user", "set_password", "remove_user", "add_token", "remove_token"},
+        "anybody": {"login", "logout", "me", "health", "openapi"},
+    }
+    changes_nothing = {"plan", "password", *STOPS}         # of somebody else's
+    found: dict[str, str] = {}
+    for methods in guarded.document["paths"].values():
+        for method, described in methods.items():
+            found[described["operationId"]] = described["x-role"]
+            if method != "get" and described["operationId"] not in set().union(*least.values()):
+                assert described["operationId"] in changes_nothing
+    assert found == {name: next((role for role, names in least.items() if name in names), "viewer") for name in found}
+    assert set().union(*least.values(), changes_nothing) <= found.keys()
+
+
 def test_a_machine_has_the_role_of_its_token_and_nobody_else_one(guarded):
     for rank, role in enumerate(ROLES):
         assert guarded("GET", "/me", guarded.of_token(role)).json()["roles"] == list(ROLES[: rank + 1])
@@ -392,12 +412,29 @@ def test_two_who_ask_at_once_are_one_run(guarded):
 
 def test_who_confirms_is_told_from_who_asked(guarded):
     run = guarded.run("ask", "real", "operator")
+    wait_for("the code", lambda: any(f"Asked for by operator, run {run}" in one for one in guarded.service.said))
     code = {"json": {"code": "123456"}}
     assert guarded("POST", f"/runs/{run}/confirm", guarded.sessions["viewer"], **code).status_code == 403
     assert guarded("POST", f"/runs/{run}/confirm", guarded.of_token("engineer"), **code).status_code == 200
     guarded.service.wait(run, "done")
     wanted = {("operator", "asked", run), ("engineer-machine (token)", "confirmed", run)}
     wait_for("the audit", lambda: wanted <= set(guarded.audit()))
+
+
+def test_two_who_confirm_at_once_are_one_who_did(guarded):
+    run, answers = guarded.run("ask", "real"), []
+    confirming = [threading.Thread(target=lambda who=who: answers.append((who, guarded(
+        "POST", f"/runs/{run}/confirm", guarded.sessions[who], json={"code": "123456"}).status_code)))
+        for who in ("operator", "engineer", "admin")]
+    for one in confirming:
+        one.start()
+    for one in confirming:
+        one.join()
+    assert sorted(code for _, code in answers) == [200, 409, 409]
+    (by,) = [who for who, code in answers if code == 200]
+    guarded.service.wait(run, "done")
+    wait_for("the audit", lambda: len([one for one in guarded.audit() if "confirm" in one[1]]) == 3)
+    assert [who for who, what, _ in guarded.audit() if what == "confirmed"] == [by]
 
 
 @pytest.mark.parametrize("option", [
