@@ -4,6 +4,7 @@ How to get it and run these: tests/peers/conftest.py.
 """
 
 import json
+import re
 import subprocess
 from base64 import b64decode
 
@@ -13,6 +14,9 @@ from tests.path.path_runs import HANGS_S, process
 from tests.service.conftest import wait_for
 from tests.service.test_foxglove import by_topic, declared, logged
 from tests.service.test_serve import QUICK, served
+
+EACH_CYCLE = ("/sample", "/command", "/can")
+"""What a viewer loses that stays behind."""
 
 
 @pytest.mark.parametrize("protocol", ["foxglove.websocket.v1", "foxglove.sdk.v1"])
@@ -39,8 +43,12 @@ def test_the_protocol_s_own_client_gets_what_the_log_holds(foxglove_program, tmp
     assert [one["info"]["name"] for one in told if "info" in one][1].endswith("SIMULATED")
     got = [(topic, int(time_ns), bytes.fromhex(data)) for topic, time_ns, data in (
         one["message"] for one in told if "message" in one)]
-    wanted = logged(path)
-    print(f"{protocol}: {len(got)} messages, {sum(len(payload) for *_, payload in got)} bytes")
-    assert by_topic(got) == by_topic(wanted)
-    assert len(got) == len(wanted) > 10_000
-    assert not [one for one in told if "status" in one and one["status"][0] > 0]
+    wanted, statuses = logged(path), [one["status"] for one in told if "status" in one]
+    print(f"{protocol}: {len(got)} of {len(wanted)} messages, {sum(len(payload) for *_, payload in got)} bytes")
+    left_out = sum(int(re.search(r"too slow: (\d+) messages", text).group(1)) for level, text in statuses if level > 0)
+    assert len(got) + left_out == len(wanted) > 10_000
+    assert list(by_topic(got)) == list(by_topic(wanted))
+    for topic, messages in by_topic(got).items():
+        left = iter(by_topic(wanted)[topic])       # in their order; on a busy computer, but for what it was told of
+        assert all(one in left for one in messages), topic
+        assert len(messages) == len(by_topic(wanted)[topic]) or (left_out and topic in EACH_CYCLE)
