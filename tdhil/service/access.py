@@ -164,9 +164,8 @@ class Access:
 
     def refresh(self, *, first: bool = False) -> None:
         """Read the accounts if they were changed; where they can't be read, those of before hold."""
-        before = self.accounts.known
         try:
-            found = self.accounts.read()
+            before, found = self.accounts.changed()
         except TdhilError as error:
             if str(error) != self._trouble:
                 self._trouble = str(error)

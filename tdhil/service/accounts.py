@@ -126,7 +126,7 @@ class AccountsFile:
         self.path = folder / FILE
         self._stamp: tuple[int, ...] | None = None
         self._known = Accounts()
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     @property
     def known(self) -> Accounts:
@@ -149,6 +149,11 @@ class AccountsFile:
                 raise UsageError(f"the accounts can't be read ({str(error)[:100]})", where=str(self.path),
                                  next_step="Bring back a copy, or delete it and add the users again") from error
             return self._known
+
+    def changed(self) -> tuple[Accounts, Accounts]:
+        """What was known, and what is now: different where another process changed it. Raises UsageError."""
+        with self._lock:
+            return self._known, self.read()
 
     def add_user(self, name: str, role: Role, password: str) -> User:
         """Raises UsageError."""
@@ -213,18 +218,19 @@ class AccountsFile:
             os.close(descriptor)
 
     def _write(self, accounts: Accounts) -> None:
-        try:
-            write_json(self.path, {
-                "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
-                "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
-            }, mode=0o600)
-            if os.geteuid() == 0:              # by root for a service that isn't: it has to read them
-                owner = self.path.parent.stat()
-                for path in (self.path, self.path.with_suffix(".lock")):
-                    os.chown(path, owner.st_uid, owner.st_gid)
-        except OSError as error:
-            raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path)) from error
-        self.read()
+        with self._lock:                   # nobody takes this for another process's change
+            try:
+                write_json(self.path, {
+                    "users": {name: _plain(one) for name, one in sorted(accounts.users.items())},
+                    "tokens": {name: _plain(one) for name, one in sorted(accounts.tokens.items())},
+                }, mode=0o600)
+                if os.geteuid() == 0:      # by root for a service that isn't: it has to read them
+                    owner = self.path.parent.stat()
+                    for path in (self.path, self.path.with_suffix(".lock")):
+                        os.chown(path, owner.st_uid, owner.st_gid)
+            except OSError as error:
+                raise LogError(f"can't be written ({error.strerror or error})", where=str(self.path)) from error
+            self.read()
 
 
 def _plain(one: User | Token) -> dict[str, Any]:

@@ -772,11 +772,13 @@ class Web:
                 await socket.accept()          # only so does a page hear why
                 await allowed(socket)
                 return
-            async with anyio.create_task_group() as both:
-                both.start_soon(look, socket, both.cancel_scope)
-                with suppress(WebSocketDisconnect):
+            try:
+                async with anyio.create_task_group() as both:
+                    both.start_soon(look, socket, both.cancel_scope)
                     await serve(socket)
-                both.cancel_scope.cancel()
+                    both.cancel_scope.cancel()
+            except* (WebSocketDisconnect, RuntimeError):
+                pass                       # it has gone in mid-word
 
         return guarded
 

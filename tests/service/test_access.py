@@ -580,6 +580,24 @@ def test_an_admin_adds_and_removes_over_http(guarded):
     assert guarded.service.audit.verify() is None
 
 
+def test_what_the_service_changes_itself_is_nobody_else_s_change(guarded, monkeypatch):
+    """Its own thread looks in the middle of it: whose change it was is told once, and rightly."""
+    written = accounts_module.write_json
+
+    def looked_at(*given: Any, **more: Any) -> None:
+        written(*given, **more)
+        looking = threading.Thread(target=guarded.access.refresh)
+        looking.start()
+        looking.join(0.05)
+
+    monkeypatch.setattr(accounts_module, "write_json", looked_at)
+    guarded("POST", "/tokens", guarded.sessions["admin"], json={"name": "meter", "role": "viewer"})
+    monkeypatch.undo()
+    guarded.access.refresh()
+    wait_for("the audit", lambda: ("admin", "token added", None) in guarded.audit())
+    assert [who for who, what, _ in guarded.audit() if what == "token added"] == ["admin"]
+
+
 def test_what_is_kept_tells_nothing(tmp_path):
     accounts = AccountsFile(tmp_path)
     accounts.add_user("anna", "operator", PASSWORD)
