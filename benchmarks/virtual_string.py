@@ -49,7 +49,7 @@ MODES_HZ = (0.1299, 0.567, 1.079)
 CONTROLLERS = {       # law, set speeds from and to, least damping
     "a=0.25": (SpeedController(1186.0, 999.3), 45.0, 79.0, 0.226),
     "a=0.35": (SpeedController(847.1, 705.1), 38.0, 66.0, 0.140),
-    "stiff": (SpeedController(20286.0, 26454.0), 168.0, 212.0, 0.036),
+    "stiff": (SpeedController(20286.0, 26454.0), 168.0, 218.0, 0.036),
 }
 SETTLE_S = 20.0
 

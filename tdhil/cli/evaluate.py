@@ -18,6 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--controller", type=Path, required=True, metavar="tune.json",
                       help="what tdhil tune --json wrote for that string: the speed controller, run in this host")
     what.add_argument("--use", choices=CONTROLLERS, default="soft", help="which controller of it (soft)")
+    what.add_argument("--own-loop", action="store_true",
+                      help="the drive's own speed loop, with these gains typed in; the string's torque goes through "
+                      "its torque offset")
     what.add_argument("--result", type=Path, metavar="result.json",
                       help="of tdhil identify on the rig that turns, where that isn't the machine that was tuned for")
     add_peer_arguments(parser)
@@ -35,7 +38,8 @@ def run(namespace: argparse.Namespace) -> int:
         tuning = load_tuning(namespace.controller)
         rig = tuning["identified"] if namespace.result is None else read_result(namespace.result)
         case = evaluation_case(
-            load_string(namespace.virtual_string), tuning, namespace.use, rig, str(namespace.controller)
+            load_string(namespace.virtual_string), tuning, namespace.use, rig, str(namespace.controller),
+            own_loop=namespace.own_loop,
         )
         return run_with(namespace, case)
     return run_with(namespace)

@@ -30,7 +30,8 @@ def evaluation_document(
         "verdict": found.outcome.value,
         "reason": found.why,
         "controller": {
-            "kind": prediction.kind, "at_main_shaft": asdict(case.law), "inner_lags_s": list(case.meant.inner_lags_s),
+            "kind": prediction.kind, "own_loop": case.own_loop, "at_main_shaft": asdict(case.law),
+            "inner_lags_s": list(case.meant.inner_lags_s),
         },
         "critical_rpm": None if found.critical_rpm is None else asdict(found.critical_rpm),
         "predicted_critical_rpm": asdict(prediction.cure_rpm),
@@ -66,7 +67,8 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     """Measured beside predicted. 80 columns do."""
     simulated = f" · {SIMULATED}" if document["simulated"] else ""
     name = document["string"] or "a virtual string"
-    console.print(Words(f"{document['controller']['kind']} controller on {name}{simulated}", style="bold"))
+    where = "in the drive's own loop, " if document["controller"]["own_loop"] else ""
+    console.print(Words(f"{document['controller']['kind']} controller, {where}on {name}{simulated}", style="bold"))
     grid = Grid.grid(padding=(0, 2))
     grid.add_column(no_wrap=True, style="dim")
     grid.add_column(overflow="fold")

@@ -37,6 +37,7 @@ from tdhil.run.stages import (
     MeanSpeedControl,
     SpeedResult,
     TorqueResult,
+    go_to,
     measure_offsets,
     probe_sign,
     refuse_longer,
@@ -132,7 +133,7 @@ class Runner:
             limits, assumptions = task.limits, task.assumptions
             mode = choose_mode(task.request, limits, preflight)
             _, torque_offset = measure_offsets(loop, limits)
-            program = None if task.evaluation is None else self._program(task, task.evaluation, loop)
+            program = None if task.evaluation is None else self._program(task, task.evaluation, loop, preflight)
             self._log.learn(torque_offset_nm=torque_offset)
             self._confirm(task, preflight, lambda: self._idle(loop))
             self._stop = StopSequence(
@@ -176,7 +177,7 @@ class Runner:
             why = no_torque(task.request.mode, preflight)
             self._book.skip("torque", f"{why}: no switch, and no second look at the inertia by a drift")
         model = self._model(loop, speed, drifted)
-        if task.evaluation is not None and program is not None and drifted is not None:
+        if task.evaluation is not None and program is not None:
             self._run_virtual_string(task, task.evaluation, program, loop, speed, drifted, resolution)
             return
         planner = StagePlanner(loop, self._log, self._display, self._say)
@@ -199,13 +200,18 @@ class Runner:
                 preflight.speed_resolution_rad_s,
             )
 
-    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop) -> Program:
+    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> Program:
         """The virtual string's course, before anything moves. Raises what refuses it."""
         limits = task.limits
         if limits.load != "none":
             raise PreflightRefused(
                 f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
                 next_step="Evaluate before the string is below the drive",
+            )
+        if case.own_loop and preflight.torque_offset_resolution_nm <= 0.0:
+            raise PreflightRefused(
+                "the drive has no torque offset that its profile knows of, through which the string could reach it",
+                where="--own-loop", next_step="Leave --own-loop out: the host's controller in torque mode needs none",
             )
         refuse_untrue(case, loop.period_s)
         window = Window(
@@ -218,20 +224,23 @@ class Runner:
 
     def _run_virtual_string(
         self, task: Task, case: EvaluationCase, program: Program, loop: ControlLoop, speed: SpeedResult,
-        drifted: TorqueResult, resolution_rad_s: float,
+        drifted: TorqueResult | None, resolution_rad_s: float,
     ) -> None:
         """Stages 4 and 5 with a virtual string."""
         limits, assumptions = task.limits, task.assumptions
         refuse_other_rig(case, speed.model)
-        if loop.guard.no_braking:
+        if drifted is not None and loop.guard.no_braking:
             raise PreflightRefused(
                 f"a virtual string brakes the shaft: {loop.guard.no_braking}", where="braking probe",
                 next_step=loop.guard.to_brake,
             )
         start = program.start_rad_s * case.rig.gear_ratio
         with self._book.stage("hold", 15.0):
-            control = MeanSpeedControl(speed.model, 0.25 * limits.torque_nm, assumptions)
-            run_hold(loop, limits, speed.model, control, start, drifted.speed_rad_s, resolution_rad_s)
+            if drifted is None:
+                go_to(loop, limits, speed.model, start, resolution_rad_s)
+            else:
+                control = MeanSpeedControl(speed.model, 0.25 * limits.torque_nm, assumptions)
+                run_hold(loop, limits, speed.model, control, start, drifted.speed_rad_s, resolution_rad_s)
         with self._book.stage("acquire", program.longest_s):
             run_virtual_string(loop, limits, case, program, self._log.virtual, self._say)
 
@@ -251,7 +260,7 @@ class Runner:
             DriveLimits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
-                limits.temperature_c,
+                limits.temperature_c, torque_offset=task.evaluation is not None and task.evaluation.own_loop,
             )
         )
         self._display.preflight(preflight)

@@ -38,7 +38,8 @@ def load_tuning(path: Path) -> Mapping[str, Any]:
 
 
 def evaluation_case(
-    string: DrillString, tuning: Mapping[str, Any], use: str, rig: Mapping[str, Any], where: str
+    string: DrillString, tuning: Mapping[str, Any], use: str, rig: Mapping[str, Any], where: str, *,
+    own_loop: bool = False,
 ) -> EvaluationCase:
     """The machine that was tuned for, its controller of that kind, and the rig as a result document has it.
 
@@ -70,7 +71,8 @@ def evaluation_case(
                    max(0.0, lag["value"]), rig["gear_ratio"])
         prediction = Prediction(
             use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]))
-        return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s)
+        return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s,
+                              own_loop)
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise UsageError(f"is no tuning as tdhil tune writes it ({type(error).__name__}: {error})", where=where,
                          next_step=_TUNE_AGAIN) from None

@@ -214,7 +214,7 @@ class RunSession:
         )
         asked = excitation_request(request.options)
         if request.evaluation is not None:
-            asked = ExcitationRequest(mode="torque")
+            asked = ExcitationRequest(mode="speed" if request.evaluation.own_loop else "torque")
         return Task(limits, asked, facts(bench), evaluation=request.evaluation)
 
 

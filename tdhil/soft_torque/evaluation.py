@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import inf, pi, sqrt
 from typing import Any
@@ -27,13 +27,18 @@ LEAST_DRAG_NM_S_RAD_M = 0.001
 
 BELOW_RPM = (12.0, 10.0, 8.0, 6.0, 4.0)
 """Below the predicted critical speed, where the bit may be made to stick; the first that the shaft can bear."""
-ABOVE_RPM, ABOVE_SHARE = 20.0, 0.15
+ABOVE_RPM, ABOVE_SHARE = 20.0, 0.2
 """So far above it the ramp goes, at least the first of both."""
 ROOM_SHARE = 0.95
 """Of the torque limit, that may be needed."""
 TOLERANCE_RPM, TOLERANCE_DAMPING = 3.0, 0.03
 """Beyond the predicted intervals that still counts as predicted: as near as this has been seen to come to real strings
 on simulated drives."""
+
+
+OWN_LOOP_FADE_S, OWN_LOOP_ARMED_S = 15.0, 12.0
+SAME_INERTIA = 0.15
+"""By so much of it the rig's inertia may differ from the one that was tuned for, in the drive's own loop."""
 
 
 class EvaluationRefused(TdhilError):
@@ -73,6 +78,8 @@ class EvaluationCase:
     prediction: Prediction
     speed_lag_error_s: float = 0.0
     """Half of the lag's 95 % interval."""
+    own_loop: bool = False
+    """The drive's own speed loop with these gains, the string's torque through its torque offset."""
 
     @property
     def scale(self) -> float:
@@ -105,6 +112,11 @@ def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
         raise EvaluationRefused(
             f"at {rate_hz:.3g} cycles a second the loop would swing by its cycle, not by the string",
             where="--rate", next_step=f"This controller takes {needed:.3g} cycles a second or more")
+    if case.own_loop and abs(case.scale * case.rig.gear_ratio - 1.0) > SAME_INERTIA:
+        raise EvaluationRefused(
+            f"the drive's own loop turns {case.rig.inertia_kg_m2 * case.rig.gear_ratio**2:.4g} kg·m² at the main shaft,"
+            f" and the gains are for {case.meant.inertia_kg_m2:.4g}",
+            where="--own-loop", next_step="Tune for this rig, or leave --own-loop out, which scales")
     if case.rig.speed_lag_s > MOST_LAG_S or case.speed_lag_error_s > MOST_LAG_ERROR_S:
         raise EvaluationRefused(
             f"the reported speed lags by {case.rig.speed_lag_s:.3g} ± {case.speed_lag_error_s:.2g} s; up to "
@@ -147,7 +159,10 @@ def program_for(case: EvaluationCase, window: Window) -> Program:
             next_step="Raise it, if machine and drive allow, or take a softer controller (--use)")
     # Of the meant rotor, in its first second too, which a bit that breaks away kicks.
     moving_nm = case.meant.inertia_kg_m2 * float(np.abs(rate).max()) / ratio
-    return Program(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
+    program = Program(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
+    if case.own_loop:      # which has to make up for the string's torque by itself
+        program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
+    return program
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -244,7 +259,8 @@ def _verdict(
     if foreign > FOREIGN_SHARE:
         return Outcome.INVALID, (
             f"{unknown_nm:.0f} N·m rms of torque that nobody commanded, {100.0 * foreign:.0f} % of what moved the "
-            "shaft: inertia, friction or lags are not those of the result")
+            "shaft: " + ("the drive's gains are not these, or " if case.own_loop else "")
+            + "inertia, friction or lags are not those of the result")
     if not did_stick:
         return Outcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
     if critical is None:
@@ -325,4 +341,5 @@ def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
         Prediction(prediction["kind"], Interval(**prediction["cure_rpm"]), Interval(**prediction["least_damping"]),
                    tuple(prediction["string_modes_hz"])),
         plain["speed_lag_error_s"],
+        bool(plain.get("own_loop", False)),
     )

@@ -155,6 +155,8 @@ class _Lag:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+DRIFT_S = 10.0
+"""Over which an unknown torque is taken for one of the drive's own integral, in its own loop."""
 OBSERVER_SHARE = 2.0
 """The observer's poles lie at this share of 1/τ_w …"""
 SLOWEST_RAD_S, FASTEST_RAD_S = 3.0, 10.0
@@ -223,6 +225,10 @@ class Observer:
             self.innovation_rad_s = reported_rad_s - float(self._state[1])
             self._state = self._state + self._gain * self.innovation_rad_s
 
+    def less_unknown(self, torque_nm: float) -> None:
+        """So much of it is known from now on."""
+        self._state[2] -= torque_nm
+
     def ahead(self, torque_nm: float) -> float:
         """ω one cycle on, with the torque that is under way."""
         return float(self._carried(torque_nm)[0])
@@ -262,6 +268,8 @@ class Program:
     move_rad_s2: float = 2.0 * RPM
     settle_s: float = 4.0
     fade_s: float = 5.0
+    armed_s: float = 0.0
+    """Of the whole torque before the string is let go, for a loop that has to make up for it by itself."""
     hold_s: float = 20.0
     calm_s: float = 15.0
     """Without sticking for so long, the bit turns."""
@@ -278,7 +286,7 @@ class Program:
     def longest_s(self) -> float:
         """Of all of it, if every trial takes its time."""
         span = self.highest_rad_s - self.start_rad_s
-        around = 2.0 * self.fade_s + self.settle_s
+        around = 2.0 * self.fade_s + self.armed_s + self.settle_s
         once = self.hold_s + span / self.ramp_rad_s2 + self.steady_s + self.released_s + around
         return once + self.most_trials * (self.trial_s + around + 0.5 * span / self.move_rad_s2)
 
@@ -339,7 +347,7 @@ class Course:
 
     def _arm(self) -> None:
         self.share = min(1.0, self._phase_s / self._program.fade_s)
-        if self.share == 1.0:
+        if self._phase_s >= self._program.fade_s + self._program.armed_s:
             self.phase = Phase.HOLD if self._first else Phase.TRIAL
 
     def _hold(self) -> None:
@@ -410,19 +418,23 @@ torque that acts, ``put_in_j`` of energy by the loop's errors, ``clamped`` 1 whe
 
 
 class HostLoop:
-    """String, controller and observer at one cycle: report in, torque out; ``row`` is what the log keeps of it."""
+    """String, controller and observer at one cycle: report in, torque out; ``row`` is what the log keeps of it.
+
+    ``own_loop``: the controller is the drive's; what goes out is the string's torque alone, as a torque offset beside
+    `set_rad_s`, and the law is what the observer takes the drive's own torque for.
+    """
 
     def __init__(
         self, string: DrillString, meant: TopDrive, law: SpeedController, rig: Rig, program: Program,
-        period_s: float, torque_limit_nm: float,
+        period_s: float, torque_limit_nm: float, own_loop: bool = False,
     ) -> None:
-        self._meant, self._rig, self._period_s = meant, rig, period_s
-        self.scale = rig.inertia_kg_m2 * rig.gear_ratio / meant.inertia_kg_m2
+        self._meant, self._rig, self._period_s, self._own_loop = meant, rig, period_s, own_loop
+        self.scale = 1.0 / rig.gear_ratio if own_loop else rig.inertia_kg_m2 * rig.gear_ratio / meant.inertia_kg_m2
         """κ, from the meant machine's torque to the rig's."""
         self._limit_nm = torque_limit_nm
-        self._own = TopDrive(meant.inertia_kg_m2, rig.viscous_nm_s_rad * rig.gear_ratio / self.scale,
-                             rig.coulomb_nm / self.scale)
-        self._same = abs(self.scale * rig.gear_ratio - 1.0) < 1e-9
+        self._own = TopDrive(rig.inertia_kg_m2 * rig.gear_ratio / self.scale,
+                             rig.viscous_nm_s_rad * rig.gear_ratio / self.scale, rig.coulomb_nm / self.scale)
+        self._same = own_loop or abs(self.scale * rig.gear_ratio - 1.0) < 1e-9
         self._observer = Observer(self._own, rig.speed_lag_s, period_s)
         self._string = VirtualString(string)
         self._controller = HostController(law, meant.inner_lags_s, period_s)
@@ -430,7 +442,7 @@ class HostLoop:
         self._torque_nm = self._acted_nm = 0.0     # acts until the next one does, and the one before; main shaft
         self._share = 0.0
         self._put_in_j = self._net_nm = 0.0
-        self._clamped = False
+        self._clamped = self._cut = False
         self.row: tuple[float, ...] = ()
 
     @property
@@ -439,9 +451,9 @@ class HostLoop:
         return self._course.phase
 
     @property
-    def set_rpm(self) -> float:
-        """Of the main shaft."""
-        return self._course.set_rad_s / RPM
+    def set_rad_s(self) -> float:
+        """The set speed, of the main shaft."""
+        return self._course.set_rad_s
 
     @property
     def innovation_rad_s(self) -> float:
@@ -463,8 +475,9 @@ class HostLoop:
         """Did the torque limit cut the last torque?"""
         return self._clamped
 
-    def end(self) -> None:
-        """Fade the string out, and be done."""
+    def cut(self) -> None:
+        """A torque limit acts: fade the string out, and be done. Every row from now on says so."""
+        self._cut = True
         self._course.end()
 
     def begin(self, reported_rad_s: float, torque_nm: float) -> None:
@@ -500,17 +513,25 @@ class HostLoop:
             string.step(speed, period_s)
         string_nm = string.torque_nm
         share = course.share
-        # What comes in or goes is met by as much of the drive's: no controller under test has to make up for it.
-        self._controller.shift((share - self._share) * string_nm)
+        if self._own_loop:
+            # The drive's integral runs on counts of the set speed that ours doesn't see: they drift apart, slowly.
+            drifted_nm = self._observer.unknown_nm * period_s / DRIFT_S
+            self._controller.shift(drifted_nm)
+            self._observer.less_unknown(drifted_nm)
+        else:
+            # What comes in or goes is met by as much of the drive's: no controller under test has to make up for it.
+            self._controller.shift((share - self._share) * string_nm)
         self._share = share
         drive_nm = self._controller.step(course.set_rad_s, speed)
         moving_nm = self._meant.inertia_kg_m2 * course.slope_rad_s2
         self._put_in_j -= share * string_nm * self._observer.innovation_rad_s * period_s
-        self._net_nm = drive_nm + moving_nm - share * string_nm
-        wanted = self.scale * (self._net_nm + self._more_friction(speed))
+        by_drive_nm = drive_nm + (0.0 if self._own_loop else moving_nm)
+        self._net_nm = by_drive_nm - share * string_nm
+        others_nm = by_drive_nm if self._own_loop else 0.0      # of what acts, that isn't ours to command
+        wanted = self.scale * (self._net_nm - others_nm + self._more_friction(speed))
         torque = min(self._limit_nm, max(-self._limit_nm, wanted))
-        self._acted_nm, self._torque_nm = self._torque_nm, torque / self.scale
-        self._clamped = torque != wanted
+        self._acted_nm, self._torque_nm = self._torque_nm, torque / self.scale + others_nm
+        self._clamped = self._cut or torque != wanted
         self.row = (
             time_s, float(course.phase), course.set_rad_s, speed, self._observer.innovation_rad_s, string_nm, drive_nm,
             share, string.bit_rad_s, self._observer.unknown_nm, self._put_in_j, float(self._clamped),

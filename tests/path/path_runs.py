@@ -263,11 +263,11 @@ class Host:
 
 
 @contextlib.contextmanager
-def host(folder: Path, *arguments: object, **options: Any) -> Iterator[Host]:
-    """`python -m tdhil identify --json …`, its log in ``folder``."""
+def host(folder: Path, *arguments: object, command: str = "identify", **options: Any) -> Iterator[Host]:
+    """`python -m tdhil identify --json …`, or another command that runs a drive; its log in ``folder``."""
     log = folder / "run.mcap"
     with process(
-        sys.executable, "-m", "tdhil", "identify", "--json", "--log", log, *arguments,
+        sys.executable, "-m", "tdhil", command, "--json", "--log", log, *arguments,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=options.pop("stdin", subprocess.DEVNULL), **options,
     ) as child:
         running = Host(child, log)

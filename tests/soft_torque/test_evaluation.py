@@ -41,7 +41,8 @@ PROGRAM = Program(45.0 * RPM, 79.0 * RPM)
     (replace(CASE, speed_lag_error_s=0.06), 0.02, "lags by"),
     (replace(CASE, string=string_with(drag=0.0)), 0.02, "drag"),
     (replace(CASE, string=replace(STRING, bit=None)), 0.02, "no bit"),
-], ids=["10 Hz", "stiff at 20 Hz", "lag", "lag unknown", "no mud", "no bit"])
+    (replace(CASE, own_loop=True, rig=replace(CASE.rig, inertia_kg_m2=1200.0)), 0.02, "the gains are for 1500"),
+], ids=["10 Hz", "stiff at 20 Hz", "lag", "lag unknown", "no mud", "no bit", "other J in its own loop"])
 def test_what_can_not_be_true_is_refused(case, period_s, said):
     with pytest.raises(EvaluationRefused, match=said):
         refuse_untrue(case, period_s)
@@ -76,7 +77,7 @@ def test_a_window_without_room_is_refused(window, said):
 
 def test_a_case_comes_back_from_json():
     smooth = replace(CASE, string=string_with(friction="coulomb", static_nm=None, stribeck_speed_rad_s=None))
-    for case in (CASE, smooth):
+    for case in (CASE, smooth, replace(CASE, own_loop=True)):
         assert case_of(json.loads(json.dumps(case.plain(), allow_nan=False))) == case
 
 

@@ -239,3 +239,33 @@ def test_fading_in_and_out_leaves_the_shaft_alone():
     fading = rows[:, 1] == Phase.FADE_OUT
     assert fading.any() and rows[-1, 7] < 0.7
     assert np.abs(np.diff(speeds[fading])).max() < 0.05
+
+
+@pytest.mark.parametrize(("gains", "unknown_nm"), [(1.0, (0.0, 120.0)), (1.6, (300.0, 2000.0))])
+def test_in_the_drives_own_loop_the_string_goes_through_the_offset_and_other_gains_show(gains, unknown_nm):
+    """A drive under its own PI, with counts of the set speed that the host doesn't see."""
+    rig, period_s, fine = Rig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0), 0.02, 10
+    program = Program(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=8.0, armed_s=8.0, hold_s=15.0)
+    host = HostLoop(STRING, DRIVE, SOFT_025, rig, program, period_s, 1e6, own_loop=True)
+    speed = reported = program.start_rad_s * 8.0
+    integral = 7.5 + 0.125 * speed
+    host.begin(reported, integral)
+    own = SOFT_025.at_shaft(8.0)
+    offset, rows, speeds = 0.0, [], []
+    for tick in range(round(30.0 / period_s)):
+        acts, offset = offset, host.step(tick * period_s, reported)
+        rows.append(host.row)
+        set_rad_s = round(host.set_rad_s * 8.0 / 0.08) * 0.08
+        for _ in range(fine):
+            dt = period_s / fine
+            reported += (speed - reported) * (1.0 - np.exp(-dt / 0.4))
+            error = set_rad_s - speed
+            integral += own.integral_nm_rad * error * dt
+            torque = gains * own.gain_nm_s_rad * error + integral + acts
+            speed += (torque - 7.5 - 0.125 * speed) / rig.inertia_kg_m2 * dt
+        speeds.append(speed / 8.0)
+    rows = np.array(rows)
+    assert rows[-1, 1] == Phase.HOLD and np.ptp(speeds[-700:]) > 2.0
+    arming = rows[:, 1] == Phase.ARM
+    assert np.abs(np.array(speeds)[arming][-50:] - program.start_rad_s).max() < 0.1      # the loop has made up for it
+    assert unknown_nm[0] <= np.sqrt(np.mean(rows[-600:, 9] ** 2)) <= unknown_nm[1]

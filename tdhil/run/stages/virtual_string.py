@@ -1,4 +1,5 @@
-"""Stage 5 with a virtual string: the drive in torque mode, string, bit and speed controller in the host.
+"""Stage 5 with a virtual string: the drive in torque mode, string, bit and speed controller in the host; or the drive
+in its own speed loop, the string's torque through its torque offset.
 
 What may end it beside the guard, which holds speed, torque and time as ever: a shaft that does not do what its torque
 says, a loop that swings more than string and bit can, and energy that the loop's own errors put into the shaft. However
@@ -16,7 +17,8 @@ from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import MachineLimits
-from tdhil.soft_torque import EvaluationCase, HostLoop, Phase, Program
+from tdhil.run.stages.steady import wait_until_steady
+from tdhil.soft_torque import RPM, EvaluationCase, HostLoop, Phase, Program
 
 STRANGE_SHARE = 0.1
 """Of the speed limit, that the report may be away from what the observer expects."""
@@ -25,6 +27,9 @@ ENERGY_SHARE = 0.05
 """Of what the string holds as the bit breaks away, that may have been put in."""
 SAME_RIG = 0.5
 """By so much, or by what it is uncertain by, stage 2's rough inertia may differ from the result's."""
+TORQUE_SHARE, RAMP_S = 0.25, 5.0
+"""In the drive's own loop the first set speed is gone to with this share of the torque limit, or all of the window in
+so long."""
 RESERVE_S = 20.0
 BEFORE_S = 150.0
 """Stages 1 to 4, about: what is left of the time limit is looked at before anything moves."""
@@ -61,6 +66,19 @@ def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
         )
 
 
+def go_to(
+    loop: ControlLoop, limits: MachineLimits, model: RigGuess, speed_rad_s: float, speed_resolution_rad_s: float
+) -> None:
+    """Ramp to that speed in speed mode, and settle there. Raises what the bench raises, LimitHit if it doesn't."""
+    begun = max(0.0, loop.last.speed_rad_s) if loop.last is not None else 0.0
+    rate = min(TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2, limits.speed_max_rad_s / RAMP_S)
+    steps = loop.cycles(abs(speed_rad_s - begun) / rate)
+    for step in range(1, steps + 1):
+        loop.cycle(Command(Mode.SPEED, begun + (speed_rad_s - begun) * step / steps, 0.0))
+    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    wait_until_steady(loop, Command(Mode.SPEED, speed_rad_s, 0.0), speed_rad_s, tolerance, timeout_s=90.0)
+
+
 def run_virtual_string(
     loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program, keep: Keep,
     say: Callable[[str], None],
@@ -69,30 +87,34 @@ def run_virtual_string(
 
     Raises LimitHit, and what the bench raises.
     """
-    host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm)
+    host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm,
+                    case.own_loop)
     ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program)
     last = loop.last
     speed = last.speed_rad_s if last is not None else program.start_rad_s * ratio
     torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
     host.begin(speed, torque)
+    if case.own_loop:
+        torque, loop.guard.torque_offset_nm = 0.0, limits.torque_nm
     phase: Phase = host.phase
     clamped = False
     while host.phase is not Phase.DONE:
-        wanted = max(0.0, min(limits.speed_max_rad_s, program.start_rad_s * ratio))
-        sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
+        wanted = max(0.0, min(limits.speed_max_rad_s, host.set_rad_s * ratio))
+        command = Command(Mode.SPEED, wanted, 0.0, torque) if case.own_loop else Command(Mode.TORQUE, wanted, torque)
+        sample = loop.cycle(command)
         torque = host.step(sample.time_s, sample.speed_rad_s if sample.fresh else None)
         keep(host.row)
         watch.see(host, sample)
-        if host.clamped and not clamped:
+        if (host.clamped or (case.own_loop and sample.limit_active)) and not clamped:
             clamped = True
             loop.log.event(loop.now_s, "limits", "virtual string: the torque limit acts; it is faded out")
             say("the torque limit acts: the virtual string is faded out, and there will be no result")
-            host.end()
+            host.cut()
         if host.phase is not phase:
             phase = host.phase
             text = _TOLD.get(phase, "")
             if phase is Phase.TRIAL:
-                text = f"virtual string: does the bit end turning at {host.set_rpm:.1f} rpm?"
+                text = f"virtual string: does the bit end turning at {host.set_rad_s / RPM:.1f} rpm?"
             if text:
                 loop.log.event(loop.now_s, "string", text)
                 say(text)
