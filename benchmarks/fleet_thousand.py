@@ -29,11 +29,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
+from tdhil.errors import TdhilError  # noqa: E402
 from tdhil.fleet import FleetRequest, FleetRow, Settings, read_table, run_fleet  # noqa: E402
 from tdhil.process_pool import Pool, TaskLimits  # noqa: E402
 from tests.fleet import poison  # noqa: E402
 from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
 from tests.fleet.terminal import fleet_with_ctrl_c  # noqa: E402
+from tests.process_pool.poison import work  # noqa: E402
 from tests.recording.test_damage import bomb  # noqa: E402
 
 LIMITS = TaskLimits(60.0, 1_500_000_000)
@@ -130,7 +132,14 @@ def by_road(road: str, request: FleetRequest, kills: int, function: Any, workers
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=40) as cluster:
             killer = Killer(kills, lambda: cluster_processes(cluster, workers_too))
             there = replace(request, scheduler=cluster.scheduler_address)
-            summary = run_fleet(there, killer, function=function)
+            while True:
+                try:
+                    summary = run_fleet(there, killer, function=function)
+                    break
+                except TdhilError as error:                 # all workers are down at once: as a user would do
+                    print(f"dask : {error.what}: the same again", flush=True)
+                    there = replace(there, again=False)
+                    time.sleep(5.0)
     else:
         killer = Killer(kills if road == "pool" else 0, lambda: pool_processes(os.getpid()))
         summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=function)
@@ -219,7 +228,7 @@ def cost(asked: argparse.Namespace, folder: Path) -> None:
               f"{time.monotonic() - began:.1f} s in all; "
               f"{resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024:.0f} MB the largest process")
     began = time.monotonic()
-    with Pool(poison.work, 2, LIMITS) as pool:
+    with Pool(work, 2, LIMITS) as pool:
         list(pool.run([1, 2]))
     print(f"start of the pool: {time.monotonic() - began:.2f} s until two processes have answered")
 
