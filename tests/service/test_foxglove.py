@@ -155,7 +155,7 @@ def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
         return relay
 
     monkeypatch.setattr(web_module, "Relay", counted)
-    _, path = moving(service, 6_000)
+    _, path = moving(service, 5_000)
     total = sum(len(payload) for *_, payload in logged(path))
     with listening(service.web) as port, socket.create_connection(("127.0.0.1", port)) as raw:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
