@@ -168,6 +168,11 @@ class ModbusDrive:
             raise PreflightRefused("preflight before connect", where="driver")
         table, access, profile = Table(), self._access, self._profile
         table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
+        if limits.torque_offset:
+            table.row(
+                "torque offset", "there", f"profile {profile.name} names no register that adds a torque", False,
+                self._where, "The drive's own impedance can be measured from its reference (--impedance reference)",
+            )
         found, scales, rated_nm = checks.read_only_checks(
             table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm,
             limits.accept_no_watchdog,

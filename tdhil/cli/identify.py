@@ -67,6 +67,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
     motion.add_argument("--max-time", dest="max_time_s", type=amount(TIME), metavar="TIME",
                         help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
+    motion.add_argument("--impedance", choices=("offset", "reference"),
+                        help="measure the drive's own impedance, in its speed loop, by its torque offset or reference")
+    motion.add_argument("--string-impedance", dest="string_impedance_nm_s_rad", type=float, metavar="NMS",
+                        help="N·m·s/rad at the main shaft: of the pipe that the reflection is told for")
     motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
     result = parser.add_argument_group("result")
     result.add_argument("--tolerance", type=share, metavar="SHARE",

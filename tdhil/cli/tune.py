@@ -16,7 +16,7 @@ from tdhil.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.report import TunedFor
-    from tdhil.soft_torque import DriveSetting, TuneCase, Tuning
+    from tdhil.soft_torque import DriveSetting, SpeedController, TuneCase, Tuning
 
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
 """Of the result, that `tdhil evaluate` needs to know of the rig."""
@@ -30,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="what tdhil identify --json wrote, or the log of a run")
     parser.add_argument("--string", type=Path, required=True, metavar="string.yaml",
                         help="drill string, bottom and bit (docs/soft_torque.md)")
+    parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
+                        help="what identify --impedance measured: the drive's present gains beside the others, and its "
+                        "inner lags")
     parser.add_argument("--loop", choices=("drive", "bus"), default="drive",
                         help="where the speed loop runs: in the drive (default), or in a host over the bus")
     parser.add_argument("--inner-lags", type=amount(TIME), nargs="+", metavar="S",
@@ -129,6 +132,7 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     """All at the main shaft, and where the lags come from. Raises TuningRefused where the result has no J."""
     from tdhil.soft_torque import Interval, TopDrive, TuneCase, TuningRefused, load_string
 
+    measured = None if namespace.impedance is None else _impedance(namespace.impedance, result)
     inertia = result["inertia_kg_m2"]
     if not isinstance(inertia, dict) or not all(_is_number(inertia.get(key)) for key in
                                                 ("value", "low_total", "high_total")):
@@ -139,17 +143,52 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not 0.0 < low <= value <= high:
         raise TuningRefused("J's interval reaches down to nothing", where=str(namespace.result),
                             next_step="Identify again, for longer")
-    lags, lags_from = _lags(result, namespace)
+    lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
                      square**0.5 * _estimate(result, "coulomb_nm"), lags)
     case = TuneCase(load_string(namespace.string), drive, Interval(value, low, high), namespace.phase_margin,
-                    namespace.a, namespace.compensate)
+                    namespace.a, namespace.compensate, _present(measured, square))
     return case, lags_from
 
 
-def _lags(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[tuple[float, ...], str]:
+def _impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The section `impedance` of a result, valid and of the same shaft. Raises UsageError, and TuningRefused."""
+    from tdhil.soft_torque import TuningRefused
+
+    document = read_result(path)
+    found = document.get("impedance")
+    if not isinstance(found, dict):
+        raise UsageError("the drive's own impedance wasn't measured there", where=f"--impedance {path}",
+                         next_step="tdhil identify --impedance offset … --json > z.json")
+    if found.get("verdict") != "valid":
+        raise TuningRefused(f"the drive's own impedance is {found.get('verdict')}: {found.get('reason')}",
+                            where=f"--impedance {path}", next_step=str(found.get("advice", "")))
+    if document["gear_ratio"] != result["gear_ratio"]:
+        raise UsageError(f"was measured with a gear ratio of {document['gear_ratio']:g}, and J with "
+                         f"{result['gear_ratio']:g}", where=f"--impedance {path}")
+    for key in ("gain_nm_s_rad", "integral_nm_rad", "torque_lag_s", "speed_filter_s"):
+        if not isinstance(found.get(key), dict) or not _is_number(found[key].get("value")):
+            raise UsageError(f"{key} is no number", where=f"--impedance {path}")
+    return found
+
+
+def _present(measured: Mapping[str, Any] | None, square: float) -> SpeedController | None:
+    from tdhil.soft_torque import SpeedController
+
+    if measured is None:
+        return None
+    return SpeedController(square * float(measured["gain_nm_s_rad"]["value"]),
+                           square * float(measured["integral_nm_rad"]["value"]))
+
+
+def _lags(
+    result: Mapping[str, Any], namespace: argparse.Namespace, measured: Mapping[str, Any] | None
+) -> tuple[tuple[float, ...], str]:
     inner = tuple(lag for lag in namespace.inner_lags or ASSUMED_LAGS_S if lag > 0.0)
     said = "as stated" if namespace.inner_lags else "assumed: nobody measured them"
+    if measured is not None and not namespace.inner_lags:
+        inner = tuple(max(0.0, float(measured[key]["value"])) for key in ("speed_filter_s", "torque_lag_s"))
+        inner, said = tuple(lag for lag in inner if lag > 0.0), "as measured (--impedance)"
     if namespace.loop == "drive":
         if not inner:
             raise UsageError("no lag at all: no loop is like that", where="--inner-lags")
@@ -203,7 +242,7 @@ def _tuned_for(
         if any(one.compensated_share for one in tuning.tuned):
             warnings.append("inertia compensation needs the derivative of the measured speed in the drive; few drives "
                             "have it, and a feed-forward of the set speed's acceleration is not it")
-    if not namespace.inner_lags:
+    if not namespace.inner_lags and namespace.impedance is None:
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")
     if tuning.case.string.bit is None:

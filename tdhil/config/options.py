@@ -82,6 +82,8 @@ class RunOptions:
     periods: int | None = _option("--periods", "run.periods")
     tolerance: float = _option("--tolerance", "run.tolerance", 0.05)
     max_time_s: float | None = _option("--max-time", "run.max_time_s")
+    impedance: Literal["offset", "reference"] | None = _option("--impedance", "run.impedance")
+    string_impedance_nm_s_rad: float | None = _option("--string-impedance", "run.string_impedance_nm_s_rad")
     model: str = _option("--model", "run.model", "auto")
     confidence: float = _option("--confidence", "run.confidence", 0.95)
     seed: int | None = _option("--seed", "run.seed")

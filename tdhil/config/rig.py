@@ -197,6 +197,9 @@ class DriveData(DataModel):
     speed_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
     torque_lag_s: NotNegative | None = Field(default=None, description="s; time constant on the reported torque")
     torque_lag_sd_s: NotNegative | None = Field(default=None, description="s; its standard deviation")
+    reference_filter_s: NotNegative | None = Field(
+        default=None, description="s; time constant of the drive's smoothing of its speed reference"
+    )
     parameters: dict[str, float] = Field(
         default={}, description="drive parameters that can't be read over the bus, by the profile's names, in its units"
     )
@@ -248,6 +251,12 @@ class RunSection(DataModel):
     periods: int | None = Field(default=None, ge=1, le=10_000)
     tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
     max_time_s: Time | None = Field(default=None, description="s; longest stage 5")
+    impedance: Literal["offset", "reference"] | None = Field(
+        default=None, description="measure the drive's own impedance, by its torque offset or its speed reference"
+    )
+    string_impedance_nm_s_rad: NotNegative | None = Field(
+        default=None, description="N·m·s/rad at the main shaft; of the pipe that |r| is told for"
+    )
     model: Annotated[str, Registered(MODELS)] | None = Field(
         default=None, description="of the shaft; auto: the simplest that fits"
     )

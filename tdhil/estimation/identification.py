@@ -7,11 +7,12 @@ there are samples, and shown beside whatever comes out.
 
 from dataclasses import replace
 
-from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
 from tdhil.estimation.cross_checks import cross_checked
 from tdhil.estimation.data_checks import check_samples
 from tdhil.estimation.frequency_domain import clear_lines, identify_lines, measured
+from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
 from tdhil.estimation.result import Identification, Options, Refused
 from tdhil.estimation.samples import excited_window, usable_samples
@@ -38,7 +39,13 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         finding = Finding(refusal=refused.refusal)
     if case.sound:
         finding = cross_checked(finding, case)
-    return conclude(case, stretched(finding, case.recording))
+    found = conclude(case, stretched(finding, case.recording))
+    asked = case.recording.impedance
+    if asked is None:
+        return found
+    if isinstance(case, PeriodicCase):
+        return replace(found, impedance=measure_impedance(case))
+    return replace(found, impedance=refusal(asked, finding.refusal.reason, finding.refusal.advice))
 
 
 def _sampled(case: Case) -> Case:

@@ -162,6 +162,49 @@ class Compliant:
 
 
 @dataclass(frozen=True)
+class ImpedancePoint:
+    """The drive's impedance at one frequency, as its speed loop makes it: N·m·s/rad, real and imaginary part.
+
+    ``reflection``: |r| = |Z − ζ|/|Z + ζ| if the torque scale is exact; ``reflection_total`` with what is open of that.
+    None where no ζ is known. ``measured``: what an excited line shows by itself, with the model's lags taken off.
+    """
+
+    hertz: float
+    real_nm_s_rad: Estimate
+    imaginary_nm_s_rad: Estimate
+    reflection: Estimate | None
+    reflection_total: Estimate | None
+    measured_nm_s_rad: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class DriveImpedance:
+    """What a drive's speed loop is to whatever hangs on its shaft, Z = J s + B + H(s)(P + I/s), at the motor.
+
+    H = 1/((1 + τ_t s)(1 + τ_f s)) are the lags inside the loop: of its torque, and of the speed that it sees;
+    ``inner_lag_s`` is their sum, which is known better than either. P and I are as the drive has them, in the scale of
+    its own torque. Estimates are None where the verdict is a refusal.
+    """
+
+    verdict: Verdict
+    by: str                                    # offset, reference
+    reason: str
+    advice: str
+    string_nm_s_rad: float                     # ζ at the motor; 0: none was known
+    gain_nm_s_rad: Estimate | None = None      # P
+    integral_nm_rad: Estimate | None = None    # I
+    inner_lag_s: Estimate | None = None
+    torque_lag_s: Estimate | None = None
+    speed_filter_s: Estimate | None = None
+    inertia_kg_m2: Estimate | None = None      # as this measurement has it
+    viscous_nm_s_rad: Estimate | None = None
+    reference_filter_s: Estimate | None = None     # of a reference filter that nobody declared, where one shows
+    residual: ResidualTest | None = None
+    points: tuple[ImpedancePoint, ...] = ()    # rising frequency
+    conditions: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class LinePoint:
     """One excited line: what torque over acceleration is at that frequency, and what the model makes of it.
 
@@ -216,4 +259,5 @@ class Identification:
     second_opinions: tuple[SecondOpinion, ...] = ()
     friction_curve: tuple[FrictionPoint, ...] = ()      # rising speed; empty where fewer than three speeds were seen
     compliant: Compliant | None = None                  # with the models two-mass and string; ``inertia`` is J_r then
+    impedance: DriveImpedance | None = None             # of a run that measured the drive's own
     lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from tdhil.recording.mcap_container import MAGIC as MAGIC, schema_of as schema_of
     from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
-        BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, LagPrior as LagPrior,
-        Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment, Stage as Stage,
-        SteppedSetpoint as SteppedSetpoint, aborted_stage as aborted_stage, before_abort as before_abort,
+        BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
+        LagPrior as LagPrior, Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment,
+        Stage as Stage, SteppedSetpoint as SteppedSetpoint, aborted_stage as aborted_stage,
+        before_abort as before_abort,
     )
     from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy

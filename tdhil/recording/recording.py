@@ -29,6 +29,9 @@ class Segment:
     The reference was ``offset_rad_s + sum(a * cos(2π f (t - start_s) + φ))`` over the lines; every line is a
     whole multiple of ``1 / period_s``. ``end_s`` is where the last whole period ended (earlier if aborted);
     the first ``settle_periods`` periods are transient and not for identification.
+
+    With ``torque_amplitudes_nm`` it was a torque offset that had these lines and phases, about zero, while the speed
+    reference stood at ``offset_rad_s``; ``amplitudes_rad_s`` are then what the speed was expected to do.
     """
 
     start_s: float
@@ -39,6 +42,7 @@ class Segment:
     lines_hz: tuple[float, ...]
     amplitudes_rad_s: tuple[float, ...]
     phases_rad: tuple[float, ...]
+    torque_amplitudes_nm: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,21 @@ class SteppedSetpoint:
 
 
 @dataclass(frozen=True)
+class ImpedanceInput:
+    """What was commanded to measure the drive's own impedance with: a torque offset or the speed reference.
+
+    ``count`` is one count of it, N·m or rad/s: what was commanded is rounded to it (0: it isn't). A command stood from
+    one sample to the next. ``reference_filter_s``: a first-order smoothing of the speed reference that the drive is
+    known to have. ``string_nm_s_rad``: impedance ζ of the string that |r| is told for, at the motor; 0: none is known.
+    """
+
+    by: str                            # offset, reference
+    count: float = 0.0
+    reference_filter_s: float = 0.0
+    string_nm_s_rad: float = 0.0
+
+
+@dataclass(frozen=True)
 class Stage:
     """A stage of the protocol as it went. ``outcome``: ok, degraded, aborted."""
 
@@ -149,6 +168,7 @@ class Recording:
     gear_ratio: float = 1.0                # i = ω_motor / ω_main
     timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
+    impedance: ImpedanceInput | None = None             # where the drive's own impedance was measured
     pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did

@@ -100,6 +100,39 @@ def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         yield title, "left open by the data" if part is None else estimate_text(part, unit)
 
 
+def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
+    """What the drive's own speed loop is, where that was measured; |r| where a string was named."""
+    found = document.get("impedance")
+    if found is None:
+        return
+    title = "drive's impedance"
+    if found["verdict"] != "valid":
+        yield title, Text(f"{found['verdict']}: {found['reason']}", style="bold red")
+        if found["advice"]:
+            yield "", Text(found["advice"], style="italic")
+        return
+    yield title, Text.assemble((found["verdict"], "bold green"), f", by its {_BY[found['by']]}")
+    yield "its P", estimate_text(found["gain_nm_s_rad"], "N·m·s/rad")
+    yield "its I", estimate_text(found["integral_nm_rad"], "N·m/rad")
+    yield "lags in its loop", estimate_text(found["inner_lag_s"], "s")
+    seen = [point for point in found["points"] if point["reflection_total"] is not None]
+    if seen:
+        least = min(seen, key=lambda point: float(point["reflection_total"]["value"]))
+        told = dict.fromkeys([min(seen, key=lambda point: abs(float(point["hertz"]) - hertz))["hertz"]
+                              for hertz in (0.1, 0.2, 0.5)])
+        parts = [f"{point['hertz']:.2g} Hz: {_short(point['reflection_total'])}" for point in seen
+                 if point["hertz"] in told]
+        yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {_short(least['reflection_total'])}"
+        yield "", "   ".join(parts)
+
+
+_BY = {"offset": "torque offset", "reference": "speed reference"}
+
+
+def _short(part: Mapping[str, Any]) -> str:
+    return plus_minus(part["value"], 0.5 * (part["high"] - part["low"]))
+
+
 def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     """Every second opinion, and whether it agrees with the result."""
     for opinion in document["second_opinions"]:
@@ -189,7 +222,8 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
     ):
         if (part := document[key]) is not None:
             rows.add_row(title, estimate_text(part, unit))
-    for title, text in (*compliant_rows(document), *friction_rows(document), *opinion_rows(document)):
+    more = (*impedance_rows(document), *compliant_rows(document), *friction_rows(document), *opinion_rows(document))
+    for title, text in more:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
         rows.add_row("the paper's method", _paper_text(paper, inertia))

@@ -170,6 +170,8 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Sec
         picture = Picture(partial(draw_run, recording=recording), 2.9, "As reported, nothing smoothed. Green: steady "
                           "levels. Blue: the excitation, its settling lighter.")
         yield Section("Speed and torque", (picture,))
+    if (impedance := document.get("impedance")) is not None:
+        yield Section("The drive's own impedance", tuple(_impedance(impedance)))
     if document["inertia_kg_m2"] is not None or document["second_opinions"]:
         rows = len(document["second_opinions"]) + 4
         picture = Picture(
@@ -304,6 +306,42 @@ def _numbers(document: Part) -> Iterator[Block]:
         yield Table(columns, tuple(rows))
         yield Text("Where nothing is said of the torque scale it is taken for exact: such intervals compare runs on "
                    "this drive.")
+
+
+def _impedance(found: Part) -> Iterator[Block]:
+    """The picture, the loop's numbers, and what they rest on; or the refusal."""
+    from tdhil.report.plots import draw_impedance
+
+    if found["points"]:
+        zeta = found["string_nm_s_rad"]
+        caption = ("What the drive's speed loop is to whatever hangs on its shaft, with nothing on it: "
+                   "Z = J s + B + H (P + I/s). Dots: what each line shows by itself.")
+        if zeta:
+            caption += (" Below: the share of a wave that it sends back up a string of "
+                        f"{zeta:.4g} N·m·s/rad (at the motor), with its interval; 1 is a wall.")
+        yield Picture(partial(draw_impedance, found=found), 3.4 if zeta else 2.2, caption)
+    rows = [
+        (title, *rounded(part["value"], part["low"], part["high"]), unit)
+        for title, key, unit in _LOOP if (part := found[key]) is not None
+    ]
+    if rows:
+        columns = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
+                   Column("to", 0.12, True), Column("unit", 0.12))
+        yield Table(columns, tuple(rows))
+    yield Text(f"{found['verdict']}: {_sentence(found['reason'])} {_sentence(found['advice'])}".strip())
+    yield Text("Conditional on: " + "; ".join(found["conditions"]) + ".")
+
+
+_LOOP = (
+    ("gain P of the drive's speed loop", "gain_nm_s_rad", "N·m·s/rad"),
+    ("integral gain I", "integral_nm_rad", "N·m/rad"),
+    ("lags inside the loop, together", "inner_lag_s", "s"),
+    ("of them, the torque's", "torque_lag_s", "s"),
+    ("and the speed's that it sees", "speed_filter_s", "s"),
+    ("inertia, as this has it", "inertia_kg_m2", "kg·m²"),
+    ("viscous friction, as this has it", "viscous_nm_s_rad", "N·m·s/rad"),
+    ("a reference filter that nobody declared", "reference_filter_s", "s"),
+)
 
 
 def _opinions(document: Part) -> Iterator[Block]:

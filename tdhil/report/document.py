@@ -42,6 +42,9 @@ def result_document(
         "second_opinions": [asdict(opinion) for opinion in found.second_opinions],
         "friction_curve": [asdict(point) for point in found.friction_curve],
         "compliant": _compliant(found),
+        "impedance": None if found.impedance is None else asdict(found.impedance) | {
+            "verdict": found.impedance.verdict.value
+        },
         "lines": [asdict(line) for line in found.lines],
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,

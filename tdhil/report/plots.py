@@ -111,6 +111,32 @@ def draw_lines(figure: FigureBase, document: Part) -> None:
         axes.grid(alpha=0.3)
 
 
+def draw_impedance(figure: FigureBase, found: Part) -> None:
+    """|Z| over frequency, lines by themselves and the loop that explains them; |r| below, where a string is known."""
+    points, zeta = found["points"], found["string_nm_s_rad"]
+    hertz = [point["hertz"] for point in points]
+    real, imaginary = (np.array([point[key]["value"] for point in points])
+                       for key in ("real_nm_s_rad", "imaginary_nm_s_rad"))
+    seen = [(point["hertz"], np.hypot(*point["measured_nm_s_rad"])) for point in points if point["measured_nm_s_rad"]]
+    axes = figure.subplots(2 if zeta else 1, 1, sharex=True, squeeze=False)[:, 0]
+    top = axes[0]
+    top.loglog(hertz, np.hypot(real, imaginary), color=OURS, lw=1.4, label="|Z| of the loop found")
+    top.loglog([one for one, _ in seen], [size for _, size in seen], "o", color=DARK, ms=5, label="each line by itself")
+    if zeta:
+        top.axhline(zeta, color=QUIET, lw=1.0, ls=":", label="ζ of the string")
+        parts = [point["reflection_total"] for point in points]
+        below = axes[1]
+        below.fill_between(hertz, [part["low"] for part in parts], [part["high"] for part in parts], color=OURS,
+                           alpha=0.25, lw=0)
+        below.semilogx(hertz, [part["value"] for part in parts], color=OURS, lw=1.4)
+        below.set(ylabel="|r|", ylim=(0.0, 1.05))
+    top.set_ylabel("|Z|, N·m·s/rad")
+    top.legend(fontsize="small")
+    axes[-1].set_xlabel("frequency, Hz")
+    for one in axes:
+        one.grid(alpha=0.3, which="both")
+
+
 def draw_budget(figure: FigureBase, document: Part) -> None:
     """One bar for each source, largest on top."""
     lines = sorted((line for line in document["budget"] if line["half_width_kg_m2"] is not None),

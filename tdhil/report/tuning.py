@@ -40,12 +40,13 @@ if TYPE_CHECKING:
 Part = Mapping[str, Any]
 
 _WHAT = {
+    "present": "what stands in the drive now, as its own impedance was measured",
     "stiff": "the stiffest that keeps its phase margin",
     "soft": "P = ζ/a, I = ω²J: rotor and I tuned to the string's lowest mode",
     "compensated": "the same, part of the rotor's inertia given back",
     "broadband": "near ζ over more than one mode, as far as lags and J's interval allow",
 }
-_COLOURS = {"stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
+_COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _CRITICAL = ("cure", "start", "onset")
 _MEANT = {
     "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
@@ -276,9 +277,10 @@ def _rows(document: Part) -> Iterator[tuple[str, list[str]]]:
     yield "L to −1, least", [f"{one['least_distance_from_minus_1']:.2f}" for one in taken]
     yield "one more lag", ["> 1 s" if one["lag_reserve_s"] is None else f"{1e3 * one['lag_reserve_s']:.0f} ms"
                                 for one in taken]
-    for k in range(len(taken[0]["inertia_wrong_by"]) if taken else 0):
-        yield (f"J {100 * taken[0]['inertia_wrong_by'][k]['error']:+.3g} % wrong",
-               [_wrong(one["inertia_wrong_by"][k]) for one in taken])
+    wrongs: list[Part] = next((one["inertia_wrong_by"] for one in taken if one["inertia_wrong_by"]), [])
+    for k, error in enumerate(wrong["error"] for wrong in wrongs):
+        yield (f"J {100 * error:+.3g} % wrong",
+               [_wrong(one["inertia_wrong_by"][k]) if one["inertia_wrong_by"] else "–" for one in taken])
 
 
 def _gain(value: float) -> str:
@@ -331,7 +333,8 @@ def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
 
     found = {one.kind: one for one in tuning.tuned if one.controller is not None and one.critical is not None}
     stiff = found.get("stiff")
-    tuned = [one for kind, one in found.items() if kind != "stiff" and one.critical and one.critical.cure_rpm]
+    tuned = [one for kind, one in found.items()
+             if kind not in ("stiff", "present") and one.critical and one.critical.cure_rpm]
     if stiff is None or stiff.critical is None or not tuned or tuning.searched is None:
         return None
     best = min(tuned, key=lambda one: one.critical.cure_rpm if one.critical and one.critical.cure_rpm else math.inf)

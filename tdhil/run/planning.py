@@ -39,7 +39,7 @@ from tdhil.run.excitation import (
     periodic_kind,
 )
 from tdhil.run.settings import ExcitationRequest
-from tdhil.run.stages import Course
+from tdhil.run.stages import Course, reference_plan
 
 NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
 NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
@@ -144,6 +144,8 @@ def plan_acquisition(
     if isinstance(excitation_kind(request.kind), SwingKind):
         return _swings(request, mode, limits, guess, known, left_s)
     wish = wish_of(request, mode)
+    if request.impedance is not None:
+        return _reference(request, limits, guess, wish, known, left_s)
     allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
     if not adaptive(request):
         chosen = choose(limits, guess, wish, known, request.confidence, request.max_time_s)
@@ -183,6 +185,25 @@ def refuse_hopeless(
                 first = first or error
     if first is not None:
         raise first
+
+
+def _reference(
+    request: ExcitationRequest, limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge,
+    left_s: float,
+) -> Planned:
+    """The speed reference's lines that the drive's own impedance is measured by."""
+    if request.impedance != "reference":
+        raise PlanRefused(
+            "by the torque offset the motion is planned in stage 4, from what a small offset does",
+            "Leave --dry-run out",
+        )
+    plan = reference_plan(limits, guess, wish)
+    if plan.duration_s > left_s:
+        raise PlanRefused(
+            f"time: it takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            "Raise limits.time_s in rig.yaml, or ask for fewer --periods",
+        )
+    return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
 
 def _swings(

@@ -25,7 +25,7 @@ from drivers import (
     quantile,
 )
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
-from tdhil.config import told_before_echo
+from tdhil.config import DEFAULT_EXCITATION, told_before_echo
 from tdhil.recording import LagPrior
 from tdhil.run.excitation import excitation_kind
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
@@ -310,6 +310,9 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
 
     Raises PreflightRefused where what was asked for can't be had in a mode of this drive.
     """
+    if request.impedance is not None:
+        _refuse_impedance(request, limits, preflight)
+        return Mode.SPEED
     wanted, can_torque = request.mode, Mode.TORQUE in preflight.modes and preflight.switch_while_enabled
     if wanted == Mode.TORQUE.value and not can_torque:
         raise PreflightRefused(
@@ -332,6 +335,40 @@ def choose_mode(request: ExcitationRequest, limits: MachineLimits, preflight: Pr
             next_step="Use --excitation pulses or multisine",
         )
     return mode
+
+
+def _refuse_impedance(request: ExcitationRequest, limits: MachineLimits, preflight: Preflight) -> None:
+    """The drive's own impedance: in its speed loop, with nothing on the shaft, by a multisine."""
+    if request.mode == Mode.TORQUE.value:
+        raise PreflightRefused(
+            "torque mode was asked for, and the drive's own impedance is that of its speed loop",
+            where="--mode and --impedance", next_step="Leave --mode out",
+        )
+    if limits.load != "none":
+        raise PreflightRefused(
+            f"the drive's own impedance is measured with nothing on its shaft, and load is {limits.load}",
+            where="--impedance and load in rig.yaml", next_step="Measure it before the string is below it",
+        )
+    if request.kind != DEFAULT_EXCITATION or request.frequency_hz is not None:
+        raise PreflightRefused(
+            "the lines that the drive's own impedance is measured at are the measurement's own",
+            where="--impedance", next_step="Leave --excitation and --frequency out",
+        )
+
+
+SLOWEST_REFERENCE_S = 0.0125
+"""Cycle above which a command's own delay is open by as much as the filters that are looked for."""
+
+
+def refuse_slow_reference(request: ExcitationRequest, period_s: float) -> None:
+    """PreflightRefused where a filter of the reference can't be told from a reference that comes in steps."""
+    if request.impedance == "reference" and period_s > SLOWEST_REFERENCE_S:
+        raise PreflightRefused(
+            f"at {1.0 / period_s:.3g} cycles a second the reference comes in steps whose delay is open by"
+            f" {1e3 * period_s:.0f} ms: a filter of the reference could not be told from it, and nothing would show",
+            where="--impedance reference",
+            next_step=f"It takes {1.0 / SLOWEST_REFERENCE_S:.0f} cycles a second or more",
+        )
 
 
 def keep_within(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> MachineLimits:

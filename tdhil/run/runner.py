@@ -11,18 +11,20 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
-from tdhil.recording import Excitation, LagPrior, Ramp, RunLog
+from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Ramp, RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
 from tdhil.run.control_loop import ControlLoop
-from tdhil.run.excitation import RigGuess
+from tdhil.run.excitation import MotionLimits, RigGuess
 from tdhil.run.guard import Guard
+from tdhil.run.planning import wish_of
 from tdhil.run.preconditions import (
     choose_mode,
     choose_rate,
     keep_within,
     no_torque,
     quieten,
+    refuse_slow_reference,
     refuse_with_string,
     with_known_lag,
     with_read_filters,
@@ -43,6 +45,8 @@ from tdhil.run.stages import (
     refuse_longer,
     refuse_other_rig,
     run_hold,
+    run_offset,
+    run_pilot,
     run_plan,
     run_speed,
     run_torque,
@@ -180,6 +184,9 @@ class Runner:
         if task.evaluation is not None and program is not None:
             self._run_virtual_string(task, task.evaluation, program, loop, speed, drifted, resolution)
             return
+        if task.request.impedance == "offset":
+            self._run_offset(task, loop, speed, ramps, resolution)
+            return
         planner = StagePlanner(loop, self._log, self._display, self._say)
         planned = planner.plan(task, speed, mode, self._prior)
         plan = planned.plan
@@ -244,6 +251,31 @@ class Runner:
         with self._book.stage("acquire", program.longest_s):
             run_virtual_string(loop, limits, case, program, self._log.virtual, self._say)
 
+    def _run_offset(
+        self, task: Task, loop: ControlLoop, speed: SpeedResult, ramps: tuple[Ramp, ...], resolution_rad_s: float
+    ) -> None:
+        """Stages 4 and 5 of a run that measures the drive's own impedance by its torque offset."""
+        limits, assumptions = task.limits, task.assumptions
+        room = MotionLimits(
+            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
+        )
+        with self._book.stage("hold", 60.0):
+            found = run_pilot(
+                loop, limits, room, speed.model, assumptions, wish_of(task.request, Mode.SPEED.value),
+                string_at_motor(task), resolution_rad_s,
+            )
+            plan = found.plan
+            self._display.planned(plan)
+            text = (
+                f"torque offset of up to {found.peak_nm:.0f} N·m, {plan.duration_s:.0f} s, speed"
+                f" {plan.speed_min_rad_s:.2f} to {plan.speed_max_rad_s:.2f} rad/s"
+            )
+            self._log.event(loop.now_s, "plan", text)
+            self._say(text)
+            self._log.configure(plan=plan.plain() | {"torque_amplitudes_nm": list(found.torque_amplitudes_nm)})
+        with self._book.stage("acquire", plan.duration_s + 10.0):
+            run_offset(loop, found, self._announcer(speed, ramps), resolution_rad_s)
+
     def _prepare(self) -> tuple[Task, ControlLoop, Preflight]:
         identity = self._drive.connect()
         self._log.learn(simulated=identity.simulated)
@@ -260,7 +292,9 @@ class Runner:
             DriveLimits(
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
-                limits.temperature_c, torque_offset=task.evaluation is not None and task.evaluation.own_loop,
+                limits.temperature_c,
+                torque_offset=task.request.impedance == "offset"
+                or (task.evaluation is not None and task.evaluation.own_loop),
             )
         )
         self._display.preflight(preflight)
@@ -287,6 +321,12 @@ class Runner:
         task = replace(task, assumptions=task.assumptions.at_period(period_s))
         self._log.configure(cycle={"period_s": period_s, "rate_hz": 1.0 / period_s})
         self._log.event(self._drive.clock.now_s(), "rate", f"{1.0 / period_s:.4g} cycles a second")
+        refuse_slow_reference(task.request, period_s)
+        if (by := task.request.impedance) is not None:
+            count = preflight.torque_offset_resolution_nm if by == "offset" else preflight.speed_resolution_rad_s
+            self._log.learn(
+                impedance=ImpedanceInput(by, count, task.request.reference_filter_s, string_at_motor(task))
+            )
         self._prior = with_read_filters(task.facts.get("lag_prior", LagPrior()), preflight.filters)
         task = replace(task, assumptions=with_known_lag(task.assumptions, self._prior))
         self._log.learn(
@@ -371,6 +411,14 @@ class Runner:
             self._log.failure(self._drive.clock.now_s(), error)
         except Exception as also:
             error.add_note(f"and the log did not take it: {also}")
+
+
+def string_at_motor(task: Task) -> float:
+    """ζ of the string that |r| is told for, at the motor: as asked for, or of rig.yaml's pipe; 0: none is known."""
+    asked, pipe = task.request.string_nm_s_rad, task.facts.get("pipe")
+    if asked is not None:
+        return asked / float(task.facts.get("gear_ratio", 1.0)) ** 2
+    return 0.0 if pipe is None else float(pipe.impedance_nm_s_rad)
 
 
 def _refusal(preflight: Preflight) -> PreflightRefused:

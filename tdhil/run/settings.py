@@ -43,6 +43,9 @@ class ExcitationRequest:
     confidence: float = 0.95
     tolerance: float | None = None     # acquire until J's relative half-width is this; None = for a fixed time
     max_time_s: float | None = None    # longest stage 5; None = the plan's own, or what the time limit leaves
+    impedance: str | None = None       # offset, reference: measure the drive's own impedance, in its speed loop
+    string_nm_s_rad: float | None = None   # ζ of the string that |r| is told for, at the main shaft
+    reference_filter_s: float = 0.0    # smoothing of the speed reference that the drive is known to have
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,9 @@ def conclude(
     )
     if said:
         identification = replace(identification, warnings=(*said, *identification.warnings))
-    stands = identification.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
+    # a run that measured the drive's own impedance stands or falls with that
+    measured = identification.impedance
+    stands = (identification if measured is None else measured).verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     document = result_document(identification, recording, run, log)
     return Conclusion(identification, document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)
 

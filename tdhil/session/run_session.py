@@ -212,7 +212,7 @@ class RunSession:
             accept_wider=consent.wider_limits,
             accept_speed_unit=consent.speed_unit,
         )
-        asked = excitation_request(request.options)
+        asked = excitation_request(request.options, bench)
         if request.evaluation is not None:
             asked = ExcitationRequest(mode="speed" if request.evaluation.own_loop else "torque")
         return Task(limits, asked, facts(bench), evaluation=request.evaluation)

@@ -105,8 +105,8 @@ def machine_limits(
     )
 
 
-def excitation_request(options: RunOptions) -> ExcitationRequest:
-    """What stage 5 shall do."""
+def excitation_request(options: RunOptions, bench: Rig | None = None) -> ExcitationRequest:
+    """What stage 5 shall do; what the ``bench`` says of the drive goes with it."""
     return ExcitationRequest(
         kind=options.excitation,
         mode=options.mode,
@@ -117,6 +117,9 @@ def excitation_request(options: RunOptions) -> ExcitationRequest:
         confidence=options.confidence,
         tolerance=options.tolerance if options.given("tolerance") else None,
         max_time_s=options.max_time_s,
+        impedance=options.impedance,
+        string_nm_s_rad=options.string_impedance_nm_s_rad,
+        reference_filter_s=0.0 if bench is None else bench.drive_data.reference_filter_s or 0.0,
     )
 
 

@@ -89,6 +89,8 @@ class TuneCase:
     """a, where it is asked for; None: the one that damps most."""
     compensated_share: float | None = None
     """Share of J, where it is asked for; None: the one that damps most within the reserve."""
+    present: SpeedController | None = None
+    """What stands in the drive now, as measured (`identify --impedance`); shown beside the others."""
 
     @property
     def at_inertias(self) -> tuple[TopDrive, ...]:
@@ -158,13 +160,15 @@ class Tuning:
 def tune(
     case: TuneCase, search: Search | None = Search(), told: Callable[[str], None] = lambda text: None  # noqa: B008
 ) -> Tuning:
-    """Stiff, soft, compensated and broadband. `TuningRefused` where what was asked for explicitly can't be.
+    """Present, stiff, soft, compensated, broadband. `TuningRefused` where what was asked for explicitly can't be.
 
     ``search`` None leaves the simulated critical speeds out; ``told`` hears what is being done.
     """
     told("string's modes")
     held = string_modes_hz(case.string)
+    present = case.present
     recipes: list[tuple[str, Callable[[], Tuned]]] = [
+        *([("present", lambda: Tuned("present", present))] if present is not None else []),
         ("stiff", lambda: _stiff(case)),
         ("soft", lambda: _soft(case, held)),
         ("compensated", lambda: _compensated(case, held)),
@@ -400,11 +404,12 @@ def _with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], told: Cal
     along = np.array([figures_at(case, drive, law, held) for drive in case.at_inertias])
     inertia = case.inertia_kg_m2
     integral = None
-    if tuned.kind != "stiff":
+    if tuned.kind not in ("stiff", "present"):
         square = (2.0 * pi * held[0]) ** 2 * (1.0 - tuned.compensated_share)
         integral = Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high)
     system = ClosedSystem(case.string, case.drive, law)
-    wrong = tuple(_wrong(case, tuned, error, held) for error in WRONG_BY)
+    errors = WRONG_BY if tuned.kind != "present" else ()       # those gains hang on no J that is believed now
+    wrong = tuple(_wrong(case, tuned, error, held) for error in errors)
     return replace(
         tuned, integral_nm_rad=integral, reflection=_spanned(along[:, 0]), band_reflection=_spanned(along[:, 1]),
         damping=_spanned(along[:, 2]), modes=system.modes(1.1 * held[min(2, len(held) - 1)]),

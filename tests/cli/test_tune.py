@@ -139,3 +139,60 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
     assert text.count("<svg") == 3
     assert "SIMULATED" in text
     assert write_tuning_report(document, None, tmp_path / "tune.pdf").read_bytes().startswith(b"%PDF")
+
+
+def impedance(**said):
+    """What identify --impedance says, at the motor."""
+    loop = {"gain_nm_s_rad": estimate(203.0, 200.0, 206.0), "integral_nm_rad": estimate(264.5, 260.0, 269.0),
+            "torque_lag_s": estimate(0.012, 0.01, 0.014), "speed_filter_s": estimate(0.021, 0.018, 0.024)}
+    return {"verdict": "valid", "by": "offset", "reason": "explained", "advice": "", **loop, **said}
+
+
+@pytest.fixture
+def measured(tmp_path):
+    def write(**said):
+        path = tmp_path / "z.json"
+        path.write_text(json.dumps(result(**{"impedance": impedance(), **said})), encoding="utf-8")
+        return "--impedance", path.as_posix()
+
+    return write
+
+
+def test_the_drives_present_gains_stand_beside_the_others_with_its_own_lags(tuned, measured):
+    code, document, _ = tuned(*measured())
+    assert code == 0
+    present, stiff = document["controllers"][:2]
+    assert (present["kind"], stiff["kind"]) == ("present", "stiff")
+    assert present["at_main_shaft"]["gain_nm_s_rad"] == pytest.approx(20300.0)
+    assert present["at_motor"]["integral_nm_rad"] == pytest.approx(264.5)
+    # these are the reference case's stiff gains: what they do to its string is known from the notes
+    assert present["reflection_at_lowest_mode"]["value"] == pytest.approx(0.992, abs=0.002)
+    assert present["least_damping"]["value"] == pytest.approx(0.036, abs=0.003)
+    assert present["inertia_wrong_by"] == []
+    assert document["main_shaft"]["inner_lags_s"] == [0.021, 0.012]
+    assert document["main_shaft"]["inner_lags_from"] == "as measured (--impedance)"
+    assert not any("--inner-lags" in warning for warning in document["warnings"])
+    assert len(document["reflection"]["present"]) == len(document["reflection"]["hertz"])
+
+
+def test_the_table_has_a_column_for_them(tuned, measured):
+    code, text, _ = tuned(*measured(), as_json=False)
+    assert code == 0
+    assert "present" in text and "+12.6" in text
+
+
+def test_stated_lags_go_before_measured_ones(tuned, measured):
+    _, document, _ = tuned(*measured(), "--inner-lags", "20ms", "10ms")
+    assert document["main_shaft"]["inner_lags_s"] == [0.02, 0.01]
+
+
+@pytest.mark.parametrize(("said", "code", "words"), [
+    ({"impedance": None}, ExitCode.USAGE, "wasn't measured"),
+    ({"impedance": impedance(verdict="model_rejected", reason="a reference filter")}, 11, "a reference filter"),
+    ({"impedance": impedance(gain_nm_s_rad=None)}, ExitCode.USAGE, "no number"),
+    ({"gear_ratio": 4.0}, ExitCode.USAGE, "gear ratio"),
+])
+def test_what_is_no_measured_impedance_of_this_shaft_is_refused(tuned, measured, said, code, words):
+    found, _, err = tuned(*measured(**said), as_json=False)
+    assert found == code
+    assert words in err

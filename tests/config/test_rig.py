@@ -56,6 +56,8 @@ run:
   trace: shaft.csv
   max_time_s: 300
   model: two-mass
+  impedance: offset
+  string_impedance_nm_s_rad: 296.5
 accept_unverified: [watchdog, likely]
 modbus: {host: 192.0.2.10, port: 5020, unit: 7}
 """
@@ -110,11 +112,11 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("allow_reverse: false", "allow_reverse: off", 19, "write false"),
         ("ratio: 10.5", "ratio: 0", 15, "at least 1e-06"),
         ("confidence: 0.99", "confidence: 95", 34, "less than 1"),
-        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 45, "a list"),
-        ("unit: 7}", "unit: 256}", 46, "at most 255"),
-        ("unit: 7}", "serial: /dev/ttyUSB0}", 46, "exclude each other"),
-        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 46, "1 to 247 on a serial line"),
-        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 46, "'N', 'E' or 'O'"),
+        ("accept_unverified: [watchdog, likely]", "accept_unverified: likely", 47, "a list"),
+        ("unit: 7}", "unit: 256}", 48, "at most 255"),
+        ("unit: 7}", "serial: /dev/ttyUSB0}", 48, "exclude each other"),
+        ("host: 192.0.2.10, port: 5020, unit: 7", "serial: /dev/ttyUSB0, unit: 250", 48, "1 to 247 on a serial line"),
+        ("host: 192.0.2.10, port: 5020", "serial: /dev/ttyUSB0, parity: none", 48, "'N', 'E' or 'O'"),
         ("  speed_lag_s: 0.4\n", "  speed_lag_s: 0.4\n  parameters: {speed_scaling: fast}\n", 24, "a number"),
     ],
 )

@@ -62,6 +62,7 @@ class LineDrive:
     top_rad_s: float = 0.0
     modes_commanded: set[Mode] = field(default_factory=set)
     disabled_at: list[float] = field(default_factory=list)
+    offsets_nm: list[float] = field(default_factory=list)      # as commanded
 
     def __post_init__(self) -> None:
         self.inverter = Inverter(self.params, np.random.default_rng(self.seed))
@@ -94,6 +95,7 @@ class LineDrive:
             torque_resolution_nm=1e-3 * reporting.torque_quantum_permille * self.params.drive.rated_torque_nm,
             speed_resolution_rad_s=reporting.speed_quantum_rpm * np.pi / 30.0, watchdog_s=limits.watchdog_s,
             safe_action="quick_stop",
+            torque_offset_resolution_nm=1.0 if limits.torque_offset else 0.0,
         )
 
     def reset_fault(self) -> None:
@@ -140,11 +142,14 @@ class LineDrive:
     def _take(self, command: Command) -> None:
         control = self.inverter.control
         self.modes_commanded.add(command.mode)
+        self.offsets_nm.append(command.torque_offset_nm)
         if self._wish is PowerState.OFF and self._state is not PowerState.OFF:
             self.disabled_at.append(self.inverter.speed_rad_s)
         self._state = self._wish
         if command.mode in self.modes:
             self._mode = command.mode
+        enabled = self._state is PowerState.ENABLED and self._mode is Mode.SPEED
+        control.offset_nm = float(round(command.torque_offset_nm)) if enabled else 0.0
         if self._state is PowerState.OFF:
             control.off()
         elif self._state is PowerState.QUICK_STOP:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
         with_total as with_total,
     )
     from tdhil.estimation.frequency_domain.model import GaussianPrior as GaussianPrior, Model as Model
-    from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit
+    from tdhil.estimation.frequency_domain.optimiser import Box as Box, Fit as Fit, descend as descend
     from tdhil.estimation.frequency_domain.rigid import (
         fit_inertia as fit_inertia, known_of as known_of, lag_priors as lag_priors,
         refuse_count as refuse_count, simultaneous as simultaneous,

@@ -8,6 +8,9 @@ if TYPE_CHECKING:
     from tdhil.run.stages.acquire import run_plan as run_plan
     from tdhil.run.stages.brake_test import NOT_YET as NOT_YET, slow_down as slow_down
     from tdhil.run.stages.hold import MeanSpeedControl as MeanSpeedControl, run_hold as run_hold
+    from tdhil.run.stages.impedance import (
+        reference_plan as reference_plan, run_offset as run_offset, run_pilot as run_pilot,
+    )
     from tdhil.run.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
     from tdhil.run.stages.speed import Course as Course, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.run.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque

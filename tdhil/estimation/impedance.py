@@ -1,0 +1,595 @@
+"""The drive's own impedance, from a record in which its speed loop was moved by a known input.
+
+::
+
+    ω = E u / Z,   Z = J s + B + F H_t (P + I/s)         E = H_t e^(−ds)              a torque offset u
+                                                         E = H_t (P + I/s) G e^(−ds)   the speed reference u
+    W = H_w ω      T = H_T (J s + B) ω e^(−ks)           reported speed and torque
+
+    H_t = 1/(1 + τ_t s) torque loop, F = 1/(1 + τ_f s) the speed that the loop sees, H_w and H_T the reports, G = 1 or
+    what is known of a reference filter; d how late a command acts, k torque read later than speed.
+
+**Why that is enough.** The string takes τ from a drive whose reference stands: −τ/ω = Z. A torque offset acts where
+the string does, but for H_t, so that Z comes out of W alone, whatever J is; T besides tells J s + B, and so how Z is
+made up. From the reference Z follows from the loop's own gains only, so that whatever smooths the reference is taken
+for them: a filter that nobody declared is looked for, and where it shows the answer is refused.
+
+**Lines.** Under speed control what disturbs the shaft dies away, and the scatter from period to period is mostly what
+one period hands over to the next: it cancels in their mean, and would be counted as error. So all P counted periods are
+taken as one stretch. Excited lines stand at every P-th of its frequencies; those beside them, where nothing was
+commanded, have their noise: ν of them give its covariance.
+
+**Likelihood.** The command is known exactly: it is rounded as it was sent, and held from sample to sample, which makes
+(1 − e^(−jωh))/(jωh) of its lines. Both reports' lines are Gaussian about the model. B is tied to the levels; stated
+lags, the skew and the delay d have priors. The weights being estimated, E S⁻¹ = ν/(ν − 2) Σ⁻¹, and an estimator
+weighted by them scatters more than the best by ν/(ν − 1): both are taken off the information, and Student's t has its
+degrees of freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.estimation.case import PeriodicCase
+from tdhil.estimation.frequency_domain import Box, ComplexArray, descend, rejects, student_quantile
+from tdhil.estimation.result import DriveImpedance, Estimate, ImpedancePoint, ResidualTest, Verdict
+from tdhil.estimation.samples import Stretch, usual_interval
+from tdhil.recording import BoolArray, FloatArray, ImpedanceInput
+
+OFFSET: Final = "offset"
+REFERENCE: Final = "reference"
+
+(
+    INERTIA, VISCOUS, GAIN, INTEGRAL, TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT, DELAY, SKEW,
+    REFERENCE_FILTER,
+) = range(11)
+_SIZE: Final = 11
+_LAG_BOUND_S, _INNER_BOUND_S, _DELAY_BOUND_S = 3.0, 0.5, 0.5
+_SIGNALS = 2                   # speed and torque
+_LEAST_PERIODS = 5             # in a row: the lines beside an excited one are then four at least
+_BESIDE = 5                    # of them on either side
+_BLOCK = 8192                  # samples worked on at once
+_FLOOR = 1e-14                 # relative variance below which noise is rounding of the arithmetic
+_LEAST_LINES = 4
+_CLEAR = 9.0                   # |mean|² over its variance, of a line that answers
+_STARTS_S = ((0.40, 0.15), (0.05, 0.02), (0.1, 0.4))
+_OPEN = 0.5                    # relative half-width of P beyond which nothing is told
+_AT_BOUND = 1e-6
+_REFERENCE_GAIN = 10.83        # −2 ln L that a reference filter must be worth: one time in a thousand by chance
+_POINTS = 49                   # of the curve
+
+
+def measure_impedance(case: PeriodicCase) -> DriveImpedance:
+    """The finding. Never raises for what data can cause: it refuses."""
+    asked = case.recording.impedance
+    assert asked is not None
+    problem = _problem(case, asked)
+    if isinstance(problem, DriveImpedance):
+        return problem
+    try:
+        return _conclude(case, asked, problem)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return refusal(asked, "the lines can't be told apart by any loop of P and I", _MORE)
+
+
+def refusal(asked: ImpedanceInput, reason: str, advice: str) -> DriveImpedance:
+    """Nothing can be told, and why."""
+    return DriveImpedance(Verdict.NOT_IDENTIFIABLE, asked.by, reason, advice, asked.string_nm_s_rad)
+
+
+_MORE: Final = "let it run for longer (--periods), or with more room in limits.torque_nm and the speed window"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What was commanded: rounded as it was sent, line by line.
+
+
+@dataclass(frozen=True)
+class Line:
+    """One excited frequency: M segments' speed and torque, and the covariance of such a mean, of ``nu`` complex dof."""
+
+    hertz: float
+    u: ComplexArray                # (M,) the command
+    x: ComplexArray                # (M, 2)
+    covariance: ComplexArray       # (2, 2)
+    nu: float
+
+    @property
+    def answers(self) -> bool:
+        """Do speed and torque stand clear of their noise?"""
+        noise = np.diag(self.covariance).real
+        return bool(np.all(np.abs(self.x) ** 2 > _CLEAR * noise[None, :]))
+
+
+def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[Line, ...]:
+    """Of every segment's longest run of whole periods; () where one has too few."""
+    pieces = []
+    for stretch, fit_ in zip(case.stretches, case.fits, strict=True):
+        run = _longest_run(stretch)
+        if len(run) < _LEAST_PERIODS:
+            return ()
+        pieces.append((stretch.segment.lines_hz, commanded(stretch, asked), *_spectrum(stretch, run, fit_.rounding)))
+    if not pieces or len({hertz for hertz, *_ in pieces}) > 1:
+        return ()
+    found = []
+    for k, hertz in enumerate(pieces[0][0]):
+        nu = float(sum(piece[3][k].shape[0] for piece in pieces))
+        noise = [np.einsum("ni,nj->ij", piece[3][k], piece[3][k].conj()) for piece in pieces]
+        covariance: ComplexArray = np.sum(noise, axis=0) / nu + np.mean([np.diag(piece[4]) for piece in pieces], axis=0)
+        found.append(
+            Line(hertz, np.array([piece[1][k] for piece in pieces]), np.array([piece[2][k] for piece in pieces]),
+                 covariance, nu)
+        )
+    return tuple(found)
+
+
+def _longest_run(stretch: Stretch) -> tuple[int, ...]:
+    """Numbers in ``stretch.periods`` of neighbours in time."""
+    best: tuple[int, ...] = ()
+    now: list[int] = []
+    for number, index in enumerate(stretch.index):
+        if now and index != stretch.index[now[-1]] + 1:
+            now = []
+        now.append(number)
+        if len(now) > len(best):
+            best = tuple(now)
+    return best
+
+
+def _spectrum(
+    stretch: Stretch, run: tuple[int, ...], rounding: tuple[float, float]
+) -> tuple[ComplexArray, tuple[ComplexArray, ...], FloatArray]:
+    """(K, 2) speed and torque of the excited lines; beside each of them (ν, 2); and what rounding repeats in either.
+
+    By least squares on the actual time stamps, with a ramp, all lines side by side.
+    """
+    segment = stretch.segment
+    count = len(run)
+    reach = min(count // 2, _BESIDE)
+    time = np.concatenate([stretch.periods[k].time_s for k in run])
+    signals = np.column_stack([
+        np.concatenate([stretch.periods[k].speed_rad_s for k in run]),
+        np.concatenate([stretch.periods[k].torque_nm for k in run]),
+    ])
+    turns = [round(hertz * segment.period_s) * count for hertz in segment.lines_hz]
+    beside = [
+        [turn + step for step in range(-reach, reach + 1) if step and turn + step > 0] for turn in turns
+    ]
+    every = sorted({*turns, *(turn for some in beside for turn in some)})
+    omega = 2.0 * np.pi * np.asarray(every) / (count * segment.period_s)
+    size = 2 + 2 * len(every)
+    normal, right = np.zeros((size, size)), np.zeros((size, 2))
+    middle = 0.5 * (time[0] + time[-1])
+    span = time[-1] - time[0]
+    for first in range(0, len(time), _BLOCK):
+        block = slice(first, first + _BLOCK)
+        angle = np.multiply.outer(time[block] - segment.start_s, omega)
+        design = np.column_stack([
+            np.ones(len(angle)), 2.0 * (time[block] - middle) / span, np.cos(angle), np.sin(angle)
+        ])
+        normal += design.T @ design
+        right += design.T @ signals[block]
+    solved = np.linalg.solve(normal, right)
+    table: ComplexArray = solved[2 : 2 + len(every)] - 1j * solved[2 + len(every) :]
+    at = {turn: number for number, turn in enumerate(every)}
+    excited: ComplexArray = table[[at[turn] for turn in turns]]
+    noise = tuple(table[[at[turn] for turn in some]] for some in beside)
+    floor = _FLOOR * np.max(np.abs(excited) ** 2, axis=0)
+    return excited, noise, np.asarray(rounding) + floor
+
+
+def commanded(stretch: Stretch, asked: ImpedanceInput) -> ComplexArray:
+    """(K,) lines of the command that stood in the first counted period, as the continuous signal that it was."""
+    segment, period = stretch.segment, stretch.periods[0]
+    time = period.time_s - segment.start_s
+    omega = 2.0 * np.pi * np.asarray(segment.lines_hz)
+    mean, sizes = segment.offset_rad_s, segment.amplitudes_rad_s
+    if asked.by == OFFSET:
+        mean, sizes = 0.0, segment.torque_amplitudes_nm
+    angle = np.multiply.outer(time, omega)
+    wave = mean + np.cos(angle + np.asarray(segment.phases_rad)) @ np.asarray(sizes)
+    if asked.count > 0.0:
+        wave = np.round(wave / asked.count) * asked.count
+    design = np.column_stack([np.ones(len(time)), np.cos(angle), np.sin(angle)])
+    found = np.linalg.solve(design.T @ design, design.T @ wave)
+    count = len(omega)
+    step = 1j * omega * usual_interval(period.time_s)
+    lines: ComplexArray = (found[1 : 1 + count] - 1j * found[1 + count :]) * (1.0 - np.exp(-step)) / step
+    return lines
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+@dataclass(frozen=True)
+class _Prior:
+    row: FloatArray                # (P,)
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """K lines of M segments: ``x`` (K, M, 2) speed and torque, ``u`` (K, M) the command; ``white`` (K, 2, 2)."""
+
+    by: str
+    declared_s: float              # of the reference filter
+    s: ComplexArray
+    u: ComplexArray
+    x: ComplexArray
+    covariance: ComplexArray       # (K, 2, 2)
+    white: ComplexArray
+    nu: FloatArray                 # (K,)
+    priors: tuple[_Prior, ...]
+
+    def model(self, theta: FloatArray) -> ComplexArray:
+        """(K, 2) speed and torque for one unit of the command."""
+        s = self.s
+        omega = excitation_of(self.by, theta, s, self.declared_s) / impedance_of(theta, s)
+        speed = omega / (1.0 + theta[SPEED_REPORT] * s)
+        torque = (theta[INERTIA] * s + theta[VISCOUS]) * omega * np.exp(-theta[SKEW] * s)
+        torque = torque / (1.0 + theta[TORQUE_REPORT] * s)
+        return np.stack([speed, torque], axis=1)
+
+    def errors(self, theta: FloatArray) -> ComplexArray:
+        """(K, M, 2) what the model leaves."""
+        left: ComplexArray = self.x - self.model(theta)[:, None, :] * self.u[:, :, None]
+        return left
+
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Of unit variance each: lines, then priors."""
+        whitened = math.sqrt(2.0) * np.einsum("kij,kmj->kmi", self.white, self.errors(theta))
+        known = [(one.row @ theta - one.mean) / one.sd for one in self.priors]
+        return np.concatenate([whitened.real.ravel(), whitened.imag.ravel(), np.asarray(known, dtype=np.float64)])
+
+    def slopes(self, theta: FloatArray, scale: FloatArray) -> FloatArray:
+        """∂residuals/∂theta, by central differences."""
+        return _slopes(self.residuals, theta, scale)
+
+
+def _slopes(function: Callable[[FloatArray], FloatArray], theta: FloatArray, scale: FloatArray) -> FloatArray:
+    columns = []
+    for index, step in enumerate(1e-5 * scale):
+        above, below = theta.copy(), theta.copy()
+        above[index] += step
+        below[index] -= step
+        columns.append((function(above) - function(below)) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def control_law(theta: FloatArray, s: ComplexArray) -> ComplexArray:
+    """H_t (P + I/s)."""
+    found: ComplexArray = (theta[GAIN] + theta[INTEGRAL] / s) / (1.0 + theta[TORQUE_LAG] * s)
+    return found
+
+
+def impedance_of(theta: FloatArray, s: ComplexArray) -> ComplexArray:
+    """Z."""
+    found: ComplexArray = theta[INERTIA] * s + theta[VISCOUS] + control_law(theta, s) / (1.0 + theta[SPEED_FILTER] * s)
+    return found
+
+
+def excitation_of(by: str, theta: FloatArray, s: ComplexArray, declared_s: float) -> ComplexArray:
+    """E: the torque at the shaft for one unit of the command, were the shaft held."""
+    late = np.exp(-theta[DELAY] * s)
+    found: ComplexArray = late / (1.0 + theta[TORQUE_LAG] * s)
+    if by == REFERENCE:
+        found = control_law(theta, s) * late / ((1.0 + theta[REFERENCE_FILTER] * s) * (1.0 + declared_s * s))
+    return found
+
+
+def _problem(case: PeriodicCase, asked: ImpedanceInput) -> Problem | DriveImpedance:
+    lines = lines_of(case, asked)
+    if len(lines) < _LEAST_LINES:
+        return refusal(asked, f"{case.periods_used} usable whole periods are too few to know the noise", _MORE)
+    clear = [line for line in lines if line.answers]
+    if len(clear) < _LEAST_LINES:
+        what = "torque offset" if asked.by == OFFSET else "speed reference"
+        return refusal(
+            asked, f"only {len(clear)} of {len(lines)} lines of the {what} show in speed and torque",
+            "does the drive take it (its mode, its profile)? Else give it more room",
+        )
+    covariance: ComplexArray = np.array([line.covariance for line in lines], dtype=np.complex128)
+    white: ComplexArray = np.linalg.inv(np.linalg.cholesky(covariance)).astype(np.complex128)
+    return Problem(
+        by=asked.by,
+        declared_s=asked.reference_filter_s,
+        s=np.array([2j * np.pi * line.hertz for line in lines], dtype=np.complex128),
+        u=np.array([line.u for line in lines], dtype=np.complex128),
+        x=np.array([line.x for line in lines], dtype=np.complex128),
+        covariance=covariance,
+        white=white,
+        nu=np.array([line.nu for line in lines]),
+        priors=_priors(case, asked, usual_interval(case.stretches[0].periods[0].time_s)),
+    )
+
+
+def _priors(case: PeriodicCase, asked: ImpedanceInput, period_s: float) -> tuple[_Prior, ...]:
+    """A command acts within a cycle or so of when its sample was taken; what else is known beforehand."""
+    known = case.recording.lag_prior
+    found = [_prior(DELAY, 0.25 * period_s, max(period_s, 1e-3)), _prior(SKEW, 0.0, max(known.skew_sd_s, 1e-4))]
+    if known.speed_lag_s is not None:
+        found.append(_prior(SPEED_REPORT, known.speed_lag_s, max(known.speed_lag_sd_s, 1e-4)))
+    if known.torque_lag_s is not None:
+        found.append(_prior(TORQUE_REPORT, known.torque_lag_s, max(known.torque_lag_sd_s, 1e-4)))
+    tie = case.constraint
+    if tie is not None:
+        row = np.zeros(_SIZE)
+        row[VISCOUS], row[INERTIA] = 1.0, tie.slope_per_inertia
+        widened = math.sqrt(tie.dof / (tie.dof - 2.0)) if tie.dof > 3.0 else 2.0
+        found.append(_Prior(row, tie.slope, widened * tie.sd))
+    return tuple(found)
+
+
+def _prior(index: int, mean: float, sd: float) -> _Prior:
+    row = np.zeros(_SIZE)
+    row[index] = 1.0
+    return _Prior(row, mean, sd)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The fit: from some guesses at the reports' lags everything else follows by linear least squares.
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The best theta, which parameters moved and came to rest inside their bounds, and −2 ln L up to a constant."""
+
+    theta: FloatArray
+    inside: BoolArray
+    objective: float
+    scale: FloatArray
+
+
+def fit(problem: Problem, *, with_filter: bool = False) -> Fitted:
+    """``with_filter``: a first-order reference filter is fitted as well."""
+    held = {REFERENCE_FILTER} if not with_filter or problem.by == OFFSET else set()
+    stated = {int(np.argmax(one.row)): one.mean for one in problem.priors if np.count_nonzero(one.row) == 1}
+    best: Fitted | None = None
+    for lags in _STARTS_S:
+        speed, torque = stated.get(SPEED_REPORT, lags[0]), stated.get(TORQUE_REPORT, lags[1])
+        found = _descended(problem, _start(problem, speed, torque, stated[DELAY], with_filter), held)
+        best = found if best is None or found.objective < best.objective else best
+    assert best is not None
+    return best
+
+
+def _descended(problem: Problem, start: FloatArray, held: set[int]) -> Fitted:
+    inertia, viscous, gain, integral = (float(start[k]) for k in (INERTIA, VISCOUS, GAIN, INTEGRAL))
+    friction = max(abs(viscous), 0.01 * gain, 0.01 * inertia)
+    scale = np.array([inertia, friction, gain, integral, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005, 0.05])
+    high = np.array([100.0 * inertia, 100.0 * friction, 1e3 * gain, 1e4 * integral, _INNER_BOUND_S, _INNER_BOUND_S,
+                     _LAG_BOUND_S, _LAG_BOUND_S, _DELAY_BOUND_S, _DELAY_BOUND_S, _LAG_BOUND_S])
+    low = np.zeros(_SIZE)
+    positive = [INERTIA, GAIN, INTEGRAL]
+    low[positive] = 1e-4 * start[positive]
+    low[VISCOUS], low[SKEW], low[DELAY] = -high[VISCOUS], -_DELAY_BOUND_S, -_DELAY_BOUND_S
+    free: BoolArray = np.array([index not in held for index in range(_SIZE)])
+    box = Box(low, high, scale)
+    found = descend(
+        lambda theta: (problem.residuals(theta), lambda: problem.slopes(theta, scale)), start, free, box
+    )
+    near = _AT_BOUND * scale
+    inside = free & (found.theta > low + near) & (found.theta < high - near)
+    return Fitted(found.theta, inside, found.objective, scale)
+
+
+def _start(problem: Problem, speed_s: float, torque_s: float, delay_s: float, with_filter: bool) -> FloatArray:
+    s, u = problem.s[:, None], problem.u
+    omega = problem.x[:, :, 0] * (1.0 + speed_s * s)
+    torque = problem.x[:, :, 1] * (1.0 + torque_s * s)
+    ones = np.ones_like(omega)
+    inertia, viscous = _real_fit([s * ones, ones], torque / omega)
+    inertia = inertia if inertia > 0.0 else float(np.median(np.abs(torque / omega / s)))
+    law = u / omega - (inertia * s + viscous) if problem.by == OFFSET else torque / (u - omega)
+    gain, integral = _real_fit([ones, ones / s], law)
+    least = 1e-3 * float(np.median(np.abs(inertia * s)))
+    theta = np.zeros(_SIZE)
+    theta[[INERTIA, VISCOUS, GAIN, INTEGRAL]] = inertia, viscous, max(gain, least), max(integral, least)
+    theta[[TORQUE_LAG, SPEED_FILTER, SPEED_REPORT, TORQUE_REPORT]] = 0.01, 0.02, speed_s, torque_s
+    theta[DELAY] = delay_s
+    theta[REFERENCE_FILTER] = 0.05 if with_filter else 0.0
+    return theta
+
+
+def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.complex128]) -> tuple[float, float]:
+    """Real a, b with a·first + b·second ≈ target, each equation relative to its size."""
+    weight = 1.0 / np.maximum(np.abs(target), 1e-300).ravel()
+    table = np.stack([(column.ravel() * weight) for column in columns], axis=1)
+    right = target.ravel() * weight
+    both = np.concatenate([table.real, table.imag])
+    found = np.linalg.lstsq(both, np.concatenate([right.real, right.imag]), rcond=None)[0]
+    return float(found[0]), float(found[1])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is told: values with intervals by the quadratic approximation, and the residual test.
+
+
+class _Spread:
+    """Covariance of theta, and the degrees of freedom of whatever is made of it."""
+
+    def __init__(self, problem: Problem, fitted: Fitted, confidence: float) -> None:
+        self._fitted, self._confidence = fitted, confidence
+        self._moved = np.flatnonzero(fitted.inside)
+        slopes = problem.slopes(fitted.theta, fitted.scale)[:, self._moved]
+        lines = 2 * problem.x.size
+        count, segments = len(problem.s), problem.x.shape[1]
+        nu = problem.nu
+        shrunk = (nu - _SIGNALS) / nu * (nu - 1.0) / nu
+        of_line = slopes[:lines].reshape(2, count, segments * _SIGNALS, -1)
+        parts = [shrunk[k] * sum(of_line[half, k].T @ of_line[half, k] for half in range(2)) for k in range(count)]
+        self._dof = [*(2.0 * (nu - 1.0)), *([math.inf] * (len(slopes) - lines))]
+        parts += [np.outer(row, row) for row in slopes[lines:]]
+        self._parts = parts
+        size = fitted.scale[self._moved]
+        information: FloatArray = np.sum(parts, axis=0) * np.outer(size, size)
+        self._inverse = np.linalg.pinv(information, rcond=1e-13, hermitian=True) * np.outer(size, size)
+
+    def around(self, function: Callable[[FloatArray], FloatArray], extra_sd: FloatArray | None = None
+               ) -> tuple[Estimate, ...]:
+        """Each of what ``function`` makes of theta, with its interval; ``extra_sd`` in quadrature."""
+        value = function(self._fitted.theta)
+        slopes = _slopes(function, self._fitted.theta, self._fitted.scale)[:, self._moved]
+        found = []
+        for index, (one, row) in enumerate(zip(value, slopes, strict=True)):
+            column = self._inverse @ row
+            shares = np.array([column @ part @ column for part in self._parts])
+            variance = max(float(row @ column), 0.0)
+            open_share = float(np.sum([share**2 / dof for share, dof in zip(shares, self._dof, strict=True)]))
+            dof = max(1.0, min(float(np.sum(shares)) ** 2 / open_share if open_share > 0.0 else 1e6, 1e6))
+            half = student_quantile(self._confidence, dof) * math.sqrt(variance)
+            if extra_sd is not None:
+                half = math.hypot(half, student_quantile(self._confidence, 1e6) * float(extra_sd[index]))
+            found.append(Estimate(float(one), float(one - half), float(one + half)))
+        return tuple(found)
+
+
+def residual_test(problem: Problem, fitted: Fitted) -> ResidualTest | None:
+    """Bartlett's form of Wilks' Λ line by line, (2ν + M − 2) ln det(1 + S⁻¹ Σ e eᴴ/ν) ~ χ²(4M), and the priors'."""
+    from scipy.special import chdtrc
+
+    errors = problem.errors(fitted.theta)
+    segments = errors.shape[1]
+    statistic = 0.0
+    for k, nu in enumerate(problem.nu):
+        spread = errors[k].T @ errors[k].conj()
+        matrix = np.eye(_SIGNALS) + np.linalg.solve(problem.covariance[k], spread) / nu
+        statistic += (2.0 * nu + segments - _SIGNALS) * math.log(abs(np.linalg.det(matrix)))
+    statistic += float(sum(((one.row @ fitted.theta - one.mean) / one.sd) ** 2 for one in problem.priors))
+    measured = 2.0 * _SIGNALS * segments * len(problem.nu) + len(problem.priors)
+    left = measured - float(np.count_nonzero(fitted.inside))
+    if left < 1.0:
+        return None
+    return ResidualTest(float(statistic), left, float(chdtrc(left, statistic)))
+
+
+def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: Problem) -> DriveImpedance:
+    fitted = fit(problem)
+    test = residual_test(problem, fitted)
+    bare = replace(refusal(asked, "", ""), residual=test, conditions=_conditions(case, asked))
+    confidence = case.options.confidence
+    shows = _undeclared(problem, fitted, confidence) if asked.by == REFERENCE else None
+    p_value = 1.0 if test is None else test.p_value
+    if shows is not None:
+        return replace(
+            bare, verdict=Verdict.MODEL_REJECTED, reference_filter_s=shows,
+            reason=f"the residuals contradict a speed loop without a reference filter (p = {p_value:.2g}): one of"
+            f" {shows.value:.3g} s ({shows.low:.3g} to {shows.high:.3g}) would explain them",
+            advice="measure by the torque offset (--impedance offset), which a reference filter doesn't touch; or"
+            " switch the filter off at the drive, or state it (drive_data.reference_filter_s in rig.yaml)",
+        )
+    if rejects(test):
+        return replace(
+            bare, verdict=Verdict.MODEL_REJECTED,
+            reason=f"the residuals contradict a rigid shaft under a speed loop of P and I (p = {p_value:.2g})",
+            advice="does a string or a brake hang on the shaft, has the loop another structure (a feed-forward, a ramp,"
+            " a notch), or do the reports have other filters than first-order lags?",
+        )
+    spread = _Spread(problem, fitted, confidence)
+    gains = spread.around(
+        lambda theta: np.array([
+            theta[GAIN], theta[INTEGRAL], theta[TORQUE_LAG] + theta[SPEED_FILTER], theta[TORQUE_LAG],
+            theta[SPEED_FILTER], theta[INERTIA], theta[VISCOUS],
+        ])
+    )
+    if not gains[0].bounded:
+        return replace(bare, reason="the data leave the loop's gain open", advice=_MORE)
+    gain, integral, inner, torque_lag, speed_filter, inertia, viscous = gains
+    explained = "untested" if test is None else f"p = {p_value:.2g}"
+    return replace(
+        bare,
+        verdict=Verdict.VALID,
+        reason=f"a speed loop of P and I on a rigid shaft explains speed and torque ({explained})",
+        advice="" if asked.string_nm_s_rad > 0.0 else "name the string (--string-impedance) to have |r| as well",
+        gain_nm_s_rad=gain,
+        integral_nm_rad=_not_below_zero(integral),
+        inner_lag_s=_not_below_zero(inner),
+        torque_lag_s=_not_below_zero(torque_lag),
+        speed_filter_s=_not_below_zero(speed_filter),
+        inertia_kg_m2=inertia,
+        viscous_nm_s_rad=viscous,
+        points=_points(case, asked, problem, fitted, spread),
+    )
+
+
+def _not_below_zero(one: Estimate) -> Estimate:
+    return Estimate(one.value, max(one.low, 0.0), one.high)
+
+
+def _undeclared(problem: Problem, plain: Fitted, confidence: float) -> Estimate | None:
+    """A reference filter that the data want, past chance."""
+    found = fit(problem, with_filter=True)
+    if plain.objective - found.objective < _REFERENCE_GAIN or not found.inside[REFERENCE_FILTER]:
+        return None
+    spread = _Spread(problem, found, confidence)
+    return _not_below_zero(spread.around(lambda theta: theta[[REFERENCE_FILTER]])[0])
+
+
+def _points(
+    case: PeriodicCase, asked: ImpedanceInput, problem: Problem, fitted: Fitted, spread: _Spread
+) -> tuple[ImpedancePoint, ...]:
+    lines = problem.s.imag / (2.0 * math.pi)
+    grid = np.geomspace(lines.min(), lines.max(), _POINTS)
+    hertz = np.unique(np.concatenate([grid[(grid > lines.min() * 1.001) & (grid < lines.max() * 0.999)], lines]))
+    s: ComplexArray = 2j * np.pi * hertz
+    zeta, scale_sd = asked.string_nm_s_rad, case.recording.torque_scale_rel_sd
+
+    def both(theta: FloatArray) -> FloatArray:
+        z = impedance_of(theta, s)
+        return np.concatenate([z.real, z.imag])
+
+    def reflected(theta: FloatArray) -> FloatArray:
+        return reflection(impedance_of(theta, s), zeta)
+
+    parts = spread.around(both)
+    real, imaginary = parts[: len(s)], parts[len(s) :]
+    inner: list[Estimate | None] = [None] * len(s)
+    total = inner
+    if zeta > 0.0:
+        z = impedance_of(fitted.theta, s)
+        by_scale = np.abs(reflection(1.001 * z, zeta) - reflection(0.999 * z, zeta)) / 0.002 * scale_sd
+        inner = [_not_below_zero(one) for one in spread.around(reflected)]
+        total = [_not_below_zero(one) for one in spread.around(reflected, by_scale)]
+    seen = _seen(problem, fitted)
+    return tuple(
+        ImpedancePoint(float(f), real[k], imaginary[k], inner[k], total[k], seen.get(round(float(f), 9)))
+        for k, f in enumerate(hertz)
+    )
+
+
+def reflection(impedance: ComplexArray, string_nm_s_rad: float) -> FloatArray:
+    """|r| = |Z − ζ|/|Z + ζ|."""
+    found: FloatArray = np.abs((impedance - string_nm_s_rad) / (impedance + string_nm_s_rad))
+    return found
+
+
+def _seen(problem: Problem, fitted: Fitted) -> dict[float, tuple[float, float]]:
+    """Z that each line shows by itself: E u/ω, the reported speed without its lag."""
+    theta, s = fitted.theta, problem.s
+    driven = excitation_of(problem.by, theta, s, problem.declared_s) / (1.0 + theta[SPEED_REPORT] * s)
+    speed = np.sum(problem.x[:, :, 0] * problem.u.conj(), axis=1)
+    power = np.sum(np.abs(problem.u) ** 2, axis=1)
+    z = driven * power / speed
+    return {
+        round(float(f), 9): (float(one.real), float(one.imag))
+        for f, one in zip(s.imag / (2.0 * math.pi), z, strict=True)
+    }
+
+
+def _conditions(case: PeriodicCase, asked: ImpedanceInput) -> tuple[str, ...]:
+    found = ["P, I and Z in the scale of the drive's own torque", "first-order lags in loop and reports"]
+    if asked.by == REFERENCE:
+        declared = asked.reference_filter_s
+        found.append(f"a reference filter of {declared:g} s" if declared > 0.0 else "no reference filter")
+    if case.recording.lag_prior.source:
+        found.append(f"reporting lags as stated by {case.recording.lag_prior.source}")
+    return tuple(found)
+
+
+__all__ = ["OFFSET", "REFERENCE", "measure_impedance", "refusal"]

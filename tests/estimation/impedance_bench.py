@@ -1,0 +1,162 @@
+"""A drive in its speed loop, moved by a torque offset or by its reference, in closed form: what is linear is added up.
+
+Shares no code with what it tests, nor with the simulated drive. The command's own lines, rounding included, go through
+the loop's transfer functions; so do load, ripple and the sensor's noise, drawn as spectra. What is reported is sampled
+and rounded.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.estimation.case import Case, PeriodicCase
+from tdhil.estimation.frequency_domain import measured
+from tdhil.estimation.impedance import measure_impedance
+from tdhil.estimation.result import Options
+from tdhil.estimation.samples import usable_samples
+from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Level, Recording, Segment
+
+HARMONICS = np.array([1, 2, 3, 5, 7, 10, 14, 20, 30])
+PHASES = np.array([0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651])
+PERIOD_S, MEAN, LEVELS, LEVEL_S = 20.0, 5.0, (2.9, 7.15), 10.0
+ZETA = 20.56                       # of 5 inch pipe at this motor: 296.5 N·m·s/rad times 104/1500
+SETTINGS = {                       # P and I at the motor: the reference case's, by 104/1500
+    "soft, a = 1": (20.6, 69.3), "soft, a = 0.25": (82.2, 69.3), "the paper's": (300.0, 300.0),
+    "stiff": (1406.0, 1834.0),
+}
+
+
+@dataclass(frozen=True)
+class Machine:
+    """SI at the motor shaft; noises as standard deviations, white ones of a step of 2 ms."""
+
+    gain: float = 300.0
+    integral: float = 300.0
+    inertia: float = 104.0
+    viscous: float = 8.0
+    coulomb: float = 60.0
+    torque_lag: float = 0.010
+    speed_filter: float = 0.020
+    reference_filter: float = 0.0
+    speed_report: float = 0.40
+    torque_report: float = 0.15
+    load_sd: float = 3.0
+    load_time: float = 0.5
+    ripple_sd: float = 10.0
+    sensor_sd: float = 0.02
+    speed_noise: float = 0.003
+    torque_noise: float = 2.0
+    speed_quantum: float = 0.1 * np.pi / 30.0
+    torque_quantum: float = 1.0
+    period: float = 0.004
+    late: float = 0.0              # of the command
+
+    def law(self, s):
+        return (self.gain + self.integral / s) / (1.0 + self.torque_lag * s)
+
+    def impedance(self, hertz):
+        s = 2j * np.pi * np.asarray(hertz)
+        return self.inertia * s + self.viscous + self.law(s) / (1.0 + self.speed_filter * s)
+
+    def reflection(self, hertz, zeta=ZETA):
+        z = self.impedance(hertz)
+        return np.abs((z - zeta) / (z + zeta))
+
+    def driven(self, by, s):
+        """Speed for one unit of the command."""
+        drive = 1.0 / (1.0 + self.torque_lag * s) if by == "offset" else self.law(s) / (1.0 + self.reference_filter * s)
+        return drive * np.exp(-self.late * s) / self.impedance(s.imag / (2.0 * np.pi))
+
+    def reported(self, speed, s):
+        torque = (self.inertia * s + self.viscous) * speed
+        return speed / (1.0 + self.speed_report * s), torque / (1.0 + self.torque_report * s)
+
+
+def command(machine, by, peak=None):
+    """Sizes of the lines: what the field rig's window (3.5 rad/s about its mean) and torque (200 N·m) leave."""
+    hertz = HARMONICS / PERIOD_S
+    s = 2j * np.pi * hertz
+    if by == "offset":
+        z = np.abs(machine.impedance(hertz))
+        sizes = (2.0 * ZETA * z / (z**2 + ZETA**2)) ** 0.75
+    else:
+        sizes = 1.0 / np.hypot(1.0, s.imag)
+    speed = machine.driven(by, s)
+    grid = np.exp(1j * (np.outer(np.arange(0.0, PERIOD_S, 0.01), s.imag) + PHASES))
+
+    def highest(lines):
+        return np.max(np.abs((grid @ (sizes * lines)).real))
+
+    most = min(3.5 / highest(speed), 200.0 / highest((machine.inertia * s + machine.viscous) * speed))
+    if by == "offset":
+        most = min(most, 160.0 / highest(np.ones(len(s))))
+    return sizes * (most if peak is None else peak / highest(np.ones(len(s))))
+
+
+def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, scale_sd=0.0, declared=0.0):
+    """A Recording: two levels, then the counted periods."""
+    rng = np.random.default_rng(seed)
+    h = machine.period
+    sizes = command(machine, by, peak)
+    omega = 2.0 * np.pi * HARMONICS / PERIOD_S
+    in_period, in_level = round(PERIOD_S / h), round(LEVEL_S / h)
+    lines = np.cos(np.outer(np.arange(in_period) * h, omega) + PHASES) @ sizes
+    count = machine.torque_quantum if by == "offset" else machine.speed_quantum
+    sent = np.round((lines if by == "offset" else MEAN + lines) / count) * count
+    # the command's spectrum, held from sample to sample, through the loop
+    spectrum = np.fft.rfft(sent - sent.mean())
+    s = 2j * np.pi * np.fft.rfftfreq(in_period, h)
+    s[0] = 1e-9j
+    held = (1.0 - np.exp(-s * h)) / (s * h)
+    wave = [np.fft.irfft(part, in_period) for part in machine.reported(machine.driven(by, s) * held * spectrum, s)]
+    total = 2 * in_level + counted * in_period
+    noise = _noise(machine, total, rng)
+    dither = 3.0 * machine.speed_quantum * np.sin(2.0 * np.pi * 0.3031 * np.arange(total) * h)
+    start = 100.0
+    time = np.concatenate([np.arange(in_level) * h, 40.0 + np.arange(in_level) * h,
+                           start + np.arange(counted * in_period) * h])
+    at = np.repeat([*LEVELS, MEAN], [in_level, in_level, counted * in_period])
+    moving = [np.concatenate([np.zeros(2 * in_level), np.tile(part, counted)]) for part in wave]
+    speed = at + dither + moving[0] + noise[0] + machine.speed_noise * rng.standard_normal(total)
+    torque = machine.coulomb + machine.viscous * at + moving[1] + noise[1]
+    torque += machine.torque_noise * rng.standard_normal(total)
+    segment = Segment(
+        start, start + counted * PERIOD_S, PERIOD_S, 0, MEAN, tuple(HARMONICS / PERIOD_S),
+        tuple(sizes) if by == "reference" else (0.0,) * len(sizes), tuple(PHASES),
+        tuple(sizes) if by == "offset" else (),
+    )
+    return Recording(
+        time_s=time, speed_rad_s=np.round(speed / machine.speed_quantum) * machine.speed_quantum,
+        torque_nm=np.round(torque / machine.torque_quantum) * machine.torque_quantum,
+        fresh=np.ones(total, dtype=bool), limited=np.zeros(total, dtype=bool),
+        excitation=Excitation("multisine", "speed", (segment,)),
+        levels=(Level(0.0, LEVEL_S - h), Level(40.0, 40.0 + LEVEL_S - h)), lag_prior=prior or LagPrior(),
+        speed_resolution_rad_s=machine.speed_quantum, torque_resolution_nm=machine.torque_quantum,
+        torque_scale_rel_sd=scale_sd, impedance=ImpedanceInput(by, count, declared, ZETA),
+    )
+
+
+def _noise(machine, total, rng):
+    """Reported speed and torque of what disturbs the loop, (2, total)."""
+    h = machine.period
+    s = 2j * np.pi * np.fft.rfftfreq(total, h)
+    s[0] = s[1]
+    white = np.sqrt(0.002 / h)
+    keep = np.exp(-h / machine.load_time)
+    load, ripple, sensor = (np.fft.rfft(rng.standard_normal(total)) for _ in range(3))
+    load = load * machine.load_sd * np.sqrt(1.0 - keep**2) / (1.0 - keep * np.exp(-s * h))
+    ripple, sensor = white * machine.ripple_sd * ripple, white * machine.sensor_sd * sensor
+    z = machine.impedance(s.imag / (2.0 * np.pi))
+    loop = machine.law(s) / (1.0 + machine.speed_filter * s)
+    speed = (load + ripple - loop * sensor) / z
+    torque = ripple - loop * (speed + sensor)
+    seen = (speed + sensor) / (1.0 + machine.speed_report * s), torque / (1.0 + machine.torque_report * s)
+    return [np.fft.irfft(part, total) for part in seen]
+
+
+def found(recording):
+    """What is found of its impedance, without all that is found of its inertia."""
+    case = Case(recording, Options(), samples=usable_samples(recording))
+    periodic = measured(case, recording.excitation)
+    assert isinstance(periodic, PeriodicCase)
+    return measure_impedance(periodic)
