@@ -84,7 +84,8 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
     for name, summary in _COMMANDS.items():
         # Options are written out in full: no `--y` may stand for --yes.
         sub = commands.add_parser(
-            name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False
+            name, help=summary, description=summary[0].upper() + summary[1:] + "." * (summary[-1] != "?"),
+            allow_abbrev=False,
         )
         if name == chosen:
             _builder(name)(sub)
