@@ -145,8 +145,8 @@ def by_road(road: str, request: FleetRequest, kills: int, function: Any, workers
         summary = run_fleet(replace(request, jobs=2 if road == "pool" else 1), killer, function=function)
     rows = summary.rows
     names = Counter(row.log for row in rows)
-    print(f"{road:5}: {len(rows)} rows, {sum(not row.failed for row in rows)} results, "
-          f"{dict(Counter(str(row.error_kind) for row in rows if row.failed))}; {killer.kills} killed; "
+    bad = Counter(row.error_kind or row.verdict for row in rows if row.verdict not in ("valid", "valid_wide"))
+    print(f"{road:5}: {len(rows)} rows, {len(rows) - bad.total()} results, {dict(bad)}; {killer.kills} killed; "
           f"lost {summary.left}, twice {sum(count > 1 for count in names.values())}; "
           f"{summary.cpu_s / max(1, len(rows)):.3f} s CPU a log, {time.monotonic() - began:.0f} s in all", flush=True)
     return rows
