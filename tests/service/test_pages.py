@@ -217,6 +217,8 @@ def test_a_stop_that_nobody_hears_says_so(page, served, way):
         page.route("**/stop", lambda route: None)           # neither an answer nor an error
     page.get_by_role("button", name="Stop", exact=True).click()
     page.get_by_text("NOT DELIVERED: use the hard-wired stop").wait_for()
+    if way == "offline":
+        page.get_by_text("asking …").wait_for(state="hidden")
     assert served.service.store.status(run).stop.asked is None
 
 

@@ -368,6 +368,7 @@
         undelivered = true;
       } finally {
         asking = null;
+        stopTimes();
         stopAlarm();
       }
     });
