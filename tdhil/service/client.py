@@ -131,6 +131,23 @@ class Client:
             found = self._object("GET", f"/runs/{quote(run, safe='')}/replays/{found['name']}")
         return found
 
+    def fleet(self, folder: str = "", *, below: str = "", **settings: Any) -> dict[str, Any]:
+        """Identify many logs again, the service's own runs or a folder of ``--logs``; comes back when that has ended.
+
+        ``settings``: ``model``, ``tolerance``, ``confidence``. The same again does what is left.
+        """
+        found = self._object("POST", "/fleets", {"folder": folder, "below": below, **settings})
+        while found["state"] == "running":
+            time.sleep(0.5)
+            found = self._object("GET", f"/fleets/{found['id']}")
+        return found
+
+    def fleet_rows(self, fleet: str, start: int = 0, limit: int = 200) -> list[dict[str, Any]]:
+        """A row a log, as `tdhil.fleet.FleetRow`."""
+        asked = urlencode({"from": start, "limit": limit})
+        found: list[dict[str, Any]] = self._json("GET", f"/fleets/{quote(fleet, safe='')}/rows?{asked}")
+        return found
+
     def wait(
         self, run: str, *, every_s: float = 0.2, timeout_s: float | None = None,
         seen: Callable[[dict[str, Any]], None] = lambda run: None,

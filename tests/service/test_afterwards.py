@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -110,6 +111,7 @@ def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, servi
         fleets.ask("logs", "below", {}, "local")
     held = wait_for("logs that are found", lambda: (one := fleets.get(fleet)).total and one)
     assert (held.held, held.total, held.done) == (True, 2, 0)
+    assert os.getpriority(os.PRIO_PROCESS, fleets._going.process.pid) == 19
     turns[0] = False
     wait_for("its end", lambda: fleets.get(fleet).state != "running")
     found = call("GET", f"/fleets/{fleet}", 200)

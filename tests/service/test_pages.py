@@ -393,14 +393,29 @@ def test_a_newcomer_clicks_twice_and_has_a_result(browser, tmp_path):
     began_s = time.monotonic()
     with process(tmp_path / "data") as server:
         page = browser.new_context(base_url=server.url).new_page()
+        page.set_default_timeout(300_000)
         page.goto("/")
         page.get_by_role("article", name="Simulated rig, CANopen").get_by_role("link", name="Start").click()
         clicked_s = time.monotonic()
         page.get_by_role("button", name="Start").click()
-        page.get_by_role("link", name="To the result").click(timeout=300_000)
+        page.get_by_role("link", name="To the result").click()
         page.get_by_text("J = 104").wait_for()
         took_s = time.monotonic() - clicked_s
         page.locator(".pictures img").nth(4).evaluate("one => { one.loading = 'eager'; return one.decode() }")
+        run = server.client.runs()[0]["id"]
+        page.get_by_label("How tight").fill("0.1")
+        page.get_by_role("button", name="Replay").click()
+        page.get_by_role("row", name="tolerance 0.001").get_by_text("valid_wide").wait_for()
+        page.get_by_role("row", name="the run itself").get_by_role("cell", name="valid", exact=True).wait_for()
+        for name, begins in (("report.pdf", b"%PDF"), ("samples.csv", b"time_s,"), ("run.mcap", b"\x89MCAP")):
+            with page.expect_download() as loaded:
+                page.locator(".files").get_by_role("link", name=name).click()
+            assert loaded.value.path().read_bytes().startswith(begins)
+        page.get_by_role("link", name="Fleet").click()
+        page.get_by_role("button", name="Identify").click()
+        page.get_by_text("done: 1 of 1 logs").wait_for()
+        page.get_by_role("row", name=run).get_by_text("the same").wait_for()
+        assert [row["changed"] for row in server.client.fleet_rows(server.client.fleet()["id"])] == [False]
         print(f"a click to a result: {took_s:.0f} s, {clicked_s - began_s:.0f} s from the command to the click;"
               f" load {os.getloadavg()[0]:.1f}")
 
