@@ -6,6 +6,7 @@ and rounded.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -72,8 +73,12 @@ class Machine:
         return speed / (1.0 + self.speed_report * s), torque / (1.0 + self.torque_report * s)
 
 
+@cache
 def command(machine, by, peak=None):
-    """Sizes of the lines: what the field rig's window (3.5 rad/s about its mean) and torque (200 N·m) leave."""
+    """Sizes and phases of the lines: what the field rig's window (3.5 rad/s about its mean) and torque (190 N·m) leave.
+
+    By the offset with the best of some phases, as a run draws them.
+    """
     hertz = HARMONICS / PERIOD_S
     s = 2j * np.pi * hertz
     if by == "offset":
@@ -82,25 +87,31 @@ def command(machine, by, peak=None):
     else:
         sizes = 1.0 / np.hypot(1.0, s.imag)
     speed = machine.driven(by, s)
-    grid = np.exp(1j * (np.outer(np.arange(0.0, PERIOD_S, 0.01), s.imag) + PHASES))
+    grid = np.exp(1j * np.outer(np.arange(0.0, PERIOD_S, 0.02), s.imag))
 
-    def highest(lines):
-        return np.max(np.abs((grid @ (sizes * lines)).real))
+    def most(phases):
+        def highest(lines):
+            return np.max(np.abs((grid @ (sizes * lines * np.exp(1j * phases))).real))
 
-    most = min(3.5 / highest(speed), 200.0 / highest((machine.inertia * s + machine.viscous) * speed))
-    if by == "offset":
-        most = min(most, 160.0 / highest(np.ones(len(s))))
-    return sizes * (most if peak is None else peak / highest(np.ones(len(s))))
+        if peak is not None:
+            return peak / highest(np.ones(len(s)))
+        within = min(3.5 / highest(speed), 190.0 / highest((machine.inertia * s + machine.viscous) * speed))
+        return min(within, 160.0 / highest(np.ones(len(s)))) if by == "offset" else within
+
+    rng = np.random.default_rng(1)
+    drawn = [PHASES, *(rng.uniform(0.0, 2.0 * np.pi, (300 * (by == "offset" and peak is None), len(s))))]
+    best = max(drawn, key=most)
+    return sizes * most(best), best
 
 
 def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, scale_sd=0.0, declared=0.0):
     """A Recording: two levels, then the counted periods."""
     rng = np.random.default_rng(seed)
     h = machine.period
-    sizes = command(machine, by, peak)
+    sizes, phases = command(machine, by, peak)
     omega = 2.0 * np.pi * HARMONICS / PERIOD_S
     in_period, in_level = round(PERIOD_S / h), round(LEVEL_S / h)
-    lines = np.cos(np.outer(np.arange(in_period) * h, omega) + PHASES) @ sizes
+    lines = np.cos(np.outer(np.arange(in_period) * h, omega) + phases) @ sizes
     count = machine.torque_quantum if by == "offset" else machine.speed_quantum
     sent = np.round((lines if by == "offset" else MEAN + lines) / count) * count
     # the command's spectrum, held from sample to sample, through the loop
@@ -122,7 +133,7 @@ def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, s
     torque += machine.torque_noise * rng.standard_normal(total)
     segment = Segment(
         start, start + counted * PERIOD_S, PERIOD_S, 0, MEAN, tuple(HARMONICS / PERIOD_S),
-        tuple(sizes) if by == "reference" else (0.0,) * len(sizes), tuple(PHASES),
+        tuple(sizes) if by == "reference" else (0.0,) * len(sizes), tuple(phases),
         tuple(sizes) if by == "offset" else (),
     )
     return Recording(

@@ -13,7 +13,7 @@ from tdhil.estimation.impedance import lines_of
 from tdhil.recording import LagPrior
 from tdhil.recording.builder import RecordingBuilder
 from tests.estimation import impedance_bench
-from tests.estimation.impedance_bench import HARMONICS, PERIOD_S, PHASES, SETTINGS, ZETA, Machine, command, found
+from tests.estimation.impedance_bench import HARMONICS, PERIOD_S, SETTINGS, ZETA, Machine, command, found
 
 record = partial(impedance_bench.record, counted=12)       # half of what a run takes, and of the time to reckon
 NAMED = pytest.mark.parametrize("name", SETTINGS)
@@ -150,7 +150,8 @@ def test_the_command_is_what_was_sent_rounded_and_held():
     recording = record(drive, seed=1, counted=6)
     case = measured(Case(recording, Options(), samples=usable_samples(recording)), recording.excitation)
     hertz = HARMONICS / PERIOD_S
-    sent = np.cos(np.outer(np.arange(5000) * 0.004, 2.0 * np.pi * hertz) + PHASES) @ command(drive, "offset")
+    sizes, phases = command(drive, "offset", None)
+    sent = np.cos(np.outer(np.arange(5000) * 0.004, 2.0 * np.pi * hertz) + phases) @ sizes
     sent = np.round(sent / 5.0) * 5.0
     fine = np.repeat(sent, 50)         # held, and integrated in steps of 80 µs
     middle = (np.arange(len(fine)) + 0.5) * 0.004 / 50
