@@ -84,7 +84,7 @@ def test_rig_example_is_valid_with_its_commented_keys_too(tmp_path):
 
 
 def _indented(line: str) -> str:
-    inside = ("lag", "temperature", "length", "diameter", "tolerance")
+    inside = ("lag", "filter", "temperature", "length", "diameter", "tolerance")
     return ("  " if any(word in line for word in inside) else "") + line
 
 
