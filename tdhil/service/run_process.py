@@ -209,7 +209,7 @@ class RunProcess:
 
         code = int(exit_code(error))
         if not isinstance(error, TdhilError):
-            traceback.print_exception(error)
+            tell("".join(traceback.format_exception(error)))
         self._end(_cut_short(code, None), code, error=Told.of(error))
         return code
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,6 +22,7 @@ from tdhil.service.attending import (
     Lease,
     ServiceAttendant,
     Watcher,
+    tell,
 )
 from tdhil.service.states import State, Status, now
 from tdhil.service.store import Store
@@ -324,6 +326,15 @@ def test_what_a_drive_says_of_itself_is_text(board):
 def test_a_step_that_cannot_be_ends_no_run(board):
     board.to(State.DONE)
     assert board.status.state is State.REQUESTED
+
+
+def test_a_line_for_a_log_that_takes_none_is_nobody_s_error(monkeypatch):
+    full = Path("/dev/full").open("w")                     # noqa: SIM115
+    monkeypatch.setattr("sys.stderr", full)
+    tell("no space for this")
+    monkeypatch.undo()
+    with pytest.raises(OSError, match="No space"):
+        full.close()
 
 
 def test_a_full_disk_holds_nobody_up(board, monkeypatch):
