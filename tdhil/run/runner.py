@@ -249,7 +249,9 @@ class Runner:
                 control = MeanSpeedControl(speed.model, 0.25 * limits.torque_nm, assumptions)
                 run_hold(loop, limits, speed.model, control, start, drifted.speed_rad_s, resolution_rad_s)
         with self._book.stage("acquire", program.longest_s):
-            run_virtual_string(loop, limits, case, program, self._log.virtual, self._say)
+            run_virtual_string(
+                loop, limits, case, program, self._log.virtual, self._say, resolution_rad_s, speed.high.speed_sd_rad_s
+            )
 
     def _run_offset(
         self, task: Task, loop: ControlLoop, speed: SpeedResult, ramps: tuple[Ramp, ...], resolution_rad_s: float

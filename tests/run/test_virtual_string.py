@@ -13,7 +13,7 @@ from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRef
 from tdhil.run.runner import Runner
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.task import Task
-from tdhil.soft_torque import COLUMNS, RPM, EvaluationRefused, Phase, Program, Rig
+from tdhil.soft_torque import COLUMNS, RPM, EvaluationRefused, Outcome, Phase, Program, Rig, evaluate
 from tests.run.fake_drive import LIMITS, FakeDrive, FakeLog
 from tests.run.run_outcomes import assert_at_rest, outcomes, up_to
 from tests.soft_torque.test_evaluation import CASE
@@ -154,3 +154,20 @@ def test_a_result_of_another_rig_is_refused(world, course):
     result = runner(here, other).run()
     assert isinstance(result.cause, PreflightRefused) and "this shaft has about" in str(result.cause)
     assert_at_rest(here, result)
+
+
+def test_a_torque_limit_that_acts_fades_the_string_out_and_leaves_no_result(world, course):
+    tight = replace(ROOM, torque_nm=350.0)
+    here = world(FakeDrive(), tight)
+    result = runner(here, BENCH, tight).run()
+    assert result.cause is None
+    assert [stage.outcome for stage in result.stages] == ["ok"] * 5
+    assert_at_rest(here, result)
+    rows = rows_of(here)
+    assert rows["clamped"].any() and rows["phase"].max() == Phase.DONE
+    first = int(np.flatnonzero(rows["clamped"])[0])
+    assert np.all(np.diff(rows["share"][first:]) <= 0.0) and rows["share"][-1] == 0.0
+    assert max(abs(one.torque_nm) for one in here.drive.commands) <= 350.0
+    assert ("limits", "virtual string: the torque limit acts; it is faded out") in here.log.events
+    found = evaluate(np.array(here.log.rows), BENCH, Program(45.0 * RPM, 79.0 * RPM))
+    assert found.outcome is Outcome.INVALID and "torque limit" in found.why

@@ -20,8 +20,10 @@ from tdhil.run.settings import MachineLimits
 from tdhil.run.stages.steady import wait_until_steady
 from tdhil.soft_torque import RPM, EvaluationCase, HostLoop, Phase, Program
 
-STRANGE_SHARE = 0.1
-"""Of the speed limit, that the report may be away from what the observer expects."""
+STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
+"""Of the speed limit, counts of the reported speed, and standard deviations of its noise: by the most of these the
+report may be away from what the observer expects. A lag or an inertia that is believed wrongly by a tenth makes it a
+fifth of the first; a lost load or torque is seen in a tenth of a second."""
 RMS_S = 5.0
 ENERGY_SHARE = 0.05
 """Of what the string holds as the bit breaks away, that may have been put in."""
@@ -81,15 +83,16 @@ def go_to(
 
 def run_virtual_string(
     loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program, keep: Keep,
-    say: Callable[[str], None],
+    say: Callable[[str], None], resolution_rad_s: float, noise_rad_s: float,
 ) -> None:
-    """All of the course, from steady rotation at its first speed in torque mode; ``keep`` gets a row a cycle.
+    """All of the course, from steady rotation at its first speed; ``keep`` gets a row a cycle.
 
+    ``resolution_rad_s``, ``noise_rad_s``: of the reported speed, a count and a standard deviation.
     Raises LimitHit, and what the bench raises.
     """
     host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm,
                     case.own_loop)
-    ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program)
+    ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program, resolution_rad_s, noise_rad_s)
     last = loop.last
     speed = last.speed_rad_s if last is not None else program.start_rad_s * ratio
     torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
@@ -123,9 +126,14 @@ def run_virtual_string(
 class _Watch:
     """Looks at every cycle of the loop, and raises LimitHit."""
 
-    def __init__(self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program) -> None:
+    def __init__(
+        self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program,
+        resolution_rad_s: float, noise_rad_s: float,
+    ) -> None:
         assert case.string.bit is not None
-        self._strange_rad_s = STRANGE_SHARE * limits.speed_max_rad_s
+        self._strange_rad_s = max(
+            STRANGE_SHARE * limits.speed_max_rad_s, STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s
+        )
         self._gear = case.rig.gear_ratio
         self._peak_nm = program.peak_nm
         wound_up_j = 0.5 * case.string.bit.static_nm**2 / case.string.stiffness_nm_rad
