@@ -10,7 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 _SCRIPT = """
-import functools, os, sys
+import functools, os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)        # a shell's `&` has what it starts ignore it
 os.open(os.ttyname(0), os.O_RDWR)                  # its controlling terminal from now on
 import tdhil.fleet
 from tdhil.cli.main import main
