@@ -39,6 +39,7 @@ CASES = {
     "two poles": replace(NOISY, speed_lags_s=(0.30, 0.10)),
     "quick reports": replace(NOISY, speed_lags_s=(0.03,), torque_lags_s=(0.01,)),
     "heavy motor": replace(NOISY, motor=4000.0),
+    "heavy bit": Loaded(bottom=1000.0),
     "stated": NOISY,
 }
 STATED = LagPrior(0.40, 0.02, 0.15, 0.01, "the manual")       # of the case `stated`

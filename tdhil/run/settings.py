@@ -23,6 +23,7 @@ class MachineLimits:
     load: str = "none"                 # none, string
     torque_ramp_nm_s: float = 0.0      # with a string: how fast trapped torque is brought down
     wave_impedance_nm_s_rad: float = 0.0   # of a string's pipe, where its sizes are known; 0: they aren't
+    echo_s: float = 0.0                # 2L/v, where its sizes are known: until a wave comes back
     temperature_c: float | None = None     # °C; where the drive tells a temperature it is stopped above it
     accept_no_watchdog: bool = False   # the operator takes a drive that won't stop by itself (--accept-no-watchdog)
     accept_shared_watchdog: bool = False   # … or one that any client feeds (--accept-shared-watchdog)

@@ -97,6 +97,7 @@ def machine_limits(
         allow_reverse=bench.allow_reverse,
         load=bench.load.kind,
         wave_impedance_nm_s_rad=0.0 if pipe is None else pipe.impedance_nm_s_rad,
+        echo_s=0.0 if pipe is None else 2.0 * pipe.delay_s,
         torque_ramp_nm_s=bench.torque_ramp_nm_s or 0.0,
         accept_no_watchdog=accept_no_watchdog,
         accept_shared_watchdog=accept_shared_watchdog,

@@ -183,4 +183,6 @@ def test_pseudo_random_torque():
     usual = np.abs(np.fft.rfft(elements))[1:31]
     assert usual.min() > 0.4 * usual.max()
     chosen = choose(LIMITS, GUESS, ExcitationWish(kind="prbs"), Knowledge(assumed_noise(400.0, 10.0), LagPrior()), 0.95)
+    with pytest.raises(PlanRefused, match=r"0\.1 Hz apart"):
+        make_plan(LIMITS, GUESS, ExcitationWish(kind="prbs", frequency_hz=0.1))
     assert math.isnan(chosen.half_width) and math.isnan(chosen.usual_half_width)

@@ -370,7 +370,10 @@ def test_an_echo_is_not_looked_for_without_a_pipe(limits):
     with pytest.raises(PreflightRefused, match="whose pipe is known") as caught:
         refuse_with_string(limits, ExcitationRequest(kind="prbs"), preflight_of())
     assert "length_m" in caught.value.next_step
-    refuse_with_string(replace(STRING, wave_impedance_nm_s_rad=300.0), ExcitationRequest(kind="prbs"), preflight_of())
+    piped = replace(STRING, wave_impedance_nm_s_rad=300.0, echo_s=1.4)
+    refuse_with_string(piped, ExcitationRequest(kind="prbs"), preflight_of())
+    with pytest.raises(PreflightRefused, match=r"after 0\.30 s"):
+        refuse_with_string(replace(piped, echo_s=0.3), ExcitationRequest(kind="prbs"), preflight_of())
 
 
 @pytest.mark.parametrize("title", ["quick-stop option", "something else"])

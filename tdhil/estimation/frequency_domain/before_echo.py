@@ -10,7 +10,7 @@ for anything that answers linearly, b(t) = ∫ r(x) a(t − x) dx,
 r is not the string's whole echo but what the bottom makes of *one* wave: what runs up and down again and again passes
 the top, whose motion is measured, and is in a. So r is short, whatever the string's damping. It is unknown: next to
 nothing until 0.97 · 2L/v (`_UNEVEN`: pipes are worn, and mud drags along them), and from there anything of the size of
-a full reflection, dying away within some seconds. A dense line spectrum, 1/P apart, sees it over a whole period P. How
+a full reflection, dying away within 16 s. A dense line spectrum, 1/P apart, sees it over a whole period P. How
 the bit answers is fitted with the rest, and what it scatters by is noise like any other. A bit that sticks and slips
 answers in no such way, and is told by its swing.
 
@@ -50,10 +50,11 @@ from tdhil.recording import FloatArray, LagPrior, Pipe
 
 RESISTANCE, ECHO = 2, 3     # in m: ζ, and the first of r
 _FASTER = 0.97              # of 2L/v: waves may be a little faster than in a smooth pipe of nominal steel
-_FINER = 4.0                # instants of r per half a cycle of the fastest line
-_FULL = 0.5                 # of r at first: four of them make up a reflection
-_DIES_S = 3.0               # to 1/e
-_LASTS_S = 6.0
+_FINER, _LATE_FINER = 4.0, 1.4     # instants of r per half a cycle of the fastest line; from _LATE_S on
+_FULL = 1.0                 # of r over half a cycle, about a full reflection at first
+_DIES_S = 5.0               # to 1/e
+_LATE_S = 3.0
+_LASTS_S = 16.0
 _UNEVEN = 0.01              # of r before the echo
 _TOP_SHARE = 0.05           # of ζ: the top's own friction
 _MOST = 5.0
@@ -63,12 +64,15 @@ class EchoShaft:
     """J (kg·m²), B, ζ (N·m·s/rad), r_1 … r_N. Known of it are ζ, to the pipe's tolerance, and how large r may be."""
 
     def __init__(self, pipe: Pipe, fastest_hz: float) -> None:
-        step_s = 1.0 / (2.0 * fastest_hz * _FINER)
+        half_s = 0.5 / fastest_hz
         self.echo_s = _FASTER * 2.0 * pipe.delay_s
-        self.at_s: FloatArray = np.arange(step_s, self.echo_s + _LASTS_S, step_s)
-        late = self.at_s - self.echo_s
+        late_s, end_s = self.echo_s + _LATE_S, self.echo_s + _LASTS_S
+        fine: FloatArray = np.arange(half_s / _FINER, late_s, half_s / _FINER)
+        self.at_s: FloatArray = np.concatenate([fine, np.arange(late_s, end_s, half_s / _LATE_FINER)])
         self.pipe = pipe
-        size: FloatArray = np.where(late < 0.0, _UNEVEN, _FULL * np.exp(-np.maximum(late, 0.0) / _DIES_S))
+        after = np.maximum(self.at_s - self.echo_s, 0.0)
+        size = np.where(self.at_s < self.echo_s, _UNEVEN, _FULL * np.exp(-after / _DIES_S))
+        size /= np.sqrt(np.where(self.at_s < late_s, _FINER, _LATE_FINER))
         self.held = len(self.at_s)
         self.names = ("inertia", "viscous", "resistance", *(f"echo_{n}" for n in range(len(self.at_s))))
         self.inertia_row, self.viscous_row = np.eye(2, len(self.names))
@@ -108,7 +112,7 @@ class EchoShaft:
         zeta, at = self.pipe.impedance_nm_s_rad, self.at_s
         first = int(np.argmin(np.abs(at - 2.0 * self.pipe.delay_s)))
         slow_s = self.pipe.inertia_kg_m2 / zeta
-        echo = np.where(at >= at[first], 1.8 * (at[1] - at[0]) / slow_s * np.exp((at[first] - at) / slow_s), 0.0)
+        echo = np.where(at >= at[first], 1.8 * np.gradient(at) / slow_s * np.exp((at[first] - at) / slow_s), 0.0)
         echo[first] -= 0.9
         return np.concatenate([[inertia, 0.0, zeta], echo])
 
@@ -197,8 +201,8 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
         finding,
         inertia=inertia,
         conditions=(
-            f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away in some"
-            " seconds",
+            f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away within"
+            f" {_LASTS_S:g} s",
             f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {told}",
             *of_reports(case.recording.lag_prior),
         ),

@@ -28,6 +28,7 @@ from tdhil.run.excitation.reference import (
     make_transition,
 )
 from tdhil.run.excitation.signals import (
+    ECHOES_S,
     PeriodicKind,
     Shape,
     unit_peak,
@@ -36,6 +37,7 @@ from tdhil.run.excitation.speed_loop import Following, fit_following, held_back_
 
 __all__ = [
     "CALM_S",
+    "ECHOES_S",
     "LEAST_COUNTED",
     "DriveMode",
     "ExcitationKind",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.config import DEFAULT_EXCITATION
+from tdhil.config import DEFAULT_EXCITATION, told_before_echo
 from tdhil.recording import Segment
 from tdhil.run.excitation import signals
 from tdhil.run.excitation.reference import (
@@ -289,6 +289,11 @@ def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
     frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
     if not (math.isfinite(frequency) and frequency > 0.0):
         raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
+    if told_before_echo(wish.kind) and frequency > kind.frequency_hz:
+        raise PlanRefused(
+            f"{wish.kind} with lines {frequency:g} Hz apart can't tell an echo from what was before it",
+            f"Leave --frequency out ({kind.frequency_hz:g} Hz), or give a lower one",
+        )
     if wish.shape is not None:
         return wish.shape, frequency
     return kind.shape(), frequency

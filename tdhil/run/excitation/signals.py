@@ -205,6 +205,9 @@ STEP = PeriodicKind(shape=step_shape, frequency_hz=STEP_FREQUENCY_HZ)
 
 
 PRBS_FREQUENCY_HZ = 0.05
+ECHOES_S = (0.7, 3.8)
+"""What comes back earlier hardly lets the fastest line turn once, and what comes back later is not over in a period."""
+
 _ORDER, _TAPS = 6, (6, 5)
 _PRBS_LINES = 30
 
