@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from tdhil.errors import UsageError
-from tdhil.report.content import report_of
+from tdhil.report.content import Picture, report_of
 from tdhil.report.document import result_document
-from tdhil.report.html import check_report_path, report_page, sha256_of, write_report
+from tdhil.report.html import check_report_path, pictures_in, report_page, sha256_of, write_report
 from tdhil.report.plots import envelope
 from tests.report.findings import RUN, bare, full, open_sided, recording
 
@@ -184,3 +184,14 @@ except UsageError as error:
     assert f"{name}: can't be written (Too many open files)" in done.stdout
     assert f"tdhil replay run.mcap --report {name}" in done.stdout
     assert not (tmp_path / name).exists()
+
+
+def test_its_pictures_can_be_taken_out_of_it_each_whole_by_itself():
+    own = recording()
+    report = report_of(result_document(full(), own, RUN, "run.mcap"), own)
+    meant = [(section.heading, block.caption) for section in report.sections for block in section.blocks
+             if isinstance(block, Picture)]
+    found = pictures_in(report_page(report))
+    assert [(one.heading, one.caption) for one in found] == meant
+    assert len(found) >= 4
+    assert {ET.fromstring(one.svg).tag for one in found} == {"{http://www.w3.org/2000/svg}svg"}
