@@ -61,7 +61,7 @@ RIG = "simulated-canopen"
 FOUND_S, STOP_S, LOST_S = 3.0, 0.1, 5.0
 MORE_MISSED, WEB_SHARE = 1e-3, 0.05
 RATE_HZ, VIEWERS = 100.0, 20
-TMPFS_MB = 260                     # a log isn't begun where less than 200 MB are free
+TMPFS_MB = 400                     # a log isn't begun where less than 200 MB are free
 
 
 def load() -> str:
@@ -195,11 +195,15 @@ def mounted(arguments: list[str]) -> int:
     return subprocess.call(["unshare", "--map-root-user", "--mount", sys.executable, __file__, *arguments, "--mounted"])
 
 
-def fill(folder: Path) -> None:
-    """Nothing more can be written there."""
+def nearly_fill(folder: Path) -> None:
+    """One MB is left, which a run's log takes some seconds for."""
     free = os.statvfs(folder)
     with contextlib.suppress(OSError), (folder / "filler").open("ab") as file:
-        os.posix_fallocate(file.fileno(), 0, free.f_bavail * free.f_frsize)
+        os.posix_fallocate(file.fileno(), 0, max(1, free.f_bavail * free.f_frsize - 2**20))
+
+
+def fill(folder: Path) -> None:
+    """Nothing more can be written there."""
     with (folder / "rest").open("ab", buffering=0) as file:
         try:
             while True:
@@ -230,13 +234,25 @@ def stop(folder: Path, times: int, disk: bool) -> bool:
                     continue
                 replays.start()
                 base.execute("begin exclusive")
+                full = disk and number % 2 == 1
+                if full:
+                    nearly_fill(folder)
                 time.sleep(1.0)
-                if disk and number % 2 == 1:      # which ends the run as well, if only a little later
+                if full:      # which ends the run as well, if only a little later
                     fill(folder)
                 asked_s = time.time()
                 answer = server.client.stop(run)
                 answered_s = time.time()
                 status = wait_for("the drive's answer", lambda run=run: seen(data / "runs" / run))
+                if status["stop"]["seen"] is None:         # the full disk came first
+                    early += 1
+                    going.set()
+                    print(f"run {run}: it had braked for its log before it was asked", flush=True)
+                    if early > times:
+                        return False
+                    for name in ("filler", "rest"):
+                        (folder / name).unlink(missing_ok=True)
+                    continue
                 took_s.append(datetime.fromisoformat(status["stop"]["seen"]).timestamp() - asked_s)
                 print(f"stop {number + 1}: answered after {1e3 * (answered_s - asked_s):.0f} ms ({answer['state']}),"
                       f" seen by the drive {1e3 * took_s[-1]:.0f} ms after it was asked for by {status['stop']['by']}",
@@ -259,12 +275,12 @@ def stop(folder: Path, times: int, disk: bool) -> bool:
 
 
 def seen(folder: Path) -> dict[str, Any] | None:
-    """The run's status, from its own mouth: a full disk has an old one."""
+    """The run's status from its own mouth, once the drive brakes; a full disk may have an old one."""
     try:
         found: dict[str, Any] = ask(folder, {"do": "status"})["status"]
     except CommunicationLost:              # it has ended
         found = Store(folder.parent.parent).status(folder.name).plain()
-    return found if found["stop"]["seen"] else None
+    return found if found["stop"]["seen"] or found["state"] in ENDED else None
 
 
 def replay_on(server: Server, run: str, ended: threading.Event) -> None:
