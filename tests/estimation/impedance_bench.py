@@ -75,7 +75,7 @@ class Machine:
 
 @cache
 def command(machine, by, peak=None):
-    """Sizes and phases of the lines: what the field rig's window (3.5 rad/s about its mean) and torque (190 N·m) leave.
+    """Sizes and phases of the lines: what the field rig's window (4 rad/s about its mean) and torque (210 N·m) leave.
 
     By the offset with the best of some phases, as a run draws them.
     """
@@ -83,7 +83,7 @@ def command(machine, by, peak=None):
     s = 2j * np.pi * hertz
     if by == "offset":
         z = np.abs(machine.impedance(hertz))
-        sizes = (2.0 * ZETA * z / (z**2 + ZETA**2)) ** 0.75
+        sizes = 2.0 * ZETA * z / (z**2 + ZETA**2)
     else:
         sizes = 1.0 / np.hypot(1.0, s.imag)
     speed = machine.driven(by, s)
@@ -95,7 +95,7 @@ def command(machine, by, peak=None):
 
         if peak is not None:
             return peak / highest(np.ones(len(s)))
-        within = min(3.5 / highest(speed), 190.0 / highest((machine.inertia * s + machine.viscous) * speed))
+        within = min(4.0 / highest(speed), 210.0 / highest((machine.inertia * s + machine.viscous) * speed))
         return min(within, 160.0 / highest(np.ones(len(s)))) if by == "offset" else within
 
     rng = np.random.default_rng(1)

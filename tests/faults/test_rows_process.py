@@ -97,6 +97,20 @@ def test_row_7_nothing_is_sent_by_kernel_or_thread():
 
 
 @pytest.mark.heavy
+@pytest.mark.heavy
+def test_a_host_that_dies_with_a_torque_offset_at_work(no_bus_of_the_user, tmp_path):
+    """What stands in 60B2h stays, and the drive's own speed loop brings the shaft to rest against it."""
+    with peer(tmp_path, "--stepped", "--seed", 1, program=PLAIN) as drive, host(
+        tmp_path, *drive.options, "--stepped", "--rate", 25, "--impedance", "offset", "--periods", 10
+    ) as running:
+        assert running.wait_for_line("stage acquire …"), running.err
+        begun_s = tail_time(drive.trace)
+        wait_for("the offset", lambda: tail_time(drive.trace) > begun_s + 30.0, running.child)
+        running.child.send_signal(signal.SIGKILL)
+        running.child.wait()
+        stopped_by_its_watchdog(drive)
+
+
 def test_a_rehearsal_over_a_wire(no_bus_of_the_user, tmp_path):
     """`tdhil simulate canopen --fault …` in a process of its own: it learns of the stages from the host."""
     with peer(tmp_path, "--stepped", "--seed", 1, "--fault", "emcy@speed+15s=4310h") as drive, host(

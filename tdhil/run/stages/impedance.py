@@ -40,12 +40,12 @@ PHASES_RAD = (0.4081, 5.3094, 1.6031, 0.07, 3.2103, 0.7969, 5.0826, 4.208, 5.651
 """Equal lines with them have a crest of 1.75: found by a search with growing p-norms."""
 PERIOD_S = 20.0            # lines of 0.05 to 1.5 Hz: where strings swing, and where speed loops end
 COUNTED, SETTLE = 24, 2    # periods; the offset is faded in over the first of those that settle
-DRAWS, SHARPNESS = 400, 0.75   # of phases, of which the best is taken; how much the lines follow what |r| hangs on
+DRAWS, SHARPNESS = 400, 1.0   # of phases, of which the best is taken; how much the lines follow what |r| hangs on
 
 LARGEST_SHARE = 0.4
 """Of the torque limit, that an offset may be at most; the rest is the speed loop's."""
 PILOT_SHARE, PILOT_PERIODS = 0.05, 2
-ROOM_SHARE = 0.8           # of the room in speed and torque, that is planned for
+ROOM_SHARE = 0.9           # of the room in speed and torque, that is planned for
 FADE_S = 2.0               # at the end
 LEAST_COUNTED = 6
 RESERVE_S = 10.0           # of the time limit, beside what stage 5 is planned for
