@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.path.path_runs import PLAIN, Shaft, host, peer, tdhil, wait_for
+from tests.path.path_runs import Shaft, host, peer, tdhil, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLANT = """plant: {kind: rigid, inertia_kg_m2: 1500, viscous_nm_s_rad: 8, coulomb_nm: 60}
@@ -126,7 +126,7 @@ def test_a_fault_while_the_bit_sticks_and_slips_ends_with_a_shaft_at_rest(files,
 @pytest.mark.heavy
 def test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_drive_s_watchdog(files):
     """The drive goes on with the last torque for the watchdog's time, then brakes by itself; nothing turns back."""
-    with peer(files, "--stepped", "--seed", 1, "--plant", files / "plant.yaml", program=PLAIN) as drive, host(
+    with peer(files, "--stepped", "--seed", 1, "--plant", files / "plant.yaml") as drive, host(
         files, *drive.options, "--stepped", "--rate", 50, "--rig", files / "rig.yaml", "--controller",
         files / "tune.json", "--virtual-string", EXAMPLES / "string.yaml", command="evaluate",
     ) as running:
