@@ -255,8 +255,8 @@ def load_what_the_end_needs(report: bool) -> None:
         Verdict,  # noqa: F401
         identify,  # noqa: F401
     )
-    from tdhil.report import card_text, result_document, write_report  # noqa: F401
-    from tdhil.session import conclusion  # noqa: F401
+    from tdhil.report import card_text, evaluation_document, result_document, write_report  # noqa: F401
+    from tdhil.session import conclusion, evaluation  # noqa: F401
 
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners when it needs them

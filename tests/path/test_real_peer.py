@@ -93,7 +93,7 @@ def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
     done = identify(tmp_path, *drive.options, "--rig", rig, "--yes")
     assert done.code == 4
     assert done.document["error"]["kind"] == "PreflightRefused"
-    for said in ("5 entries", "speed (likely): CiA 402-2, 606Ch", "watchdog (likely)", "profiles show generic/cia402",
+    for said in ("6 entries", "speed (likely): CiA 402-2, 606Ch", "watchdog (likely)", "profiles show generic/cia402",
                  "--accept-unverified likely", "nothing has moved"):
         assert said in done.err
     partly = identify(tmp_path, *drive.options, "--rig", rig, "--yes", "--accept-unverified", "speed",
