@@ -99,7 +99,7 @@ def test_what_nobody_verified_is_refused_with_its_sources(tmp_path, drive, rig):
     partly = identify(tmp_path, *drive.options, "--rig", rig, "--yes", "--accept-unverified", "speed",
                       "--accept-unverified", "watchdog")
     assert partly.code == 4
-    assert "3 entries" in partly.err
+    assert "4 entries" in partly.err
     assert "speed (likely)" not in partly.err
     shaft = assert_untouched(drive)
     assert not shaft.events("heartbeat supervision began")

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from drivers import PreflightRefused
-from tdhil.service import attending
 from tdhil.service.attending import Board, Confirming, Lease
 from tdhil.service.states import Confirmation, State, Stop, now, way_to
 from tdhil.service.store import Store, read_json, write_json
@@ -34,7 +33,6 @@ def main(folder: Path) -> None:
     watched = request.motion == "watched"
     confirming = Confirming("b" * 64, lambda: None, watched=watched)
     leases: list[Lease] = []
-    attending.LEASE_S, attending.SILENT_S = 2.5, 1.5   # nobody has the time
     confirming.code = "123456"
 
     def answer(asked):

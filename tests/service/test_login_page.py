@@ -30,7 +30,7 @@ def served(tmp_path: Path, rigs: Path, people: None, tls: tuple[Path, Path]) -> 
 def page(browser: Any, served: Served) -> Iterator[Any]:  # noqa: F811
     context = browser.new_context(base_url=served.url, ignore_https_errors=True, color_scheme="dark",
                                   viewport={"width": 390, "height": 800}, bypass_csp=bool(os.environ.get("TDHIL_AXE")))
-    context.set_default_timeout(20_000)
+    context.set_default_timeout(60_000)
     found = context.new_page()
     trouble: list[str] = []
     found.on("pageerror", lambda error: trouble.append(str(error)))

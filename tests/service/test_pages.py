@@ -86,7 +86,7 @@ def browser() -> Iterator[Any]:
 def page(browser: Any, served: Served) -> Iterator[Any]:
     """A page that loads nothing from elsewhere, and whose script makes no mistake."""
     context = browser.new_context(base_url=served.url)
-    context.set_default_timeout(20_000)
+    context.set_default_timeout(60_000)
     found = context.new_page()
     trouble: list[str] = []
     found.on("pageerror", lambda error: trouble.append(str(error)))
@@ -308,7 +308,7 @@ def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_mome
     page.evaluate(HIDE, True)
     page.wait_for_timeout(1000)
     page.evaluate(HIDE, False)
-    page.wait_for_timeout(3000)            # longer than a lease, as these runs have it
+    page.wait_for_timeout(5500)            # longer than a lease
     status = served.service.store.status(run)
     assert (status.state, status.watch.gone) == ("moving", None)
     copy = page.context.new_page()         # a tab that is copied has what the first had kept: the later one holds
