@@ -75,7 +75,8 @@ def test_a_real_drive_moves_with_its_code_and_no_other(tmp_path):
         wait_for("its end", lambda: not supervisor.live())
         second = supervisor.start_run("real", {}, "local").request.id
         service.wait(second, "awaiting_confirmation")
-        shown = wait_for("the code", lambda: next((one for one in service.said if f"run {second})" in one), None))
+        asked = f"run {second}. To let it move"
+        shown = wait_for("the code", lambda: next((one for one in service.said if asked in one), None))
         with pytest.raises(Conflict, match="isn't the code"):      # of the run before
             supervisor.confirm(second, code.replace(" ", "") if code not in shown else "000000", None, "local")
         (code,) = re.findall(r"(\d{3} \d{3})\n", shown)
