@@ -138,6 +138,7 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
         key, post = "k" * 16, server.client._object
         binding = server.client.run(run)["confirmation"]["binding"]
         post("POST", f"/runs/{run}/confirm", {"code": code.replace(" ", ""), "binding": binding, "lease": key})
+        wait_for("the run's lease", lambda: server.client.run(run)["watch"])       # begun once the run has its code
         wait_for("motion", lambda: post("POST", f"/runs/{run}/lease", {"key": key})["watch"]
                  and server.client.run(run)["stage"] == "speed")
         post("POST", f"/runs/{run}/lease", {"key": key})
