@@ -249,6 +249,12 @@ class Access:
                 self._say(f"the logins can't be written, and end with this process: {error}")
 
 
+def principal(connection: HTTPConnection) -> Principal:
+    """Who asks, as the middleware has found."""
+    found: Principal = connection.scope.get("user", NOBODY)
+    return found
+
+
 def set_cookies(response: Response, connection: HTTPConnection, cookie: str | None) -> None:
     """Of a login; None: take them back. The browser forgets them when it is closed."""
     for name, value, hidden in ((COOKIE, cookie or "", True),

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-import anyio
 from starlette.responses import FileResponse, Response
 
 from tdhil.config import MODELS
 from tdhil.errors import UsageError
+from tdhil.service.access import principal
 from tdhil.service.answers import FaultView, FleetBody, PictureView
+from tdhil.service.edge import off
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.states import NotAllowed, NotThere
 
@@ -49,13 +50,13 @@ async def _shown(web: Web, run: str) -> tuple[Shown, ...]:
         report = web.store.place(run) / "report.html"
         return pictures_in(report.read_text("utf-8")) if report.is_file() else ()
 
-    return await _off(look)
+    return await off(look)
 
 
 async def _samples(web: Web, request: Request, body: None) -> Response:
     """Made when it is first asked for."""
     run = request.path_params["run"]
-    folder = await _off(lambda: web.store.place(run))
+    folder = await off(lambda: web.store.place(run))
     if not (folder / "samples.csv").exists() and (folder / "run.mcap").exists():
         if not web.store.status(run).ended:
             raise UsageError("the run has no finished log", where=f"run {run}", next_step="Wait until it has ended")
@@ -66,7 +67,7 @@ async def _samples(web: Web, request: Request, body: None) -> Response:
 async def _faults(web: Web, request: Request, body: None) -> list[FaultView]:
     from tdhil.session import bus_kind
 
-    rig = await _off(lambda: web.supervisor.rigs.get(request.path_params["rig"]))
+    rig = await off(lambda: web.supervisor.rigs.get(request.path_params["rig"]))
     if not rig.simulated:
         raise NotAllowed("only a simulated rig can be spoilt", where=f"rig {rig.id}",
                          next_step="Rehearse on a rig whose file says run: {simulate: true}")
@@ -79,11 +80,11 @@ async def _fleet_folders(web: Web, request: Request, body: None) -> list[str]:
 
 
 async def _fleets(web: Web, request: Request, body: None) -> list[FleetView]:
-    return await _off(web.fleets.all)
+    return await off(web.fleets.all)
 
 
 async def _fleet(web: Web, request: Request, body: None) -> FleetView:
-    return await _off(lambda: web.fleets.get(request.path_params["fleet"]))
+    return await off(lambda: web.fleets.get(request.path_params["fleet"]))
 
 
 async def _ask_fleet(web: Web, request: Request, body: FleetBody) -> FleetView:
@@ -96,15 +97,15 @@ async def _ask_fleet(web: Web, request: Request, body: FleetBody) -> FleetView:
         raise UsageError("must be a positive share", where="tolerance")
     asked = {"model": body.model, "confidence": body.confidence, "tolerance": body.tolerance}
     settings = {name: value for name, value in asked.items() if value is not None}
-    who = web.who(request)
-    found = await _off(lambda: web.fleets.ask(body.folder, body.below, settings, who))
+    who = principal(request).name
+    found = await off(lambda: web.fleets.ask(body.folder, body.below, settings, who))
     web.supervisor.note(who, "fleet asked", None, "", folder=body.folder, below=body.below, fleet=found.id, **settings)
     return found
 
 
 async def _stop_fleet(web: Web, request: Request, body: Any) -> FleetView:
-    found = await _off(lambda: web.fleets.stop(request.path_params["fleet"]))
-    web.supervisor.note(web.who(request), "fleet stopped", None, "", fleet=found.id)
+    found = await off(lambda: web.fleets.stop(request.path_params["fleet"]))
+    web.supervisor.note(principal(request).name, "fleet stopped", None, "", fleet=found.id)
     return found
 
 
@@ -115,20 +116,14 @@ async def _fleet_rows(web: Web, request: Request, body: None) -> list[dict[str, 
         raise UsageError("must be a number", where="from")
     if not limit.isdecimal() or not 1 <= int(limit) <= 1000:
         raise UsageError("must be 1 to 1000", where="limit")
-    return await _off(lambda: web.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
+    return await off(lambda: web.fleets.rows(request.path_params["fleet"], int(start), int(limit)))
 
 
 async def _fleet_table(web: Web, request: Request, body: None) -> Response:
     which = request.path_params["fleet"]
-    path = await _off(lambda: web.fleets.table(which))
-    web.supervisor.note(web.who(request), f"downloaded {TABLE}", None, "", fleet=which)
+    path = await off(lambda: web.fleets.table(which))
+    web.supervisor.note(principal(request).name, f"downloaded {TABLE}", None, "", fleet=which)
     return FileResponse(path, media_type="text/csv", filename=f"fleet-{which}.csv")
-
-
-async def _off(work: Callable[[], T]) -> T:
-    """In a thread: files may be slow."""
-    found: T = await anyio.to_thread.run_sync(work)
-    return found
 
 
 ANSWERS: Final[Mapping[str, Answer]] = {

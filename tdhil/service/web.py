@@ -20,53 +20,42 @@ from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, TypeVar
-from urllib.parse import quote, urlencode, urlsplit
+from urllib.parse import quote, urlencode
 
 import anyio
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from prometheus_client import CollectorRegistry, Counter, Gauge, generate_latest
-from pydantic import ValidationError
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.authentication import AuthenticationMiddleware
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Mount, WebSocketRoute
 from starlette.routing import Route as Way
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from drivers import CommunicationLost, DataFileError, PreflightRefused
-from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
+from tdhil.errors import LogError, TdhilError, UsageError
+from tdhil.service import afterwards, logins
 from tdhil.service.access import (
-    NOBODY,
     SOCKET_LOOK_S,
     Access,
-    Principal,
-    address_of,
+    principal,
     require,
     require_options,
-    set_cookies,
-    token_in,
 )
-from tdhil.service.accounts import ROLES, Role, Token, User
-from tdhil.service.afterwards import ANSWERS
+from tdhil.service.accounts import Role
 from tdhil.service.answers import (
     API,
     CSRF_HEADER,
-    OPTIONS,
     ROUTES,
     SOCKETS,
-    AccountsView,
-    AccountView,
     AuditView,
     CompareView,
-    ErrorView,
     HealthView,
     LeaseView,
-    MeView,
     PlanView,
     ReplayView,
     RigFileView,
@@ -74,7 +63,6 @@ from tdhil.service.answers import (
     Route,
     RunView,
     StoppedView,
-    TokenView,
     TrendView,
     adapter,
     document,
@@ -82,132 +70,30 @@ from tdhil.service.answers import (
 )
 from tdhil.service.asking import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.attending import LEASE_S
+from tdhil.service.edge import Guard, body_of, error_response, off, status_of, told_of
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.fleets import Fleets
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.states import (
-    Conflict,
     NotAllowed,
     NotLoggedIn,
     NotThere,
     State,
     Status,
-    Told,
-    TooManyTries,
-    iso,
     now,
 )
 from tdhil.service.store import Summary, read_json, write_json
 from tdhil.service.supervisor import Supervisor
-from tdhil.service.wire import Refused, lives
+from tdhil.service.wire import lives
 from tdhil.version import __version__
 
 T = TypeVar("T")
 HERE: Final = Path(str(files("tdhil.service")))
+_ANSWERS: Final = {**afterwards.ANSWERS, **logins.ANSWERS}
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-BODY_LIMIT: Final = 64 * 1024
-POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-)
-"""Of every page: nothing from elsewhere, and no script or style in the page itself."""
 _REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
 """Where a login may lead to."""
-_BROKEN_HINT: Final = "The terminal of tdhil serve says more"
-
-
-class Guard:
-    """Before everything: a known host, no other site's page, and the headers of every answer."""
-
-    def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
-        self._app, self._hosts, self._viewers = app, hosts, viewers
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        connection = HTTPConnection(scope)
-        why = self._wrong(connection, changes=scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD"))
-        if why is None:
-            await self._app(scope, receive, partial(_with_headers, send))
-        elif scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 4403, "reason": why.what[:100]})
-        else:
-            await _error_response(why)(scope, receive, partial(_with_headers, send))
-
-    def _wrong(self, connection: HTTPConnection, *, changes: bool) -> NotAllowed | None:
-        host = connection.headers.get("host", "")
-        if _name_of(host) not in self._hosts:
-            return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
-                              next_step=f"Open it as {', '.join(sorted(self._hosts))}")
-        if connection.scope["type"] == "websocket" and token_in(connection) is not None:
-            return None                # a token comes with no page by itself; without it nothing else counts
-        origin = connection.headers.get("origin")
-        if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
-            return None
-        elsewhere = origin is not None and (
-            urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
-        )
-        if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
-            return NotAllowed("a page of another site asked for this", where=f"origin {(origin or '?')[:100]}")
-        return None
-
-
-def _name_of(host: str) -> str:
-    with suppress(ValueError):
-        return (urlsplit(f"//{host}").hostname or "").lower()
-    return ""
-
-
-async def _with_headers(send: Send, message: Message) -> None:
-    if message["type"] == "http.response.start":
-        headers = list(message.get("headers", ()))
-        named = {name.lower() for name, _ in headers}
-        for name, value in (
-            (b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"), (b"x-frame-options", b"DENY"), (b"cache-control", b"no-store"),
-            (b"cross-origin-resource-policy", b"same-origin"), (b"cross-origin-opener-policy", b"same-origin"),
-        ):
-            if name not in named:
-                headers.append((name, value))
-        message = {**message, "headers": headers}
-    await send(message)
-
-
-def status_of(error: BaseException) -> int:
-    """The HTTP status of an error of the tree."""
-    if isinstance(error, HTTPException):
-        return int(error.status_code)
-    for kind, status in (
-        (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
-        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (CommunicationLost, 503),
-        (LogError, 503),
-    ):
-        if isinstance(error, kind):
-            return status
-    if isinstance(error, Refused):
-        return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.told.exit_code), 500)
-    return 500
-
-
-def told_of(error: BaseException) -> ErrorView:
-    """The body of an error."""
-    if isinstance(error, Refused):
-        return ErrorView(error.told)
-    if isinstance(error, HTTPException):
-        return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE)))
-    if not isinstance(error, TdhilError):
-        return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1))
-    return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
-
-
-def _error_response(error: BaseException) -> Response:
-    headers = {"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {}
-    if isinstance(error, TooManyTries):
-        headers["retry-after"] = f"{error.wait_s:.0f}"
-    return JSONResponse(plain(told_of(error), ErrorView), status_of(error), headers=headers)
 
 
 class Web:
@@ -229,7 +115,7 @@ class Web:
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
         self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
         self._works = anyio.CapacityLimiter(1)         # arithmetic, one piece at a time
-        self._logins = anyio.CapacityLimiter(1)        # passwords too: each takes 32 MB
+        self.logins = anyio.CapacityLimiter(1)        # passwords too: each takes 32 MB
         self._waiting: dict[tuple[str, str], ReplayView] = {}
         self._made = threading.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -295,7 +181,7 @@ class Web:
 
             traceback.print_exception(error, file=sys.stderr)
         if request.url.path.startswith(API) or request.method != "GET":
-            return _error_response(error)
+            return error_response(error)
         if isinstance(error, NotLoggedIn) and self.access.login:
             there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
             return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
@@ -306,15 +192,15 @@ class Web:
 
     def _endpoint(self, route: Route) -> Callable[[Request], Awaitable[Response]]:
         own = getattr(self, f"_{route.name}", None)
-        answer: Callable[[Request, Any], Awaitable[Any]] = own or partial(ANSWERS[route.name], self)
+        answer: Callable[[Request, Any], Awaitable[Any]] = own or partial(_ANSWERS[route.name], self)
         first = next(iter(route.answers))
 
         async def serve(request: Request) -> Response:
             try:
                 self._require(route, request)
-                found = await answer(request, await _body(request, route))
+                found = await answer(request, await body_of(request, route))
             except TdhilError as error:
-                return _error_response(error)
+                return error_response(error)
             if isinstance(found, Response):
                 return found
             code, value = found if isinstance(found, tuple) else (first, found)
@@ -327,36 +213,36 @@ class Web:
         require(principal(request), route.role, route=route.name, open_here=not self.access.login, csrf=sent)
 
     async def _rigs(self, request: Request, body: Any) -> list[RigView]:
-        return await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
+        return await off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
 
     async def _rig(self, request: Request, body: Any) -> RigView:
-        return await self._off(lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
+        return await off(lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
 
     async def _rig_file(self, request: Request, body: Any) -> RigFileView:
-        return await self._off(lambda: _file_view(self.supervisor.rigs.get(request.path_params["rig"])))
+        return await off(lambda: _file_view(self.supervisor.rigs.get(request.path_params["rig"])))
 
     async def _edit_rig(self, request: Request, body: Any) -> RigFileView:
         rig, who = request.path_params["rig"], principal(request)
         if not who.known:
             raise NotAllowed("a rig's file is edited by who is logged in", where=f"rig {rig}",
                              next_step="Edit it where it is, or add users")
-        return await self._off(lambda: _file_view(self.supervisor.edit_rig(rig, body.text, body.sha256, who.name)))
+        return await off(lambda: _file_view(self.supervisor.edit_rig(rig, body.text, body.sha256, who.name)))
 
     async def _plan(self, request: Request, body: dict[str, Any]) -> PlanView:
-        rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
+        rig = await off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
         options = options_of(body)
-        await self._off(lambda: rig.way(options))
+        await off(lambda: rig.way(options))
         asked = {"rig_file": str(rig.path.resolve()), "options": options}
         return PlanView(rig.id, rig.sha256, await self.work("plan", None, asked))
 
     async def _trend(self, request: Request, body: Any) -> TrendView:
-        rig = await self._off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
+        rig = await off(lambda: self.supervisor.rigs.get(request.path_params["rig"]))
 
         def rows() -> list[dict[str, Any]]:
             runs = self.list_runs(rig.id, "done", 1000)
             return [row for one in runs if (row := read_json(self.store.place(one.id) / "row.json")) is not None]
 
-        found = await self._off(rows)
+        found = await off(rows)
         if not found:
             nothing = {"rig": rig.id, "logs": 0, "results": 0, "notes": ["no run has a result yet"], "quantities": []}
             return TrendView(rig.id, nothing)
@@ -368,7 +254,7 @@ class Web:
         if not 2 <= len(set(runs)) == len(runs) <= 8:
             raise UsageError("name two to eight different runs", where="runs", next_step="?runs=ID,ID")
         for run in runs:
-            if not (await self._off(partial(self.store.place, run)) / "run.mcap").is_file():
+            if not (await off(partial(self.store.place, run)) / "run.mcap").is_file():
                 raise NotThere("this run has no log", where=f"run {run}")
         asked = {"runs": runs, "runs_folder": str(self.store.runs)}
         return CompareView(runs, await self.work("compare", None, asked))
@@ -386,11 +272,11 @@ class Web:
                 require_unwatched(found)
             require_options(who, options_of(body))
 
-        await self._off(check)
-        asked = await self._off(lambda: self.supervisor.start_run(rig, body, who.name, key))
+        await off(check)
+        asked = await off(lambda: self.supervisor.start_run(rig, body, who.name, key))
         if asked.new:
             self._asked.inc()
-        return 201 if asked.new else 200, await self._off(lambda: self.run_view(asked.request.id))
+        return 201 if asked.new else 200, await off(lambda: self.run_view(asked.request.id))
 
     async def _stop_rig(self, request: Request, body: Any) -> StoppedView:
         rig_id, who = request.path_params["rig"], principal(request).name
@@ -415,17 +301,17 @@ class Web:
         if (state := query.get("state")) is not None and state not in set(State):
             raise UsageError(f"there is no state {state[:40]!r}", where="state",
                              next_step=f"There are {', '.join(State)}")
-        return await self._off(lambda: self.list_runs(query.get("rig"), state, int(limit)))
+        return await off(lambda: self.list_runs(query.get("rig"), state, int(limit)))
 
     async def _run(self, request: Request, body: Any) -> RunView:
-        return await self._off(lambda: self.run_view(request.path_params["run"]))
+        return await off(lambda: self.run_view(request.path_params["run"]))
 
     async def _confirm(self, request: Request, body: Any) -> RunView:
         run, who = request.path_params["run"], principal(request).name
         code = body.code.replace(" ", "")
         _require_key(body.lease, "lease")
-        await self._off(lambda: self.supervisor.confirm(run, code, body.binding, who, body.lease))
-        return await self._off(lambda: self.run_view(run))
+        await off(lambda: self.supervisor.confirm(run, code, body.binding, who, body.lease))
+        return await off(lambda: self.run_view(run))
 
     async def _renew(self, request: Request, body: Any) -> LeaseView:
         run, who = request.path_params["run"], principal(request).name
@@ -445,14 +331,14 @@ class Web:
         run, who = request.path_params["run"], principal(request).name
         if not body.note.strip() or len(body.note) > 500:
             raise UsageError("say in 1 to 500 characters what you saw", where="note")
-        await self._off(lambda: self.supervisor.sign_off(run, who, body.note))
-        return await self._off(lambda: self.run_view(run))
+        await off(lambda: self.supervisor.sign_off(run, who, body.note))
+        return await off(lambda: self.run_view(run))
 
     async def _ask_replay(self, request: Request, body: Any) -> tuple[int, ReplayView]:
         run, who = request.path_params["run"], principal(request).name
         asked = {name: value for name, value in asdict(body).items() if value is not None}
-        view = await self._off(lambda: self._new_replay(run, asked, who))
-        rig = (await self._off(lambda: self.store.request(run))).rig
+        view = await off(lambda: self._new_replay(run, asked, who))
+        rig = (await off(lambda: self.store.request(run))).rig
         self.supervisor.note(who, f"replay {view.name} asked", run, rig, options=asked)
         task = asyncio.get_running_loop().create_task(self._replay_later(run, view))
         self._tasks.add(task)
@@ -473,7 +359,7 @@ class Web:
 
     async def _replay_later(self, run: str, view: ReplayView) -> None:
         """A replay has time: it waits as long as a shaft of this service may turn."""
-        while await self._off(self.supervisor.turning):
+        while await off(self.supervisor.turning):
             await anyio.sleep(0.5)
         try:
             found = await self.work("replay", run, view.asked)
@@ -482,7 +368,7 @@ class Web:
             done = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=told_of(error).error)
         path = self.store.place(run) / "replays" / f"{view.name}.json"
         try:
-            await self._off(lambda: write_json(path, plain(done, ReplayView)))
+            await off(lambda: write_json(path, plain(done, ReplayView)))
         except OSError as error:
             lost = told_of(LogError(f"the replay can't be written ({error.strerror or error})", where=path.name)).error
             self._waiting[run, view.name] = ReplayView(view.name, view.asked, view.at, view.by, "failed", error=lost)
@@ -491,7 +377,7 @@ class Web:
 
     async def _replay(self, request: Request, body: Any) -> ReplayView:
         run, name = request.path_params["run"], request.path_params["replay"]
-        found = next((one for one in await self._off(lambda: self.replays(run)) if one.name == name), None)
+        found = next((one for one in await off(lambda: self.replays(run)) if one.name == name), None)
         if found is None:
             raise NotThere("there is no such replay", where=f"run {run[:40]}")
         return found
@@ -506,7 +392,7 @@ class Web:
 
     async def _report_pdf(self, request: Request, body: Any) -> Response:
         run = request.path_params["run"]
-        folder = await self._off(lambda: self.store.place(run))
+        folder = await off(lambda: self.store.place(run))
         if not (folder / "report.pdf").exists() and (folder / "result.json").exists():
             await self.work("report", run, {"name": "report.pdf"})
         return await self.file(request, "report.pdf", "application/pdf")
@@ -517,24 +403,19 @@ class Web:
         found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=self._works))["document"]
         return found
 
-    @staticmethod
-    def who(request: Request) -> str:
-        """The name of who asks."""
-        return principal(request).name
-
     async def _result(self, request: Request, body: Any) -> Response:
         return await self.file(request, "result.json", "application/json")
 
     async def file(self, request: Request, name: str, media: str, *, shown: bool = False) -> Response:
         """A file of the run, as a download (or ``shown``). Raises NotThere."""
         run, who = request.path_params["run"], principal(request).name
-        path = (await self._off(lambda: self.store.place(run))) / name
+        path = (await off(lambda: self.store.place(run))) / name
         if not path.is_file():
             raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="It may come when it has ended")
-        rig = (await self._off(lambda: self.store.request(run))).rig
+        rig = (await off(lambda: self.store.request(run))).rig
         self.supervisor.note(who, f"downloaded {name}", run, rig)
         called = f"{rig}-{run}-{name}"
-        grows = name == "run.mcap" and not (await self._off(lambda: self.store.status(run))).ended
+        grows = name == "run.mcap" and not (await off(lambda: self.store.status(run))).ended
         if grows and ("range" not in request.headers or "if-range" in request.headers):
             said = {"content-disposition": f'attachment; filename="{called}"'}
             return StreamingResponse(_as_it_is(path), media_type=media, headers=said)
@@ -549,115 +430,19 @@ class Web:
             entries = list(self.supervisor.audit.entries())
             return AuditView(entries[-int(limit):][::-1], self.supervisor.audit.verify())
 
-        return await self._off(look)
-
-    # -- who is who --------------------------------------------------------------------------------------------------
-
-    def _me_view(self, who: Principal) -> MeView:
-        ends_s = self.access.ends_s(who)
-        return MeView(who.name, [role for role in ROLES if role in who.roles], self.access.login,
-                      None if ends_s is None else iso(ends_s))
-
-    async def _me(self, request: Request, body: Any) -> MeView:
-        return self._me_view(principal(request))
-
-    async def _login(self, request: Request, body: Any) -> Response:
-        if not self.access.login:
-            raise UsageError("there is nobody to log in as", where="login",
-                             next_step="Add a user on the terminal: tdhil serve users add")
-        cookie, who = await self._slowly(request, body.name.strip().lower()[:64], body.password)
-        self.supervisor.note(who.name, "logged in", None, None, address=address_of(request))
-        response = JSONResponse(plain(self._me_view(who), MeView))
-        set_cookies(response, request, cookie)
-        return response
-
-    async def _slowly(self, request: Request, name: str, password: str) -> tuple[str, Principal]:
-        """A password is looked at. Raises NotLoggedIn and TooManyTries."""
-        address = address_of(request)
-        if self._logins.statistics().tasks_waiting >= 10:
-            raise TooManyTries(10.0)
-        try:
-            found: tuple[str, Principal] = await anyio.to_thread.run_sync(
-                partial(self.access.log_in, name, password, address), limiter=self._logins)
-            return found
-        except NotLoggedIn:
-            self.supervisor.note("nobody", "login refused", None, None, name=name, address=address)
-            raise
-
-    async def _logout(self, request: Request, body: Any) -> Response:
-        who = principal(request)
-        if who.session:
-            await self._off(lambda: self.access.log_out(request))
-            self.supervisor.note(who.name, "logged out", None, None)
-        response = JSONResponse(plain(self._me_view(self.access.who(request)), MeView))
-        set_cookies(response, request, None)
-        return response
-
-    async def _password(self, request: Request, body: Any) -> MeView:
-        who = principal(request)
-        if not who.session:
-            raise UsageError("only who logged in has a password", where="password")
-        try:
-            await self._slowly(request, who.name, body.old)
-        except NotLoggedIn:
-            raise UsageError("that isn't the old password", where="old") from None
-        await self._account(request, lambda: self.access.accounts.set_password(who.name, body.new), "password set",
-                            who.name)
-        return self._me_view(self.access.who(request))
-
-    async def _account(self, request: Request, change: Callable[[], T], what: str, name: str) -> T:
-        """Change an account, one at a time, and say by whom. Raises UsageError."""
-        if not self.access.login:
-            raise UsageError("the first user is added on the terminal", where="accounts",
-                             next_step="tdhil serve users add NAME --role admin; then start with a certificate")
-        found: T = await anyio.to_thread.run_sync(change, limiter=self._logins)
-        self.supervisor.note(principal(request).name, what, None, None, name=name)
-        return found
-
-    async def _accounts(self, request: Request, body: Any) -> AccountsView:
-        return self._accounts_view()
-
-    def _accounts_view(self) -> AccountsView:
-        known = self.access.accounts.known
-        return AccountsView([_account_view(one) for one in known.users.values()],
-                            [_account_view(one) for one in known.tokens.values()])
-
-    async def _add_user(self, request: Request, body: Any) -> AccountView:
-        accounts = self.access.accounts
-        return _account_view(await self._account(
-            request, lambda: accounts.add_user(body.name, body.role, body.password), "user added", body.name))
-
-    async def _set_password(self, request: Request, body: Any) -> AccountView:
-        accounts, name = self.access.accounts, request.path_params["user"]
-        return _account_view(await self._account(
-            request, lambda: accounts.set_password(name, body.password), "password set", name))
-
-    async def _remove_user(self, request: Request, body: Any) -> AccountsView:
-        accounts, name = self.access.accounts, request.path_params["user"]
-        await self._account(request, lambda: accounts.remove_user(name, keep_admin=True), "user removed", name)
-        return self._accounts_view()
-
-    async def _add_token(self, request: Request, body: Any) -> TokenView:
-        token = await self._account(
-            request, lambda: self.access.accounts.add_token(body.name, body.role), "token added", body.name)
-        return TokenView(body.name, body.role, token)
-
-    async def _remove_token(self, request: Request, body: Any) -> AccountsView:
-        accounts, name = self.access.accounts, request.path_params["token"]
-        await self._account(request, lambda: accounts.remove_token(name), "token removed", name)
-        return self._accounts_view()
+        return await off(look)
 
     # -- how it is ---------------------------------------------------------------------------------------------------
 
     async def _health(self, request: Request, body: Any) -> HealthView:
-        rigs = await self._off(self.supervisor.rigs.all)
+        rigs = await off(self.supervisor.rigs.all)
         return HealthView("ok", __version__, self.supervisor.live(), len(rigs))
 
     async def _metrics(self, request: Request, body: Any) -> Response:
         self._live.set(len(self.supervisor.live()))
         self._viewers.set(self.feeds.viewers)
         self._relayed.set(self._relays)
-        views = await self._off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
+        views = await off(lambda: [self.rig_view(rig) for rig in self.supervisor.rigs.all()])
         self._unsigned.set(sum(one.state == "blocked" for one in views))
         return Response(generate_latest(self._registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
@@ -785,7 +570,7 @@ class Web:
     async def _watch(self, socket: WebSocket) -> None:
         run = socket.path_params["run"]
         try:
-            folder = await self._off(lambda: self.store.place(run))
+            folder = await off(lambda: self.store.place(run))
         except NotThere:
             await socket.close(4404, "there is no such run")
             return
@@ -818,7 +603,7 @@ class Web:
         rig_id = socket.path_params["rig"]
         protocol = next((one for one in PROTOCOLS if one in socket.scope["subprotocols"]), None)
         try:
-            await self._off(lambda: self.supervisor.rigs.get(rig_id))
+            await off(lambda: self.supervisor.rigs.get(rig_id))
         except NotThere:
             await socket.close(4404, "there is no such rig")
             return
@@ -854,12 +639,12 @@ class Web:
             require(principal(request), role, route=request.url.path, open_here=not self.access.login)
             known: dict[str, Any] = {}
             if "rig" in request.path_params:
-                known["rig"] = await self._off(
+                known["rig"] = await off(
                     lambda: self.rig_view(self.supervisor.rigs.get(request.path_params["rig"])))
             if "run" in request.path_params:
-                known["run"] = await self._off(lambda: self.run_view(request.path_params["run"]))
+                known["run"] = await off(lambda: self.run_view(request.path_params["run"]))
             if "fleet" in request.path_params:
-                known["fleet"] = await self._off(lambda: self.fleets.get(request.path_params["fleet"]))
+                known["fleet"] = await off(lambda: self.fleets.get(request.path_params["fleet"]))
             return self._render(request, template, here, **known)
 
         return serve
@@ -876,18 +661,6 @@ class Web:
             here=here, who=principal(request), login=self.access.login, **known)
         return HTMLResponse(text, status)
 
-    @staticmethod
-    async def _off(work: Callable[[], T]) -> T:
-        """In a thread: files may be slow."""
-        found: T = await anyio.to_thread.run_sync(work)
-        return found
-
-
-def principal(request: HTTPConnection) -> Principal:
-    """Who asks."""
-    found: Principal = request.scope.get("user", NOBODY)
-    return found
-
 
 def _file_view(rig: RigFile) -> RigFileView:
     """Raises UsageError."""
@@ -896,10 +669,6 @@ def _file_view(rig: RigFile) -> RigFileView:
         return RigFileView(rig.id, data.decode(), hashlib.sha256(data).hexdigest(), sorted(EDITABLE))
     except (OSError, ValueError) as error:
         raise UsageError(f"can't be read as text ({error})", where=rig.path.name) from error
-
-
-def _account_view(one: User | Token) -> AccountView:
-    return AccountView(one.name, one.role, one.since)
 
 
 def _as_it_is(path: Path) -> Iterator[bytes]:
@@ -911,37 +680,6 @@ def _as_it_is(path: Path) -> Iterator[bytes]:
             yield piece
 
 
-async def _body(request: Request, route: Route) -> Any:
-    """What was sent, checked. Raises UsageError."""
-    if route.method == "GET":
-        return None
-    data = b""
-    async for piece in request.stream():
-        data += piece
-        if len(data) > BODY_LIMIT:
-            raise UsageError(f"more than {BODY_LIMIT} bytes", where="body")
-    media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
-    if media != "application/json":
-        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Say application/json")
-    try:
-        sent = json.loads(data or b"{}", parse_constant=_no_number)
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"no JSON ({str(error)[:100]})", where="body") from None
-    if not isinstance(sent, dict):
-        raise UsageError("must be an object", where="body", next_step='Such as {"seed": 7}')
-    if route.body == OPTIONS:
-        return sent
-    try:
-        return adapter(route.body).validate_json(json.dumps(sent), strict=True)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise UsageError(first["msg"], where=".".join(map(str, first["loc"])) or "body") from None
-
-
 def _require_key(key: str | None, where: str) -> None:
     if key is not None and not 16 <= len(key) <= 200:
         raise UsageError("must have 16 to 200 characters", where=where, next_step="Take a random one")
-
-
-def _no_number(name: str) -> Any:
-    raise ValueError(f"{name} is no number in JSON")
