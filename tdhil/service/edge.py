@@ -27,7 +27,7 @@ T = TypeVar("T")
 BODY_LIMIT: Final = 64 * 1024
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
 """Of every page: nothing from elsewhere, and no script or style in the page itself."""
 _BROKEN_HINT: Final = "The terminal of tdhil serve says more"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -10,9 +11,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
+from starlette.testclient import TestClient
 
 from tdhil.service.access import Access
+from tdhil.service.answers import API
 from tdhil.service.asking import Rigs
 from tdhil.service.store import Audit, Index, Store
 from tdhil.service.supervisor import Supervisor
@@ -92,3 +96,45 @@ def tls(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
                     "-subj", "/CN=tdhil", "-addext", "subjectAltName=IP:127.0.0.1,DNS:localhost", "-days", "2",
                     "-keyout", key, "-out", cert], check=True, capture_output=True)
     return cert, key
+
+
+class Checked:
+    """A client that holds every answer of the API against the document."""
+
+    def __init__(self, client: TestClient) -> None:
+        self._client = client
+        self.document = client.get(f"{API}/openapi.json").json()
+
+    def __call__(self, method: str, path: str, expect: int, **sent: Any) -> Any:
+        answer = self._client.request(method, f"{API}{path}", **sent)
+        assert answer.status_code == expect, answer.text
+        self.check(method, f"{API}{path.split('?', maxsplit=1)[0]}", answer)
+        return answer.json() if "json" in answer.headers["content-type"] else answer
+
+    def check(self, method: str, path: str, answer: Any) -> None:
+        template = next(
+            one for one in self.document["paths"]
+            if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path) and method.lower() in self.document["paths"][one]
+        )
+        described = self.document["paths"][template][method.lower()]["responses"][str(answer.status_code)]["content"]
+        media = answer.headers["content-type"].split(";")[0]
+        assert media in described, (path, media)
+        if "schema" in described[media]:
+            schema = {**described[media]["schema"], "components": self.document["components"]}
+            jsonschema.validate(answer.json(), schema, cls=jsonschema.Draft202012Validator)
+
+    def start(self, rig: str = "a", what: str = "done", expect: int = 201, **more: Any) -> dict[str, Any]:
+        found = self("POST", f"/rigs/{rig}/runs", expect, json={"note": what, "seed": 7}, **more)
+        assert isinstance(found, dict)
+        return found
+
+
+@pytest.fixture
+def client(service: Service) -> Iterator[TestClient]:
+    with TestClient(service.web.asgi, base_url=URL) as found:
+        yield found
+
+
+@pytest.fixture
+def call(client: TestClient) -> Checked:
+    return Checked(client)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from starlette.testclient import TestClient
 
 from profiles import STAGE_NUMBERS
 from tdhil.service import work
@@ -17,21 +15,9 @@ from tdhil.service.fleets import Fleets
 from tdhil.service.states import Conflict
 from tdhil.session import bus_kinds, hold
 from tests.recording.test_log_tail import write
-from tests.service.conftest import URL, Service, wait_for
-from tests.service.test_api import Checked
+from tests.service.conftest import wait_for
 
 HOSTILE = "<script>alert(1)</script>"
-
-
-@pytest.fixture
-def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(service.web.asgi, base_url=URL) as found:
-        yield found
-
-
-@pytest.fixture
-def call(client: TestClient) -> Checked:
-    return Checked(client)
 
 
 def test_a_run_has_the_pictures_of_its_report(call, service):

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import sqlite3
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import jsonschema
@@ -20,49 +18,6 @@ from tdhil.errors import UsageError
 from tdhil.service.answers import API, ROUTES, SOCKETS, document
 from tdhil.service.states import State
 from tests.service.conftest import URL, Service, wait_for
-
-
-class Checked:
-    """A client that holds every answer of the API against the document."""
-
-    def __init__(self, client: TestClient) -> None:
-        self._client = client
-        self.document = client.get(f"{API}/openapi.json").json()
-
-    def __call__(self, method: str, path: str, expect: int, **sent: Any) -> Any:
-        answer = self._client.request(method, f"{API}{path}", **sent)
-        assert answer.status_code == expect, answer.text
-        self.check(method, f"{API}{path.split('?', maxsplit=1)[0]}", answer)
-        return answer.json() if "json" in answer.headers["content-type"] else answer
-
-    def check(self, method: str, path: str, answer: Any) -> None:
-        template = next(
-            one for one in self.document["paths"]
-            if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path) and method.lower() in self.document["paths"][one]
-        )
-        described = self.document["paths"][template][method.lower()]["responses"][str(answer.status_code)]["content"]
-        media = answer.headers["content-type"].split(";")[0]
-        assert media in described, (path, media)
-        if "schema" in described[media]:
-            schema = {**described[media]["schema"], "components": self.document["components"]}
-            jsonschema.validate(answer.json(), schema, cls=jsonschema.Draft202012Validator)
-
-    def start(self, rig: str = "a", what: str = "done", expect: int = 201, **more: Any) -> dict[str, Any]:
-        found = self("POST", f"/rigs/{rig}/runs", expect, json={"note": what, "seed": 7}, **more)
-        assert isinstance(found, dict)
-        return found
-
-
-@pytest.fixture
-def client(service: Service) -> Iterator[TestClient]:
-    with TestClient(service.web.asgi, base_url=URL) as found:
-        yield found
-
-
-@pytest.fixture
-def call(client: TestClient) -> Checked:
-    return Checked(client)
-
 
 # -- what there is
 

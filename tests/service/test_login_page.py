@@ -41,8 +41,9 @@ def page(browser: Any, served: Served) -> Iterator[Any]:  # noqa: F811
 
 
 def log_in(page: Any, name: str, password: str = PASSWORD) -> None:
-    """By keyboard: the name's field has the focus."""
-    page.get_by_label("Name").wait_for()
+    """By keyboard: the name's field has the focus. The page listens once its button can be pressed."""
+    page.locator("input[name=name]:focus").wait_for()
+    page.locator("#login button:enabled").wait_for()
     page.keyboard.type(name)
     page.keyboard.press("Tab")
     page.keyboard.type(password)

@@ -508,6 +508,7 @@
         location.replace(next);
       });
     });
+    form.querySelector("button").disabled = false;      // Enter before this script listened would have been lost
     const me = await call("GET", "/me");     // a link from elsewhere comes without the cookie, this page's own request has it
     if (me.roles.length) location.replace(next);
   }
