@@ -10,9 +10,8 @@ from statistics import NormalDist
 from typing import Any
 
 from tdhil.recording import Recording
-from tdhil.run.design import LOOKS, MARGIN, Look, interval_of, look
+from tdhil.run.design import LOOKS, MARGIN, Look, Stopping, interval_of, look
 from tdhil.run.excitation import Plan
-from tdhil.run.planning import Stopping, extension_s
 
 Snapshot = Callable[[], Recording]
 LEAST_EXTENSION = 2       # periods at each mean speed: fewer are not worth the way back
@@ -72,7 +71,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
     """Pure: the decision after ``looks`` extensions, with ``left_s`` seconds left, ``seen`` intervals looked at."""
     segments = len(plan.segments)
     period = sum(one.reference.period_s for one in plan.segments)
-    room = max(0, math.floor((left_s - extension_s(plan, 0)) / period + 1e-9)) if looks < LOOKS else 0
+    room = max(0, math.floor((left_s - plan.extension_s(0)) / period + 1e-9)) if looks < LOOKS else 0
     counted = _counted(recording)
     most = (counted + segments * room) / counted if counted else 1.0
 

@@ -15,6 +15,7 @@ from tdhil.run.design import (
     Choice,
     Evidence,
     Knowledge,
+    Stopping,
     choose,
     half_width,
     interval_confidence,
@@ -45,31 +46,6 @@ NOT_PREDICTED = "how tight the interval of J will be is not predicted for this m
 NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
 _PILOT_SHARE = 0.6        # of the periods that are expected to be needed: the rest is decided by the pilot's scatter
 _EVER = 1000.0            # times as long: what is open then stays open
-
-
-@dataclass(frozen=True)
-class Stopping:
-    """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
-
-    ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
-    """
-
-    tolerance: float
-    confidence: float
-    pilot_dof: float
-    pilot_periods: int
-    expected_periods: int
-    allowed_s: float
-    reachable: bool
-    advice: str = ""
-
-    def working(self, seen: int) -> float:
-        """Of the interval that is looked at after ``seen`` others."""
-        return interval_confidence(self.confidence, self.pilot_dof, seen)
-
-    def plain(self) -> dict[str, Any]:
-        """As the run's configuration keeps it."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -262,7 +238,7 @@ def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, al
         reachable=enough,
         advice="" if enough else _advice(evidence, working, request.tolerance, known),
     )
-    after_pilot = extension_s(plan, periods - pilot) if periods > pilot else 0.0
+    after_pilot = plan.extension_s(periods - pilot) if periods > pilot else 0.0
     return Planned(plan, known, half, chosen.usual_half_width, stopping, plan.duration_s + after_pilot)
 
 
@@ -271,21 +247,10 @@ def pilot_dof(plan: Plan) -> float:
     return 2.0 * sum(segment.periods - segment.settle_periods - 1 for segment in plan.segments)
 
 
-def extension_s(plan: Plan, periods: int) -> float:
-    """So many more periods at each mean speed: on from the last one, then back to the others, which settle anew."""
-    others = plan.segments[:-1]
-    again = sum(one.settle_periods * one.reference.period_s for one in others)
-    ways = sum(
-        plan.transition(plan.segments[-1].reference.start_speed_rad_s, index).duration_s
-        for index in range(len(others))
-    )
-    return again + ways + periods * sum(one.reference.period_s for one in plan.segments)
-
-
 def counted_in(plan: Plan, time_s: float) -> int:
     """How many periods that count at each mean speed fit into a time, with a pilot and one extension."""
     period = sum(one.reference.period_s for one in plan.segments)
-    return math.floor((time_s - plan.with_counted(0).duration_s - extension_s(plan, 0)) / period + 1e-9)
+    return math.floor((time_s - plan.with_counted(0).duration_s - plan.extension_s(0)) / period + 1e-9)
 
 
 def _advice(evidence: Evidence, confidence: float, tolerance: float, known: Knowledge) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 import anyio
@@ -18,10 +18,15 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
-from tdhil.service.access import token_in
+from tdhil.service.access import Access, token_in
 from tdhil.service.answers import OPTIONS, ErrorView, Route, adapter, plain
 from tdhil.service.states import Conflict, NotAllowed, NotLoggedIn, NotThere, Told, TooManyTries
 from tdhil.service.wire import Refused
+
+if TYPE_CHECKING:
+    from tdhil.service.fleets import Fleets
+    from tdhil.service.store import Store
+    from tdhil.service.supervisor import Supervisor
 
 T = TypeVar("T")
 BODY_LIMIT: Final = 64 * 1024
@@ -31,6 +36,25 @@ POLICY: Final = (
 )
 """Of every page: nothing from elsewhere, and no script or style in the page itself."""
 _BROKEN_HINT: Final = "The terminal of tdhil serve says more"
+
+
+class Site(Protocol):
+    """What an answer has to do with: the service behind the web, and what the web lends."""
+
+    store: Store
+    supervisor: Supervisor
+    access: Access
+    fleets: Fleets
+    logins: anyio.CapacityLimiter
+
+    async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """A piece of arithmetic, one at a time: its document. Raises Refused."""
+
+    async def file(self, request: Request, name: str, media: str) -> Response:
+        """A file of the run, as a download. Raises NotThere."""
+
+
+Answer = Callable[[Site, Request, Any], Awaitable[Any]]
 
 
 class Guard:

@@ -11,9 +11,10 @@ from drivers.drive import Command, Mode
 from tdhil.errors import Interrupted
 from tdhil.recording.recording import Excitation, Recording
 from tdhil.run.adaptive_duration import Decision, decide
+from tdhil.run.design import Stopping
 from tdhil.run.design.stopping_rule import Look
 from tdhil.run.excitation import ExcitationWish, MotionLimits, RigGuess, make_plan
-from tdhil.run.planning import Stopping, counted_in, extension_s, pilot_dof
+from tdhil.run.planning import counted_in, pilot_dof
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.stages.acquire import run_acquire
 from tdhil.run.stages.hold import MeanSpeedControl
@@ -57,7 +58,7 @@ def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
     assert told[-1] == excitation
     assert stub.asked_s == sorted(stub.asked_s)
     # the time that an extension is reckoned to take is the time that it takes
-    assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(extension_s(PLAN, 4), abs=3.0)
+    assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(PLAN.extension_s(4), abs=3.0)
 
 
 def test_a_pilot_that_is_enough_is_the_whole_run(world):
@@ -158,8 +159,8 @@ def test_the_periods_that_fit_leave_room_for_one_extension():
     for time_s in (200.0, 321.0, 600.0):
         counted = counted_in(PLAN, time_s)
         pilot = PLAN.with_counted(counted - 2)
-        assert pilot.duration_s + extension_s(PLAN, 2) <= time_s
-        assert pilot.duration_s + extension_s(PLAN, 3) > time_s
+        assert pilot.duration_s + PLAN.extension_s(2) <= time_s
+        assert pilot.duration_s + PLAN.extension_s(3) > time_s
 
 
 # -- the whole of it -----------------------------------------------------------------------------------------

@@ -27,9 +27,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +47,31 @@ _WORTH_SHARE = 0.1        # of the interval at the end of the time: what is near
 _THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)
 _MARGINS = (1.0, 1.3)
 _PILOTS, _EXTENSIONS = 128, 32
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
+
+    ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
+    """
+
+    tolerance: float
+    confidence: float
+    pilot_dof: float
+    pilot_periods: int
+    expected_periods: int
+    allowed_s: float
+    reachable: bool
+    advice: str = ""
+
+    def working(self, seen: int) -> float:
+        """Of the interval that is looked at after ``seen`` others."""
+        return interval_confidence(self.confidence, self.pilot_dof, seen)
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        return asdict(self)
 
 
 def interval_confidence(confidence: float, pilot_dof: float, seen: int) -> float:

@@ -164,6 +164,16 @@ class Plan:
         segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
         return replace(self, segments=segments)
 
+    def extension_s(self, periods: int) -> float:
+        """So many more periods at each mean speed: on from the last one, then back to the others, which settle anew."""
+        others = self.segments[:-1]
+        again = sum(one.settle_periods * one.reference.period_s for one in others)
+        ways = sum(
+            self.transition(self.segments[-1].reference.start_speed_rad_s, index).duration_s
+            for index in range(len(others))
+        )
+        return again + ways + periods * sum(one.reference.period_s for one in self.segments)
+
     def transition(self, from_rad_s: float, index: int) -> Transition:
         """From a speed to the start of segment ``index``."""
         to = self.segments[index].reference.start_speed_rad_s

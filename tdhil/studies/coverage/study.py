@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -202,16 +203,9 @@ def _ratios(axes: Axes, found: Sequence[PlantFigures]) -> None:
 # The benchmark in tables and statements.
 
 
-def normal_quantile(confidence: float) -> float:
-    """Two-sided quantile of the normal distribution."""
-    from scipy.stats import norm
-
-    return float(norm.ppf(0.5 + 0.5 * confidence))
-
-
 def plant_table(found: Sequence[PlantFigures], confidence: float) -> ResultTable:
     """One row a plant. Shares in percent of the true inertia; rates in percent of the runs that gave a number."""
-    quantile = normal_quantile(confidence)
+    quantile = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
     columns = (
         "plant", "inertia_kg_m2", "model_true", "runs", "refused_percent", "miss_percent", "miss_low99_percent",
         "miss_high99_percent", "bias_percent", "bias_standard_error_percent", "rmse_percent", "half_width_percent",
