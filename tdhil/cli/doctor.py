@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.metadata
-import json
 import platform
 import shlex
 import shutil
@@ -18,8 +17,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drivers import DataFileError, TdhilError
 from tdhil.cli.bus_commands import bus_commands
-from tdhil.cli.finding import Finding, bad, note, ok
+from tdhil.cli.finding import Finding, bad, note, of_error, ok
+from tdhil.cli.results import print_json
 from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
@@ -179,8 +180,6 @@ def findings(
     cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[ValueSeen]
 ) -> Iterator[Finding]:
     """From the computer to the drive; ``registers`` is filled with what a person may compare."""
-    from drivers import DataFileError
-    from tdhil.cli.finding import note, of_error
     from tdhil.session import connection_of, plan_peer
 
     yield from host_findings(Path(options.log))
@@ -203,9 +202,7 @@ def findings(
 
 def _left(folder: Path) -> Iterator[Finding]:
     """What runs that died have left in their drives."""
-    from drivers import TdhilError
     from drivers.undo_journal import PREFIX, SUFFIX, read
-    from tdhil.cli.finding import bad, of_error
 
     for path in sorted(folder.glob(f"{PREFIX}*{SUFFIX}")):
         try:
@@ -219,7 +216,6 @@ def _left(folder: Path) -> Iterator[Finding]:
 
 
 def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
-    from tdhil.cli.finding import note, ok
     from tdhil.cli.profile_text import sure_text
     from tdhil.session import doubtful, is_accepted
 
@@ -233,8 +229,6 @@ def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
 
 
 def _limits(rig: Rig | None) -> Iterator[Finding]:
-    from tdhil.cli.finding import note, ok
-
     if rig is not None and rig.limits is not None:
         limits = rig.limits
         yield ok("limits", f"{limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m ({rig.source('limits')})")
@@ -260,10 +254,8 @@ def _show_registers(registers: list[ValueSeen]) -> None:
 
 
 def _dump(found: list[Finding], registers: list[ValueSeen], code: int) -> None:
-    document = {
+    print_json({
         "checks": [asdict(one) for one in found],
         "registers": [one.plain() for one in registers],
         "exit_code": int(code),
-    }
-    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-    sys.stdout.write("\n")
+    })

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from typing import TYPE_CHECKING
 
 from profiles.quantities import RPM
+from tdhil.cli.results import print_json
 from tdhil.config import Rig, RunOptions
 from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_document, plan_dry
 
@@ -30,8 +29,7 @@ def dry_run(
     if options.json:
         plain = plan_document(planned, figures, limits)
         plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
-        json.dump(plain, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(plain)
         return 0
     from tdhil.report import PlainConsole
 

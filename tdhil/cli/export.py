@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tdhil.errors import ExitCode, UsageError
+from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
 
 if TYPE_CHECKING:
     from drivers import RawFrame
@@ -38,7 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Exit 0: all of it; 3: the log is not whole, and what there is was written; 10: nothing can be read."""
-    from tdhil.errors import LogError, NothingRecoverable
     from tdhil.recording import read_run
     from tdhil.report import SIMULATED, stderr_console
 

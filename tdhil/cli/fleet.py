@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
 from tdhil.cli.arguments import amount, share
+from tdhil.cli.results import print_json
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
 
@@ -203,8 +204,7 @@ class _Bar:
 
 def _print(summary: FleetSummary, as_json: bool) -> None:
     if as_json:
-        json.dump(summary.document(), sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(summary.document())
         return
     from tdhil.report import PlainConsole
 

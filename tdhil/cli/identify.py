@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from tdhil.session import PeerPlan
+from profiles.quantities import FREQUENCY, SPEED, TIME
+from tdhil.config import EXCITATIONS, MODELS, load_rig, resolve
+from tdhil.errors import ExitCode, LogError, TdhilError, exit_code
+from tdhil.session import PeerPlan, bus_kinds
 
 if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
@@ -22,8 +25,6 @@ if TYPE_CHECKING:
 
 def list_faults() -> int:
     """Prints what there is; the exit code."""
-    from tdhil.session import bus_kinds
-
     print("\n\n".join(f"--drive {kind.name}\n\n{kind.fault_listing()}" for kind in bus_kinds()))  # noqa: T201
     return 0
 
@@ -51,9 +52,7 @@ def show_settings(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
-    from profiles.quantities import FREQUENCY, SPEED, TIME
     from tdhil.cli.arguments import amount, share
-    from tdhil.config import EXCITATIONS, MODELS
 
     motion = parser.add_argument_group("motion")
     motion.add_argument("--excitation", choices=tuple(EXCITATIONS), help="stage 5 (default multisine)")
@@ -86,7 +85,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
     """Which drive and where, what the operator takes upon himself, the log, and the simulated rig: of any run."""
     from drivers import own_limits
-    from profiles.quantities import FREQUENCY
     from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount
 
     drive = add_drive_arguments(parser)
@@ -136,7 +134,6 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
     """
     from tdhil.cli.dry_run import dry_run
-    from tdhil.config import load_rig, resolve
     from tdhil.report import stderr_console
     from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, with_faults
 
@@ -197,7 +194,6 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
 
 def _run(request: RunRequest, console: Console, report: Path | None) -> int:
     from tdhil.cli.results import print_result, save_report
-    from tdhil.errors import LogError, exit_code
     from tdhil.session import RunSession, TerminalAttendant
 
     options = request.options
@@ -237,7 +233,6 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     """The first cause, how the stop went, and where the log is."""
     import traceback
 
-    from tdhil.errors import ExitCode, TdhilError, exit_code
     from tdhil.run import not_confirmed
 
     cause, stop = outcome.cause, outcome.stop

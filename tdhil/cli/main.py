@@ -8,11 +8,14 @@ import json
 import logging
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from importlib import import_module
 from typing import NoReturn
 
 from tdhil.cli.streams import sheltered
+from tdhil.errors import ExitCode, TdhilError, exit_code
 from tdhil.version import __version__
 
 _COMMANDS = {
@@ -96,49 +99,17 @@ def _chosen(arguments: Sequence[str]) -> str | None:
     return next((argument for argument in arguments if not argument.startswith("-")), None)
 
 
+_ELSEWHERE = {
+    "watch": ("fleet", "add_watch_arguments"),
+    "compare": ("trend", "add_compare_arguments"),
+    "rig": ("rig_new", "add_arguments"),
+}
+"""Commands that don't have a module of their own name, each with its module and what adds its options."""
+
+
 def _builder(name: str) -> Callable[[argparse.ArgumentParser], None]:
-    if name == "identify":
-        from tdhil.cli.identify import add_arguments
-    elif name == "replay":
-        from tdhil.cli.replay import add_arguments
-    elif name == "fleet":
-        from tdhil.cli.fleet import add_arguments
-    elif name == "watch":
-        from tdhil.cli.fleet import add_watch_arguments as add_arguments
-    elif name == "tune":
-        from tdhil.cli.tune import add_arguments
-    elif name == "evaluate":
-        from tdhil.cli.evaluate import add_arguments
-    elif name == "trend":
-        from tdhil.cli.trend import add_arguments
-    elif name == "compare":
-        from tdhil.cli.trend import add_compare_arguments as add_arguments
-    elif name == "stop":
-        from tdhil.cli.stop import add_arguments
-    elif name == "study":
-        from tdhil.cli.study import add_arguments
-    elif name == "export":
-        from tdhil.cli.export import add_arguments
-    elif name == "recover":
-        from tdhil.cli.recover import add_arguments
-    elif name == "profiles":
-        from tdhil.cli.profiles import add_arguments
-    elif name == "scan":
-        from tdhil.cli.scan import add_arguments
-    elif name == "rig":
-        from tdhil.cli.rig_new import add_arguments
-    elif name == "support":
-        from tdhil.cli.support import add_arguments
-    elif name == "docs":
-        from tdhil.cli.docs import add_arguments
-    elif name == "doctor":
-        from tdhil.cli.doctor import add_arguments
-    elif name == "serve":
-        from tdhil.cli.serve import add_arguments
-    elif name == "attend":
-        from tdhil.cli.attend import add_arguments
-    else:
-        from tdhil.cli.simulate import add_arguments
+    module, function = _ELSEWHERE.get(name, (name, "add_arguments"))
+    add_arguments: Callable[[argparse.ArgumentParser], None] = getattr(import_module(f"tdhil.cli.{module}"), function)
     return add_arguments
 
 
@@ -148,16 +119,12 @@ _THE_SYSTEM_S = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOSPC, errno.ENOME
 
 def _report(error: Exception, as_json: bool) -> int:
     """One message for an error of the tree; a traceback only for what is a mistake of ours."""
-    from tdhil.errors import ExitCode, TdhilError, exit_code
-
     code = exit_code(error)
     if isinstance(error, TdhilError):
         print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
     elif isinstance(error, OSError) and error.errno in _THE_SYSTEM_S:
         print(f"tdhil: the system refused: {error.strerror or error}", file=sys.stderr)  # noqa: T201
     else:
-        import traceback
-
         traceback.print_exception(error, file=sys.stderr)
         print("tdhil: internal error; please report it with the lines above", file=sys.stderr)  # noqa: T201
         code = ExitCode.INTERNAL

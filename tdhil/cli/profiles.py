@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import Entry, Profile
+from profiles import DataFileError, Entry, Profile, eds_path, load_profile, matching_names, profile_names
 from profiles.canopen import CanopenProfile, Parameter
 from profiles.modbus import ModbusProfile
 from profiles.modbus import Parameter as ModbusParameter
 from tdhil.cli.profile_text import (
+    counts,
     facts_of,
     modes_text,
     register_uses,
     required_text,
+    row,
     sure_text,
     unit_text,
     watchdog_text,
 )
+from tdhil.cli.results import print_json
+from tdhil.errors import ExitCode
 from tdhil.session import UNVERIFIED_FLAG, doubtful
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import Console
     from rich.table import Table
 
@@ -213,12 +215,9 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
     """All, or those of ``names``."""
-    from profiles import load_profile, profile_names
-    from tdhil.cli.profile_text import row, sure_text
-
     profiles = [load_profile(name) for name in names or profile_names()]
     if as_json:
-        _dump({"profiles": [row(profile) for profile in profiles]})
+        print_json({"profiles": [row(profile) for profile in profiles]})
         return 0
     from rich.table import Table
 
@@ -238,15 +237,12 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
 
 
 def _show(name: str, as_json: bool) -> int:
-    from profiles import load_profile, matching_names
-    from tdhil.session import doubtful
-
     meant = matching_names(name)
     if len(meant) > 1:
         return _list(as_json, meant)
     profile = load_profile(meant[0] if meant else name)
     if as_json:
-        _dump({
+        print_json({
             "profile": profile.model_dump(mode="json", by_alias=True),
             "not_verified": [
                 {"name": name, "confidence": entry.confidence, "source": entry.source}
@@ -260,10 +256,6 @@ def _show(name: str, as_json: bool) -> int:
 
 
 def _check(files: list[str], as_json: bool) -> int:
-    from profiles import DataFileError
-    from tdhil.cli.profile_text import counts, sure_text
-    from tdhil.errors import ExitCode
-
     problems: list[dict[str, Any]] = []
     found: list[dict[str, Any]] = []
     for file in files:
@@ -281,16 +273,12 @@ def _check(files: list[str], as_json: bool) -> int:
             print(f"{file}: ok, {profile.name} on {profile.bus}: {entries} entries, {sure_text(profile)}")  # noqa: T201
     code = int(ExitCode.USAGE) if problems else 0
     if as_json:
-        _dump({"ok": not problems, "profiles": found, "problems": problems, "exit_code": code})
+        print_json({"ok": not problems, "profiles": found, "problems": problems, "exit_code": code})
     return code
 
 
 def _import(file: str, output: str | None, as_json: bool) -> int:
-    from pathlib import Path
-
     from profiles import DataFileError, Problem, begin_profile, read_eds
-    from tdhil.cli.profile_text import row, sure_text
-    from tdhil.session import doubtful
 
     source = Path(file)
     target = Path(output) if output is not None else Path(f"{source.stem}.yaml")
@@ -308,7 +296,7 @@ def _import(file: str, output: str | None, as_json: bool) -> int:
         raise DataFileError((Problem(str(target), 0, message),)) from error
     open_entries = [name for name, entry in doubtful(begun.profile) if entry.confidence == "unverified"]
     if as_json:
-        _dump({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})
+        print_json({"file": str(target), "profile": row(begun.profile), "unverified": open_entries})
         return 0
     print(f"{target}: {begun.profile.name} on canopen, begun from {source.name}: {sure_text(begun.profile)}")  # noqa: T201
     print(f"Look up in the drive's manual: {', '.join(open_entries)}. What to look for stands in the file.")  # noqa: T201
@@ -325,8 +313,6 @@ def _as_path(target: Path) -> str:
 
 def _load(file: str) -> Profile:
     """As `load_profile`; and the EDS that it names is there."""
-    from profiles import eds_path, load_profile
-
     profile = load_profile(file)
     eds_path(file)
     return profile
@@ -336,8 +322,3 @@ def _console() -> Any:
     from tdhil.report import PlainConsole
 
     return PlainConsole()
-
-
-def _dump(document: dict[str, Any]) -> None:
-    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-    sys.stdout.write("\n")

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.cli.results import print_json
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -45,8 +44,7 @@ def run(namespace: argparse.Namespace) -> int:
     code = ExitCode.OK if found.whole else ExitCode.PARTIAL
     document = report(found, path, target) | {"exit_code": int(code)}
     if namespace.json:
-        json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(document)
     else:
         _print(document)
     return int(code)

@@ -12,7 +12,7 @@ from tdhil.cli.arguments import amount, share
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session import is_evaluation, is_log, read
+from tdhil.session import conclude_evaluation, is_evaluation, is_log, read
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -92,7 +92,6 @@ def run(namespace: argparse.Namespace) -> int:
 def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     """What the virtual string of this log did, and print it."""
     from tdhil.report import stderr_console
-    from tdhil.session import conclude_evaluation
 
     for name in ("report", "model", "confidence", "tolerance"):
         if getattr(namespace, name) is not None:

@@ -24,6 +24,12 @@ def save_report(document: Mapping[str, Any], recording: Recording, path: Path | 
             print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
 
 
+def print_json(document: Mapping[str, Any]) -> None:
+    """One document on stdout; a number that JSON doesn't know is a mistake of ours."""
+    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
 def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
     from tdhil.report import PlainConsole, print_card, print_evaluation
@@ -31,8 +37,7 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     show = print_evaluation if document.get("kind") == "evaluation" else print_card
     try:
         if as_json:
-            json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-            sys.stdout.write("\n")
+            print_json(document)
         else:
             show(document, PlainConsole())
         sys.stdout.flush()

@@ -14,10 +14,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import Profile, visible
+from profiles import Profile, load_profile, visible
 from tdhil.cli.bus_commands import FoundDrive, bus_commands
 from tdhil.cli.profile_text import required_text
-from tdhil.config import BUSES, Limits, Rig
+from tdhil.cli.results import print_json
+from tdhil.config import BUSES, Limits, Rig, load_rig, resolve
+from tdhil.errors import UsageError
 from tdhil.session import bus_kind, doubtful
 
 if TYPE_CHECKING:
@@ -190,8 +192,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """0 if anybody answered. Raises CommunicationLost (exit 5) if nobody did, with the likely causes."""
-    from tdhil.config import load_rig, resolve
-    from tdhil.errors import UsageError
     from tdhil.session import connection_of, plan_peer
 
     if namespace.write is not None:
@@ -213,9 +213,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> None:
     if as_json:
-        document = {"found": [asdict(one) for one in found], "remarks": remarks}
-        json.dump(document, sys.stdout, ensure_ascii=False, indent=2)
-        sys.stdout.write("\n")
+        print_json({"found": [asdict(one) for one in found], "remarks": remarks})
         return
     for one in found:
         print(visible(f"{one.name}: {one.title or 'without a name'}{' · SIMULATED' if one.simulated else ''}"))  # noqa: T201
@@ -232,17 +230,12 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
 
 
 def _check_free(path: Path) -> None:
-    from tdhil.errors import UsageError
-
     if path.exists():
         raise UsageError("is there already, and is not written over", where=str(path), next_step="Name another file")
 
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
     """The starter file, of the one drive that was found, or of the one asked for among several."""
-    from profiles import load_profile
-    from tdhil.errors import UsageError
-
     one = _chosen(found, connection, options)
     if options.given("profile"):
         one = replace(one, profile=options.profile, why=f"as named: {options.source('profile')}")
@@ -260,8 +253,6 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
 
 
 def _chosen(found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> FoundDrive:
-    from tdhil.errors import UsageError
-
     commands = bus_commands(connection.drive)
     named = commands.wanted(connection, options)
     drives = [one for one in found if named in (None, one.address)]

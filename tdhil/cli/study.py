@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -13,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.cli.results import print_json
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -303,9 +302,7 @@ def _run(wanted: list[tuple[Study, Any]], namespace: argparse.Namespace, *, repo
         told.print(f"{tally(chapters)}; report: {index_path}", markup=False, soft_wrap=True)
     if namespace.json:
         several = {"studies": documents, "report": None if index_path is None else str(index_path)}
-        json.dump(documents[0] if len(documents) == 1 and not report else several, sys.stdout, ensure_ascii=False,
-                  indent=2, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(documents[0] if len(documents) == 1 and not report else several)
     return code
 
 
@@ -331,9 +328,7 @@ def _cost(outcome: StudyOutcome, took_s: float) -> str:
 
 def _list(studies: Mapping[str, Study], as_json: bool) -> int:
     if as_json:
-        json.dump({"studies": [{"name": study.name, "title": study.title} for study in studies.values()]}, sys.stdout,
-                  ensure_ascii=False, indent=2)
-        sys.stdout.write("\n")
+        print_json({"studies": [{"name": study.name, "title": study.title} for study in studies.values()]})
         return 0
     from tdhil.report import PlainConsole
     from tdhil.studies import print_list

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import html
-import json
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tdhil.cli.arguments import share
+from tdhil.cli.results import print_json
 from tdhil.config import MODELS
 from tdhil.errors import UsageError
 
@@ -50,7 +49,7 @@ def run(namespace: argparse.Namespace) -> int:
     _check_report(namespace.report, (namespace.table,))
     document = trend_document(read_table(namespace.table), namespace.rig)
     if namespace.json:
-        _print_json(document)
+        print_json(document)
     else:
         _print_trend(document)
     if namespace.report is not None:
@@ -75,7 +74,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
     settings = Settings(namespace.model, namespace.confidence)
     document = compare_document([identified(log, settings) for log in namespace.logs])
     if namespace.json:
-        _print_json(document)
+        print_json(document)
     else:
         _print_compared(document)
     if namespace.report is not None:
@@ -87,11 +86,6 @@ def run_compare(namespace: argparse.Namespace) -> int:
 
 # ---------------------------------------------------------------------------------------------------------------------
 # On the terminal
-
-
-def _print_json(document: Mapping[str, Any]) -> None:
-    json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-    sys.stdout.write("\n")
 
 
 def _print_trend(document: Mapping[str, Any]) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from profiles import load_profile
 from profiles.quantities import RPM, TIME, TORQUE
 from tdhil.cli.arguments import amount, share
+from tdhil.cli.results import print_json
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -52,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(namespace: argparse.Namespace) -> int:
     """Read, tune, print."""
-    from profiles import load_profile
     from tdhil.report import (
         PlainConsole,
         check_report_path,
@@ -80,8 +80,7 @@ def run(namespace: argparse.Namespace) -> int:
     tuned_for = _tuned_for(result, namespace, tuning, lags_from, profile)
     document = tuning_document(tuning, tuned_for)
     if namespace.json:
-        json.dump(document, sys.stdout, ensure_ascii=False, indent=2, allow_nan=False)
-        sys.stdout.write("\n")
+        print_json(document)
     else:
         print_tuning(document, PlainConsole())
     if namespace.report is not None:
