@@ -9,7 +9,7 @@
 """
 
 import re
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Generic, Protocol, TypeVar
@@ -203,31 +203,6 @@ def plain(make: Callable[[], M]) -> Callable[[str], M]:
     return lambda _value: make()
 
 
-def make_from(kinds: Mapping[str, Kind[M]], fault: Scripted) -> M:
-    """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
-    kind = kinds.get(fault.name)
-    where = f"--fault {fault.text or fault.name}"
-    if kind is None:
-        raise FaultRefused(f"no fault is called {fault.name!r}", where=where, next_step="--fault list shows them")
-    if fault.value and not kind.takes:
-        raise FaultRefused(f"{fault.name} takes no value", where=where, next_step="Leave the = out")
-    try:
-        return kind.make(fault.value or kind.value)
-    except ValueError as error:
-        raise FaultRefused(
-            f"{fault.value!r} is no value of {fault.name}", where=where,
-            next_step=f"It takes {kind.takes}, such as {kind.value} ({error})",
-        ) from None
-
-
-def parse_from(kinds: Mapping[str, Kind[M]], texts: Sequence[str]) -> tuple[Scripted, ...]:
-    """All the faults of a command line, each checked. Raises FaultRefused."""
-    faults = tuple(parse(text) for text in texts)
-    for fault in faults:
-        make_from(kinds, fault)
-    return faults
-
-
 @dataclass(frozen=True)
 class KnownFault:
     """A fault that can be scripted. ``row`` of docs/faults.md (0: none); ``takes``: what its value is, '' for none.
@@ -243,19 +218,46 @@ class KnownFault:
     from_start: bool
 
 
-def listed_of(kinds: Mapping[str, Kind[M]], from_start: Container[str] = ()) -> tuple[KnownFault, ...]:
-    """Every fault, in the order of the fault table's rows."""
-    return tuple(
-        KnownFault(name, kind.summary, kind.row, kind.value, kind.takes, name in from_start)
-        for name, kind in sorted(kinds.items(), key=lambda item: (item[1].row or 99, item[0]))
-    )
+class Kinds(dict[str, Kind[M]]):
+    """The faults of one bus by their names."""
 
+    def make(self, fault: Scripted) -> M:
+        """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
+        kind = self.get(fault.name)
+        where = f"--fault {fault.text or fault.name}"
+        if kind is None:
+            raise FaultRefused(f"no fault is called {fault.name!r}", where=where, next_step="--fault list shows them")
+        if fault.value and not kind.takes:
+            raise FaultRefused(f"{fault.name} takes no value", where=where, next_step="Leave the = out")
+        try:
+            return kind.make(fault.value or kind.value)
+        except ValueError as error:
+            raise FaultRefused(
+                f"{fault.value!r} is no value of {fault.name}", where=where,
+                next_step=f"It takes {kind.takes}, such as {kind.value} ({error})",
+            ) from None
 
-def listing_of(kinds: Mapping[str, Kind[M]]) -> str:
-    """Every fault with its row and value, for people."""
-    lines = ["NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: setup, speed, torque, hold, acquire, hold+2s",
-             "", f"{'row':>3}  {'name':<37}what happens"]
-    for one in listed_of(kinds):
-        shown = f"{one.name}[={one.value}]" if one.takes else one.name
-        lines.append(f"{one.row or '-':>3}  {shown:<37}{one.summary}")
-    return "\n".join(lines)
+    def parse_all(self, texts: Sequence[str]) -> tuple[Scripted, ...]:
+        """All the faults of a command line, each checked. Raises FaultRefused."""
+        faults = tuple(parse(text) for text in texts)
+        for fault in faults:
+            self.make(fault)
+        return faults
+
+    def listed(self, from_start: Container[str] = ()) -> tuple[KnownFault, ...]:
+        """Every fault, in the order of the fault table's rows."""
+        return tuple(
+            KnownFault(name, kind.summary, kind.row, kind.value, kind.takes, name in from_start)
+            for name, kind in sorted(self.items(), key=lambda item: (item[1].row or 99, item[0]))
+        )
+
+    def listing(self) -> str:
+        """Every fault with its row and value, for people."""
+        lines = [
+            "NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: setup, speed, torque, hold, acquire, hold+2s",
+            "", f"{'row':>3}  {'name':<37}what happens",
+        ]
+        for one in self.listed():
+            shown = f"{one.name}[={one.value}]" if one.takes else one.name
+            lines.append(f"{one.row or '-':>3}  {shown:<37}{one.summary}")
+        return "\n".join(lines)

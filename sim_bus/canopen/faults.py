@@ -9,7 +9,7 @@ is then in its cycle.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,20 +18,7 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_script import (
-    Cast,
-    Kind,
-    KnownFault,
-    Scripted,
-    factor,
-    listed_of,
-    listing_of,
-    make_from,
-    parse_from,
-    plain,
-    seconds,
-    share,
-)
+from sim_bus.fault_script import Cast, Kind, Kinds, Scripted, factor, plain, seconds, share
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -502,7 +489,7 @@ def _written(text: str) -> tuple[int, int, int, int]:
 
 _LONG, _SHORT = {0x1006, 0x1016, 0x6080, 0x6085, 0x60FF}, {0x100D, 0x6060}
 
-KINDS: dict[str, Kind[Misbehaviour]] = {
+KINDS: Kinds[Misbehaviour] = Kinds({
     "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(Dead)),
     "frame-loss": Kind(17, "this share of all frames is lost, either way",
                        lambda v: Lossy(share(v)), "5%", "SHARE"),
@@ -562,27 +549,8 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
                                plain(lambda: NotKept(0x1016, 1))),
     "torque-scale": Kind(0, "the reported torque is multiplied by this",
                          lambda v: Reported(torque=factor(v)), "1.1", "FACTOR"),
-}
-
-
-def make(fault: Scripted) -> Misbehaviour:
-    """What a scripted fault does. Raises FaultRefused for a name or a value that there isn't."""
-    return make_from(KINDS, fault)
-
-
-def parse_all(texts: Sequence[str]) -> tuple[Scripted, ...]:
-    """All the faults of a command line, each checked. Raises FaultRefused."""
-    return parse_from(KINDS, texts)
-
-
-def listed() -> tuple[KnownFault, ...]:
-    """Every fault."""
-    return listed_of(KINDS)
-
-
-def listing() -> str:
-    """Every fault with its row and value, for people."""
-    return listing_of(KINDS)
+})
+make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
 # ---------------------------------------------------------------------------------------------------------------------

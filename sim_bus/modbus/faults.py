@@ -17,21 +17,7 @@ import numpy as np
 from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
 from sim_bus.cia402 import Mode
-from sim_bus.fault_script import (
-    Cast,
-    FaultRefused,
-    Kind,
-    KnownFault,
-    Moment,
-    Scripted,
-    factor,
-    listed_of,
-    listing_of,
-    make_from,
-    parse_from,
-    plain,
-    share,
-)
+from sim_bus.fault_script import Cast, FaultRefused, Kind, Kinds, KnownFault, Moment, Scripted, factor, plain, share
 from sim_bus.modbus.codec import NONE, Reply
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong, parse
@@ -331,7 +317,7 @@ def _wiring(summary: str, row: int = 44) -> Kind[Misbehaviour]:
     return Kind(row, summary, plain(Misbehaviour))
 
 
-KINDS: dict[str, Kind[Misbehaviour]] = {
+KINDS: Kinds[Misbehaviour] = Kinds({
     "frozen-feedback": Kind(19, "speed and torque read as they last did; what is written goes through",
                             plain(Frozen)),
     "drive-fault": Kind(23, "fault state, after the drive's own fault reaction", plain(drive_fault)),
@@ -374,17 +360,13 @@ KINDS: dict[str, Kind[Misbehaviour]] = {
                                plain(NotArmed)),
     "torque-scale": Kind(0, "the reported torque is multiplied by this",
                          lambda v: reported(torque=factor(v)), "1.1", "FACTOR"),
-}
-
-
-def make(fault: Scripted) -> Misbehaviour:
-    """What a scripted fault does; nothing where it is the wiring. Raises FaultRefused."""
-    return make_from(KINDS, fault)
+})
+make, listing = KINDS.make, KINDS.listing
 
 
 def parse_all(texts: Sequence[str], line_kind: str) -> tuple[Scripted, ...]:
     """All the faults of a command line, each checked, on ``tcp``, ``rtu`` or ``embedded``. Raises FaultRefused."""
-    faults = parse_from(KINDS, texts)
+    faults = KINDS.parse_all(texts)
     for fault in faults:
         where = f"--fault {fault.text}"
         lines = ONLY_ON.get(fault.name, tuple(_LINES))
@@ -414,13 +396,8 @@ def wrongs_of(script: Iterable[Scripted], parameters: Sequence[str]) -> tuple[Wr
 
 def listed(line_kind: str) -> tuple[KnownFault, ...]:
     """Every fault that there can be on ``tcp``, ``rtu`` or ``embedded``."""
-    kinds = {name: kind for name, kind in KINDS.items() if line_kind in ONLY_ON.get(name, _LINES)}
-    return listed_of(kinds, WRONGS)
-
-
-def listing() -> str:
-    """Every fault with its row and value, for people."""
-    return listing_of(KINDS)
+    kinds = Kinds({name: kind for name, kind in KINDS.items() if line_kind in ONLY_ON.get(name, _LINES)})
+    return kinds.listed(WRONGS)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
