@@ -1,12 +1,13 @@
 """The drive's own impedance: error of |r|, coverage of P, I and the inner lags, and undeclared filters refused.
 
-    python benchmarks/impedance_coverage.py [--seeds 5] [--by offset|reference|both] [--filter 0.1] [--stepped 0]
+    python benchmarks/impedance_coverage.py [--seeds 5] [--by offset|reference|both] [--filter 0.1]
+                                            [--stepped 0] [--rate HZ] [--setting NAME ...]
 
 Records in closed form (tests/estimation/impedance_bench.py, which shares no code with estimator or simulator) of the
 settings of the reference case, as a motor of 104 kg·m² has them, with reporting lags of 0.40 and 0.15 s, through the
 measurement alone. ``--filter``: besides, the reference is smoothed by so many seconds, and nobody says so; all of them
 must be refused. ``--stepped``: besides, so many whole runs of each setting on the simulated drive through CANopen, in
-stepped time, by the torque offset.
+stepped time, by the torque offset; ``--rate``: at so many cycles a second instead of the profile's.
 
 Prints, for each setting: how many stand, the largest error of |r| from 0.05 to 1.5 Hz over all seeds, the mean of it,
 and how often each interval holds the truth. The exit code is 1 where an error of |r| is above 0.005 or a filter passes.
@@ -33,14 +34,14 @@ MOST = 0.005
 KEYS = (("gain_nm_s_rad", "P"), ("integral_nm_rad", "I"), ("inner_lag_s", "lags"))
 
 
-def simulated(machine: Machine, seed: int) -> dict[str, Any]:
+def simulated(machine: Machine, seed: int, more: list[str]) -> dict[str, Any]:
     """A whole run, as the command line does it; its section `impedance`."""
     with tempfile.TemporaryDirectory() as folder:
         plant = Path(folder) / "plant.yaml"
         plant.write_text(f"drive: {{speed_gain_nm_s_rad: {machine.gain}, speed_integral_gain_nm_rad: "
                          f"{machine.integral}}}\n", encoding="utf-8")
         words = ["identify", "--simulate", "--impedance", "offset", "--string-impedance", ZETA, "--plant", plant,
-                 "--seed", seed, "--json", "--log", Path(folder) / "run.mcap"]
+                 "--seed", seed, "--json", "--log", Path(folder) / "run.mcap", *more]
         command = [sys.executable, "-m", "tdhil", *map(str, words)]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         document: dict[str, Any] = json.loads(done.stdout)
@@ -84,24 +85,29 @@ def main() -> int:
     parser.add_argument("--by", choices=("offset", "reference", "both"), default="both")
     parser.add_argument("--filter", type=float, default=0.1, metavar="S")
     parser.add_argument("--stepped", type=int, default=0, metavar="RUNS")
+    parser.add_argument("--rate", type=float, metavar="HZ")
+    parser.add_argument("--setting", nargs="+", choices=tuple(SETTINGS), default=list(SETTINGS), metavar="NAME")
     asked = parser.parse_args()
     bad = False
+    settings = {name: SETTINGS[name] for name in asked.setting}
+    more = [] if asked.rate is None else ["--rate", f"{asked.rate:g}"]
     ways = ("offset", "reference") if asked.by == "both" else (asked.by,)
     for by in ways:
-        for name, (gain, integral) in SETTINGS.items():
+        for name, (gain, integral) in settings.items() if asked.seeds else ():
             machine = Machine(gain=gain, integral=integral)
             seeds = range(asked.seeds)
             bad |= row(f"{name}, {by}", machine, (in_closed_form(machine, by, seed) for seed in seeds)) > MOST
     if asked.filter > 0.0 and "reference" in ways:
-        for name, (gain, integral) in SETTINGS.items():
+        for name, (gain, integral) in settings.items():
             machine = Machine(gain=gain, integral=integral, reference_filter=asked.filter)
             said = [in_closed_form(machine, "reference", seed)["verdict"] for seed in range(asked.seeds)]
             refused = said.count("model_rejected")
             print(f"{name}, filter of {asked.filter:g} s unsaid: {refused}/{len(said)} refused", flush=True)
             bad |= refused < len(said)
-    for name, (gain, integral) in SETTINGS.items() if asked.stepped else ():
+    for name, (gain, integral) in settings.items() if asked.stepped else ():
         machine = Machine(gain=gain, integral=integral)
-        bad |= row(f"{name}, through CANopen", machine, (simulated(machine, k) for k in range(asked.stepped))) > MOST
+        runs = (simulated(machine, seed, more) for seed in range(asked.stepped))
+        bad |= row(f"{name}, through CANopen", machine, runs) > MOST
     return int(bad)
 
 
