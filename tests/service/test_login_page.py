@@ -41,9 +41,8 @@ def page(browser: Any, served: Served) -> Iterator[Any]:  # noqa: F811
 
 
 def log_in(page: Any, name: str, password: str = PASSWORD) -> None:
-    """By keyboard: the name's field has the focus. The page listens once its button can be pressed."""
+    """By keyboard: the name's field has the focus, as soon as the page listens."""
     page.locator("input[name=name]:focus").wait_for()
-    page.locator("#login button:enabled").wait_for()
     page.keyboard.type(name)
     page.keyboard.press("Tab")
     page.keyboard.type(password)
@@ -115,6 +114,19 @@ def test_a_page_from_before_a_new_login_still_stops(page, served):
     page.get_by_role("button", name="Stop", exact=True).click()
     served.service.wait(run, "stopped")
     assert served.service.store.status(run).stop.by == "engineer"
+
+
+def test_a_page_whose_script_does_not_come_sends_nothing(browser, served):  # noqa: F811
+    context = browser.new_context(base_url=served.url, ignore_https_errors=True)
+    page = context.new_page()
+    page.route("**/static/app.js", lambda route: route.abort())
+    page.goto("/login")
+    page.keyboard.type("operator\n")
+    assert page.locator("main").evaluate("one => one.inert && !one.contains(document.activeElement)")
+    page.evaluate("document.forms.login.elements.password.value = 'secret'; document.forms.login.submit()")
+    page.wait_for_timeout(300)
+    assert page.url == f"{served.url}/login"
+    context.close()
 
 
 def test_an_admin_s_accounts(page, served):

@@ -508,7 +508,6 @@
         location.replace(next);
       });
     });
-    form.querySelector("button").disabled = false;      // Enter before this script listened would have been lost
     const me = await call("GET", "/me");     // a link from elsewhere comes without the cookie, this page's own request has it
     if (me.roles.length) location.replace(next);
   }
@@ -550,5 +549,13 @@
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
   window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, may, number, ofResult, pages, percent, show, span, when };
-  document.addEventListener("DOMContentLoaded", () => (pages[document.body.dataset.page] || (() => {}))());
+  document.addEventListener("DOMContentLoaded", () => {
+    try {
+      (pages[document.body.dataset.page] || (() => {}))();
+    } finally {                 // until its script listens, a page takes neither click nor key: both would be lost
+      byId("main").inert = false;
+      const first = document.querySelector("[autofocus]");
+      if (first) first.focus();
+    }
+  });
 })();
