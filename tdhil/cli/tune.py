@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
+from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,9 @@ from tdhil.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from profiles import Profile
     from tdhil.report import TunedFor
-    from tdhil.soft_torque import DriveSetting, SpeedController, TuneCase, Tuning
+    from tdhil.soft_torque import DrillString, DriveSetting, Moved, SpeedController, TuneCase, Tuning
+
+    Ends = tuple[Moved, Moved]
 
 IDENTIFIED = ("inertia_kg_m2", "viscous_nm_s_rad", "coulomb_nm", "speed_lag_s", "torque_lag_s", "gear_ratio")
 """Of the result, that `tdhil evaluate` needs to know of the rig."""
@@ -29,8 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of tune."""
     parser.add_argument("result", type=Path, metavar="result.json|run.mcap",
                         help="what tdhil identify --json wrote, or the log of a run")
-    parser.add_argument("--string", type=Path, required=True, metavar="string.yaml",
-                        help="drill string, bottom and bit (docs/soft_torque.md)")
+    parser.add_argument("--string", type=Path, metavar="string.yaml",
+                        help="drill string, bottom and bit (docs/soft_torque.md); without it, k and J_L as the result "
+                        "has them, of a shaft that was identified as compliant")
     parser.add_argument("--impedance", type=Path, metavar="z.json|z.mcap",
                         help="what identify --impedance measured: the drive's present gains beside the others, and its "
                         "inner lags")
@@ -129,12 +133,12 @@ def read_result(path: Path) -> Mapping[str, Any]:
 
 def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[TuneCase, str]:
     """All at the main shaft, and where the lags come from. Raises TuningRefused where the result has no J."""
-    from tdhil.soft_torque import Interval, TopDrive, TuneCase, TuningRefused, load_string
+    from tdhil.soft_torque import Interval, TopDrive, TuneCase, TuningRefused
 
     measured = None if namespace.impedance is None else _impedance(namespace.impedance, result)
     inertia = result["inertia_kg_m2"]
-    if not isinstance(inertia, dict) or not all(_is_number(inertia.get(key)) for key in
-                                                ("value", "low_total", "high_total")):
+    stands = result["verdict"] in ("valid", "valid_wide") and isinstance(inertia, dict)
+    if not stands or not all(_is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
         raise TuningRefused(f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
                             next_step="Identify again with a motion that tells it")
     square = _positive(result, "gear_ratio", namespace) ** 2
@@ -142,12 +146,48 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     if not 0.0 < low <= value <= high:
         raise TuningRefused("J's interval reaches down to nothing", where=str(namespace.result),
                             next_step="Identify again, for longer")
-    lags, lags_from = _lags(result, namespace, measured)
+    string, of_string = _string(result, namespace, square**0.5)
+    lags, of_lags, lags_from = _lags(result, namespace, measured)
     drive = TopDrive(value, square * _estimate(result, "viscous_nm_s_rad"),
                      square**0.5 * _estimate(result, "coulomb_nm"), lags)
-    case = TuneCase(load_string(namespace.string), drive, Interval(value, low, high), namespace.phase_margin,
-                    namespace.a, namespace.compensate, _present(measured, square))
+    present, of_present = (None, ()) if measured is None else _present(measured, square)
+    case = TuneCase(string, drive, Interval(value, low, high), namespace.phase_margin, namespace.a,
+                    namespace.compensate, present, (*of_string, *of_lags, *of_present))
     return case, lags_from
+
+
+def _string(
+    result: Mapping[str, Any], namespace: argparse.Namespace, ratio: float
+) -> tuple[DrillString, tuple[Ends, ...]]:
+    """As its file has it; or a spring with a mass, as identified, and both ends of what is open of that."""
+    from tdhil.soft_torque import Moved, load_string, spring_and_mass
+
+    if namespace.string is not None:
+        return load_string(namespace.string), ()
+    shaft = result.get("compliant") or {}
+    spring, swing = (_three(shaft.get(key)) for key in ("stiffness_nm_rad", "antiresonance_hz"))
+    if spring is None or swing is None:
+        why = ("leaves the spring's stiffness or its swing open" if shaft else "is of a rigid shaft")
+        raise UsageError(f"--string is missing, and the result {why}", where=str(namespace.result),
+                         next_step="--string string.yaml (docs/soft_torque.md) names the pipe and what hangs on it")
+    low, k, high = (ratio**2 * one for one in spring)
+    slow, hertz, fast = swing
+
+    def string(stiffness: float, hertz: float) -> DrillString:
+        return spring_and_mass(stiffness, hertz, f"k and J_L as identified ({result.get('model')})")
+
+    return string(k, hertz), (
+        (Moved(string=string(low, hertz)), Moved(string=string(high, hertz))),
+        (Moved(string=string(k, slow)), Moved(string=string(k, fast))),
+    )
+
+
+def _three(part: Any) -> tuple[float, float, float] | None:
+    """(low, value, high) of an estimate that is bounded and positive."""
+    if not isinstance(part, dict) or not all(_is_number(part.get(key)) for key in ("low", "value", "high")):
+        return None
+    low, value, high = (float(part[key]) for key in ("low", "value", "high"))
+    return (low, value, high) if 0.0 < low <= value <= high else None
 
 
 def _impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -171,36 +211,85 @@ def _impedance(path: Path, result: Mapping[str, Any]) -> Mapping[str, Any]:
     return found
 
 
-def _present(measured: Mapping[str, Any] | None, square: float) -> SpeedController | None:
-    from tdhil.soft_torque import SpeedController
+def _present(measured: Mapping[str, Any], square: float) -> tuple[SpeedController, tuple[Ends, ...]]:
+    """What stands in the drive, and both ends of each gain."""
+    from tdhil.soft_torque import Moved, SpeedController
 
-    if measured is None:
-        return None
-    return SpeedController(square * float(measured["gain_nm_s_rad"]["value"]),
-                           square * float(measured["integral_nm_rad"]["value"]))
+    gain, integral = ((_ends(measured[key], square)) for key in ("gain_nm_s_rad", "integral_nm_rad"))
+    law = SpeedController(gain[1], integral[1])
+    return law, (
+        (Moved(present=SpeedController(gain[0], integral[1])), Moved(present=SpeedController(gain[2], integral[1]))),
+        (Moved(present=SpeedController(gain[1], integral[0])), Moved(present=SpeedController(gain[1], integral[2]))),
+    )
+
+
+def _ends(part: Mapping[str, Any], times: float = 1.0) -> tuple[float, float, float]:
+    """(low, value, high), none below 0; an end that isn't there is the value."""
+    value = max(0.0, float(part["value"]))
+    low, high = (float(part[key]) if _is_number(part.get(key)) else value for key in ("low", "high"))
+    return times * max(0.0, min(low, value)), times * value, times * max(high, value)
 
 
 def _lags(
     result: Mapping[str, Any], namespace: argparse.Namespace, measured: Mapping[str, Any] | None
-) -> tuple[tuple[float, ...], str]:
-    inner = tuple(lag for lag in namespace.inner_lags or ASSUMED_LAGS_S if lag > 0.0)
+) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
+    """Time constants in the loop, both ends of what is open of them, and who says so."""
+    inner = list(namespace.inner_lags or ASSUMED_LAGS_S)
+    axes: list[list[float]] = []
     said = "as stated" if namespace.inner_lags else "assumed: nobody measured them"
     if measured is not None and not namespace.inner_lags:
-        inner = tuple(max(0.0, float(measured[key]["value"])) for key in ("speed_filter_s", "torque_lag_s"))
-        inner, said = tuple(lag for lag in inner if lag > 0.0), "as measured (--impedance)"
+        inner, axes = _measured_lags(measured)
+        said = "as measured (--impedance)"
     if namespace.loop == "drive":
-        if not inner:
-            raise UsageError("no lag at all: no loop is like that", where="--inner-lags")
-        return inner, said
+        if not any(inner):
+            raise UsageError("no lag at all in the drive's loop: then nothing limits its gains", where="--inner-lags",
+                             next_step="State the filter of its speed, its torque loop and its sampling")
+        return _moved_lags(inner, axes, said)
     reported = result.get("speed_lag_s")
     if not isinstance(reported, dict) or not _is_number(reported.get("value")):
         raise UsageError("the result doesn't say how late the reported speed is", where="--loop bus",
                          next_step="Identify with a multisine, which tells it")
     period: Any = (result.get("cycle") or {}).get("period_s")
     waiting = 1.5 * float(period) if _is_number(period) else 0.0
-    late = max(0.0, float(reported["value"]))
-    return tuple(lag for lag in (late, waiting, *inner[1:]) if lag > 0.0), (
+    low, late, high = _ends(reported)
+    # of a measured loop, the speed that the drive itself sees is no part of it
+    rest = [sqrt(sum(axis[k] ** 2 for axis in axes)) for k in range(1, len(inner))] if axes else []
+    others = [[0.0, 0.0, *(half if k == at else 0.0 for k in range(len(rest)))] for at, half in enumerate(rest)]
+    return _moved_lags(
+        [late, waiting, *inner[1:]], [[0.5 * (high - low), 0.0, *(0.0 for _ in inner[1:])], *others],
         f"the reported speed's lag as identified and a cycle and a half; the rest {said}")
+
+
+def _measured_lags(measured: Mapping[str, Any]) -> tuple[list[float], list[list[float]]]:
+    """Of the speed, of the torque; and the main axes of what is open of them, as far as 95 % goes along each.
+
+    Their sum is known better than either: from its half-width follows how both hang together.
+    """
+    import numpy as np
+
+    keys = ("speed_filter_s", "torque_lag_s")
+    values = [_ends(measured[key])[1] for key in keys]
+    halves = [_ends(measured[key])[2] - value for key, value in zip(keys, values, strict=True)]
+    both = halves[0] * halves[1]
+    together = 0.0
+    if isinstance(measured.get("inner_lag_s"), dict):
+        _, value, high = _ends(measured["inner_lag_s"])
+        together = min(both, max(-both, 0.5 * ((high - value) ** 2 - halves[0] ** 2 - halves[1] ** 2)))
+    sizes, axes = np.linalg.eigh(np.array([[halves[0] ** 2, together], [together, halves[1] ** 2]]))
+    return values, [(sqrt(max(0.0, size)) * axis).tolist() for size, axis in zip(sizes, axes.T, strict=True)]
+
+
+def _moved_lags(
+    lags: list[float], axes: list[list[float]], said: str
+) -> tuple[tuple[float, ...], tuple[Ends, ...], str]:
+    from tdhil.soft_torque import Moved
+
+    def at(axis: list[float], sign: float) -> tuple[float, ...]:
+        moved = (lag + sign * one for lag, one in zip(lags, axis, strict=True))
+        return tuple(lag for lag in moved if lag > 0.0)
+
+    ends = tuple((Moved(inner_lags_s=at(axis, -1.0)), Moved(inner_lags_s=at(axis, 1.0))) for axis in axes if any(axis))
+    return at([0.0] * len(lags), 1.0), ends, said
 
 
 def _is_number(value: Any) -> bool:
@@ -244,7 +333,11 @@ def _tuned_for(
     if not namespace.inner_lags and namespace.impedance is None:
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")
-    if tuning.case.string.bit is None:
+    if namespace.string is None:
+        warnings.append("|r|, a and what swings above the lowest mode rest on a spring with a tenth of its load's "
+                        "weight, and without mud: name the pipe in a string.yaml for them, and the bit for critical "
+                        "speeds")
+    elif tuning.case.string.bit is None:
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),
                     None if profile is None else profile.name, ratio, namespace.loop, lags_from,

@@ -27,8 +27,10 @@ from tdhil.soft_torque import (
     Interval,
     SpeedController,
     Trace,
+    TuneCase,
     Tuned,
     Tuning,
+    in_squares,
     reflection_at,
     simulate,
 )
@@ -48,6 +50,7 @@ _WHAT = {
 }
 _COLOURS = {"present": "0.25", "stiff": "#c2410c", "soft": "#1f5fa8", "compensated": "#1a7f37", "broadband": "#7c3aed"}
 _CRITICAL = ("cure", "start", "onset")
+_IN_BRACKETS = "over the 95 % interval of J, and of all else that was measured; the gains as they are"
 _MEANT = {
     "cure": "lowest set speed from which a stuck bit ends turning, the top at full speed",
     "start": "the same after a ramp from rest",
@@ -95,6 +98,7 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
             "coulomb_nm": case.drive.coulomb_nm,
             "inner_lags_s": list(case.drive.inner_lags_s),
             "inner_lags_from": tuned_for.lags_from,
+            "inner_lag_s": asdict(_whole_lag(case)),
         },
         "string": {
             "name": string.name,
@@ -123,6 +127,13 @@ def tuning_document(tuning: Tuning, tuned_for: TunedFor) -> dict[str, Any]:
         "warnings": [*tuned_for.warnings, *_sends_back_more(tuning)],
         "tdhil": __version__,
     }
+
+
+def _whole_lag(case: TuneCase) -> Interval:
+    """Στ, with what is open of it."""
+    value = case.drive.total_lag_s
+    moved = [[end.drive.total_lag_s for end in pair] for pair in case.moves(present=False)]
+    return in_squares(Interval(value, value, value), moved)
 
 
 def _sends_back_more(tuning: Tuning) -> Iterator[str]:
@@ -166,14 +177,20 @@ def _controller(one: Tuned, ratio: float, settings: Sequence[DriveSetting]) -> d
 
 
 def _critical_part(one: Tuned, name: str) -> dict[str, float | None]:
-    """Value, and ends over J's interval; an end that is None was not found below the highest speed tried."""
+    """Value, and ends over all that has an interval; None: not found below the highest speed tried."""
     def of(speeds: CriticalSpeeds | None) -> float | None:
         found: float | None = None if speeds is None else getattr(speeds, f"{name}_rpm")
         return found
 
     value, ends = of(one.critical), [of(one.critical), of(one.critical_low), of(one.critical_high)]
+    pairs = [[of(end) for end in pair] for pair in one.critical_moved]
     known = [end for end in ends if end is not None]
-    return {"value": value, "low": min(known) if known else None, "high": None if None in ends else max(known)}
+    if value is None or len(known) < len(ends) or any(end is None for pair in pairs for end in pair):
+        known += [end for pair in pairs for end in pair if end is not None]
+        return {"value": value, "low": min(known) if known else None, "high": None}
+    moved = [[end for end in pair if end is not None] for pair in pairs]
+    found = in_squares(Interval(value, min(known), max(known)), moved)
+    return {"value": value, "low": found.low, "high": found.high}
 
 
 def _gains(law: SpeedController) -> dict[str, float]:
@@ -215,6 +232,12 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for name, cells in _rows(document):
         grid.add_row(name, *cells)
     console.print(grid)
+    legend = Grid.grid(padding=(0, 2))
+    legend.add_column(no_wrap=True, style="dim")
+    legend.add_column(overflow="fold", style="dim")
+    for name, text in _legend(document):
+        legend.add_row(name, text)
+    console.print(legend)
     for one in document["controllers"]:
         if one["refused"]:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))
@@ -241,13 +264,23 @@ def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
     main, string, tuned_for = document["main_shaft"], document["string"], document["tuned_for"]
     inertia = main["inertia_kg_m2"]
     yield "J, main shaft", with_interval(inertia["value"], inertia["low"], inertia["high"], "kg·m²")
-    lags = " + ".join(f"{1e3 * lag:g}" for lag in main["inner_lags_s"])
-    yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}"
+    lags = " + ".join(f"{1e3 * lag:.3g}" for lag in main["inner_lags_s"])
+    whole = main["inner_lag_s"]
+    yield "lags in the loop", f"{lags} ms, {main['inner_lags_from']}" + (
+        f"; together {1e3 * whole['value']:.3g} ({1e3 * whole['low']:.3g} to {1e3 * whole['high']:.3g}) ms"
+        if whole["high"] > whole["low"] else "")
     yield "string", (f"ζ {string['impedance_nm_s_rad']:.4g} N·m·s/rad, echo after {string['echo_s']:.3f} s, modes at "
                      + ", ".join(f"{hertz:.3g}" for hertz in string["modes_hz"]) + " Hz")
     yield "bit", string["bit"]["words"] if string["bit"] else "not stated: no critical speeds"
     if tuned_for["loop"] == "bus":
         yield "loop", "closed over the bus, in torque mode: the reported speed's lag is in it"
+
+
+def _legend(document: Part) -> Iterator[tuple[str, str]]:
+    """What the lines of the table mean that don't say it themselves."""
+    yield "in brackets", _IN_BRACKETS
+    if document["critical_speeds"] is not None:
+        yield from ((name, _MEANT[name]) for name in _CRITICAL)
 
 
 def _interval(part: Part, digits: int = 2) -> str:
@@ -391,9 +424,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
         )))
     rests: list[tuple[str, str]] = list(_rests_on(document))
     rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
-    if document["critical_speeds"] is not None:
-        rests += [(name, _MEANT[name]) for name in _CRITICAL]
-    rests.append(("in brackets", "over J's 95 % interval, the gains as they are"))
+    rests += _legend(document)
     sections.append(Section("What it rests on", (Pairs(tuple(rests)),)))
     simulated = document["tuned_for"]["simulated"]
     return Report(

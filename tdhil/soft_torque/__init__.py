@@ -7,7 +7,8 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.soft_torque.drill_string import (
         BitFriction as BitFriction, Bottom as Bottom, DrillString as DrillString, Line as Line, Section as Section,
-        StringFile as StringFile, load_string as load_string, string_of as string_of,
+        StringFile as StringFile, load_string as load_string, spring_and_mass as spring_and_mass,
+        string_of as string_of,
     )
     from tdhil.soft_torque.controller import (
         ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins, Mode as Mode,
@@ -30,10 +31,12 @@ if TYPE_CHECKING:
         onset_speeds as onset_speeds, simulate as simulate,
     )
     from tdhil.soft_torque.tuning import (
-        BAND_HZ as BAND_HZ, Interval as Interval, TUNING_REFUSED as TUNING_REFUSED, TuneCase as TuneCase,
-        Tuned as Tuned, Tuning as Tuning, TuningRefused as TuningRefused, WrongInertia as WrongInertia,
-        figures_at as figures_at, largest_stable_share as largest_stable_share, least_damping as least_damping,
-        recipe_with as recipe_with, string_modes_hz as string_modes_hz, tune as tune,
+        BAND_HZ as BAND_HZ, Interval as Interval, Moved as Moved, TUNING_REFUSED as TUNING_REFUSED,
+        TuneCase as TuneCase, Tuned as Tuned, Tuning as Tuning, TuningRefused as TuningRefused,
+        WrongInertia as WrongInertia, figures_at as figures_at, in_squares as in_squares,
+        largest_stable_share as largest_stable_share, least_damping as least_damping,
+        lowest_modes_below_hz as lowest_modes_below_hz, recipe_with as recipe_with,
+        string_modes_hz as string_modes_hz, tune as tune,
     )
     from tdhil.soft_torque.virtual_string import (
         COLUMNS as COLUMNS, Course as Course, HostController as HostController, HostLoop as HostLoop,

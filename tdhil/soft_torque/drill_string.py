@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, pi, sqrt
+from math import inf, pi, sqrt, tan
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -288,3 +288,21 @@ def string_of(file: StringFile) -> DrillString:
 def load_string(path: Path) -> DrillString:
     """Reads string.yaml; `DataFileError` with every problem and its line."""
     return string_of(load_model(path, StringFile))
+
+
+SPRING_SHARE = 0.1
+"""Of its load's inertia, that a spring whose weight nobody knows is taken to have: waves need some."""
+
+
+def spring_and_mass(stiffness_nm_rad: float, antiresonance_hz: float, name: str | None = None) -> DrillString:
+    """A load on a spring, as identified: no mud, no bit; with its top held it swings at ``antiresonance_hz``.
+
+    One light line with K and its share of the load. A mass m on a line with inertia J_s swings as m + J_s/3 on a
+    spring does, to the second order of J_s/m (Rayleigh), and exactly as ωT tan ωT = J_s/m has it; that is used.
+    """
+    swing = 2.0 * pi * antiresonance_hz
+    load = stiffness_nm_rad / swing**2
+    inertia = SPRING_SHARE * load
+    way = swing * sqrt(inertia / stiffness_nm_rad)       # ωT
+    line = Line(1.0, inertia, 1.0 / stiffness_nm_rad, 0.0)
+    return DrillString((line,), inertia / (way * tan(way)), name=name)

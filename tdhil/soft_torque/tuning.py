@@ -15,14 +15,16 @@ that is no more than a soft controller does, it is refused under this name.
 
 **How J's error comes in.** The gains are what they are; J is what moves. Every derived number is taken at some values
 of J from end to end of its interval, and its interval is what these span, turning points between them included:
-whatever J is in its own, the number is in this one (checked by drawing J, in the tests).
+whatever J is in its own, the number is in this one. What else has an interval (lags and gains as measured, a string as
+identified) is moved to either end of it, one after the other, and what each does to a number is added in squares.
+(Checked by drawing all of them, in the tests.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import pi, sqrt
+from math import inf, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +60,9 @@ WRONG_BY = (0.126, 0.76)
 """Errors of J whose cost is told: the paper's method on a simulated field rig, and its own spread of slopes."""
 BROADBAND_BELOW = 0.8
 """Mean |r| above which a controller isn't called broadband: a plain soft one has 0.94 on the reference case."""
+NEXT_MODE_SHARE = 0.85
+"""Of the second mode with the top held, that the whole's second mode stays above: there a top drive is a rotor, or a
+wall."""
 _LEAST_SOFT, _MOST_SOFT = 0.02, 2.0
 
 
@@ -77,6 +82,15 @@ class Interval:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """All as believed, but for one thing that is at an end of its 95 % interval; None: as believed."""
+
+    inner_lags_s: tuple[float, ...] | None = None
+    present: SpeedController | None = None
+    string: DrillString | None = None
+
+
+@dataclass(frozen=True)
 class TuneCase:
     """What is tuned for what, all at the main shaft."""
 
@@ -91,6 +105,19 @@ class TuneCase:
     """Share of J, where it is asked for; None: the one that damps most within the reserve."""
     present: SpeedController | None = None
     """What stands in the drive now, as measured (`identify --impedance`); shown beside the others."""
+    also: tuple[tuple[Moved, Moved], ...] = ()
+    """What else is known to an interval only, none hanging on another: both ends of each."""
+
+    def moved(self, by: Moved) -> TuneCase:
+        """The case with that one thing moved."""
+        lags = self.drive.inner_lags_s if by.inner_lags_s is None else by.inner_lags_s
+        return replace(self, string=by.string or self.string, present=by.present or self.present,
+                       drive=replace(self.drive, inner_lags_s=lags))
+
+    def moves(self, *, present: bool) -> tuple[tuple[TuneCase, TuneCase], ...]:
+        """Both ends of all that matters to a controller: to the ``present`` one its own gains, too."""
+        return tuple((self.moved(low), self.moved(high)) for low, high in self.also
+                     if present or low.present is None)
 
     @property
     def at_inertias(self) -> tuple[TopDrive, ...]:
@@ -142,6 +169,8 @@ class Tuned:
     critical_low: CriticalSpeeds | None = None
     """At the lower end of J's interval."""
     critical_high: CriticalSpeeds | None = None
+    critical_moved: tuple[tuple[CriticalSpeeds, CriticalSpeeds], ...] = ()
+    """At both ends of whatever else has an interval."""
     wrong: tuple[WrongInertia, ...] = ()
 
 
@@ -191,10 +220,15 @@ def string_modes_hz(string: DrillString) -> tuple[float, ...]:
     return tuple(mode.frequency_hz for mode in modes[:3])
 
 
-def lowest_modes(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> tuple[Mode, ...]:
-    """Those that the string's lowest mode has become: up to halfway to the next, as a ratio."""
+def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
+    """What swings below is what the string's lowest mode has become; the next, which rotor and P hold, stays above."""
     second = held_hz[1] if len(held_hz) > 1 else 4.0 * held_hz[0]
-    return ClosedSystem(case.string, drive, law).modes(sqrt(held_hz[0] * second))
+    return max(sqrt(held_hz[0] * second), NEXT_MODE_SHARE * second)
+
+
+def lowest_modes(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> tuple[Mode, ...]:
+    """Those that the string's lowest mode has become."""
+    return ClosedSystem(case.string, drive, law).modes(lowest_modes_below_hz(held_hz))
 
 
 def least_damping(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> float:
@@ -349,12 +383,17 @@ def largest_stable_share(
 def _stable_everywhere(
     case: TuneCase, softness: float, share: float, held: Sequence[float], believed_upper: bool = True
 ) -> bool:
-    """Stable at both ends of J's interval, with the believed J's gains; and if its upper end is believed."""
+    """Stable at both ends of J's interval, with the believed J's gains; and if its upper end is believed.
+
+    And whatever else is moved to an end of its interval, at J's lower end, which bears least compensation.
+    """
     inertia = case.inertia_kg_m2
     law = tuned_controller(case.string, inertia.value, softness, held[0], share)
     upper = tuned_controller(case.string, inertia.high, softness, held[0], share)
     wanted = [(inertia.low, law), (inertia.high, law), *([(inertia.value, upper)] if believed_upper else [])]
-    return all(_is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted)
+    ends = [end for pair in case.moves(present=False) for end in pair]
+    return all(_is_stable(case.string, case.drive.with_inertia(true), one) for true, one in wanted) and all(
+        _is_stable(end.string, end.drive.with_inertia(inertia.low), law) for end in ends)
 
 
 def _is_stable(string: DrillString, drive: TopDrive, law: SpeedController) -> bool:
@@ -402,17 +441,29 @@ def _with_figures(case: TuneCase, tuned: Tuned, held: Sequence[float], told: Cal
     assert law is not None
     told(f"{tuned.kind}: reflection, modes, margins")
     along = np.array([figures_at(case, drive, law, held) for drive in case.at_inertias])
+    present = tuned.kind == "present"
+    pairs = case.moves(present=present)
+    heard = [[held if end.string is case.string else string_modes_hz(end.string) for end in pair] for pair in pairs]
+    moved = np.array([
+        [figures_at(end, end.drive, (end.present or law) if present else law, modes)
+         for end, modes in zip(pair, own, strict=True)]
+        for pair, own in zip(pairs, heard, strict=True)
+    ]).reshape(len(pairs), 2, 3)
     inertia = case.inertia_kg_m2
     integral = None
-    if tuned.kind not in ("stiff", "present"):
-        square = (2.0 * pi * held[0]) ** 2 * (1.0 - tuned.compensated_share)
-        integral = Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high)
+    if tuned.kind != "stiff" and not present:
+        share = 1.0 - tuned.compensated_share
+        of = [[(2.0 * pi * modes[0]) ** 2 * share * inertia.value for modes in own] for own in heard]
+        square = (2.0 * pi * held[0]) ** 2 * share
+        integral = in_squares(Interval(law.integral_nm_rad, square * inertia.low, square * inertia.high), of)
     system = ClosedSystem(case.string, case.drive, law)
-    errors = WRONG_BY if tuned.kind != "present" else ()       # those gains hang on no J that is believed now
+    errors = WRONG_BY if not present else ()       # those gains hang on no J that is believed now
     wrong = tuple(_wrong(case, tuned, error, held) for error in errors)
     return replace(
-        tuned, integral_nm_rad=integral, reflection=_spanned(along[:, 0]), band_reflection=_spanned(along[:, 1]),
-        damping=_spanned(along[:, 2]), modes=system.modes(1.1 * held[min(2, len(held) - 1)]),
+        tuned, integral_nm_rad=integral, reflection=in_squares(_spanned(along[:, 0]), moved[:, :, 0]),
+        band_reflection=in_squares(_spanned(along[:, 1]), moved[:, :, 1]),
+        damping=in_squares(_spanned(along[:, 2]), moved[:, :, 2], -inf, 1.0, (along[0, 2], along[-1, 2])),
+        modes=system.modes(1.1 * held[min(2, len(held) - 1)]),
         margins=margins(case.drive, law, case.string), lag_reserve_s=_lag_reserve(case, law), wrong=wrong,
     )
 
@@ -427,6 +478,30 @@ def _spanned(along: NDArray[np.float64]) -> Interval:
             turning = here - (after - before) ** 2 / (8.0 * bend)
             low, high = min(low, turning), max(high, turning)
     return Interval(float(along[len(along) // 2]), max(low, 0.0) if along.min() >= 0.0 else low, high)
+
+
+def in_squares(
+    by_inertia: Interval, moved: Sequence[Sequence[float]] | NDArray[np.float64], least: float = 0.0, most: float = inf,
+    ends: tuple[float, float] | None = None,
+) -> Interval:
+    """An interval over J, widened by what each other move makes of the value at either of its ends.
+
+    ``ends``: the values at J's own. Where the least of two dampings has its greatest value every single move lowers
+    it, and two together may raise it: by no more than the mean of both slopes does, which is half of the difference
+    between the ends.
+    """
+    if not len(moved):
+        return by_inertia
+    value = by_inertia.value
+    below, above = value - by_inertia.low, by_inertia.high - value
+    if ends is not None:
+        above = max(above, 0.5 * abs(ends[1] - ends[0]))
+    below, above = below**2, above**2
+    for pair in moved:
+        slope = 0.5 * abs(pair[1] - pair[0])
+        below += max(slope, value - min(pair)) ** 2
+        above += max(slope, max(pair) - value) ** 2
+    return Interval(value, max(least, value - sqrt(below)), min(most, value + sqrt(above)))
 
 
 def _lag_reserve(case: TuneCase, law: SpeedController) -> float | None:
@@ -464,12 +539,18 @@ def _with_critical_speeds(
 ) -> tuple[Tuned, ...]:
     inertia = case.inertia_kg_m2
     taken = [one for one in every if one.controller is not None]
-    loops = [
-        (case.drive.with_inertia(true), one.controller)
+    believed = [
+        (case.string, case.drive.with_inertia(true), one.controller)
         for one in taken for true in (inertia.value, inertia.low, inertia.high) if one.controller is not None
     ]
+    ends = [
+        (end.string, end.drive, end.present or one.controller if one.kind == "present" else one.controller)
+        for one in taken for pair in case.moves(present=one.kind == "present") for end in pair
+        if one.controller is not None
+    ]
     told("critical speeds, simulated: cure, start, onset")
-    found = critical_speeds(case.string, loops, search)
+    speeds = _critical_speeds([*believed, *ends], search)
+    found, moved = speeds[: len(believed)], iter(speeds[len(believed) :])
     wrong = [(one.kind, part.error) for one in taken for part in one.wrong if part.stable]
     by_kind = {one.kind: one for one in taken}
     told("what a wrong J costs, simulated")
@@ -482,8 +563,20 @@ def _with_critical_speeds(
     done = {
         one.kind: replace(
             one, critical=found[3 * k], critical_low=found[3 * k + 1], critical_high=found[3 * k + 2],
+            critical_moved=tuple((next(moved), next(moved)) for _ in case.moves(present=one.kind == "present")),
             wrong=tuple(replace(part, cure_rpm=cure.get((one.kind, part.error))) for part in one.wrong),
         )
         for k, one in enumerate(taken)
     }
     return tuple(done.get(one.kind, one) for one in every)
+
+
+def _critical_speeds(
+    loops: Sequence[tuple[DrillString, TopDrive, SpeedController]], search: Search
+) -> list[CriticalSpeeds]:
+    """In the order of ``loops``: those on one string at once."""
+    found: dict[int, CriticalSpeeds] = {}
+    for string in dict.fromkeys(string for string, _, _ in loops):
+        at = [k for k, (one, _, _) in enumerate(loops) if one == string]
+        found |= zip(at, critical_speeds(string, [loops[k][1:] for k in at], search), strict=True)
+    return [found[k] for k in range(len(loops))]

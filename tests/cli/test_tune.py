@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from tdhil.soft_torque import CriticalSpeeds, Interval, Search, TuneCase, tune
 from tests.soft_torque.cases import DRIVE, STRING
 
 STRING_YAML = Path(__file__).parents[2] / "examples" / "string.yaml"
+
+
+def interval(value, low, high):
+    return {"value": value, "low": low, "high": high}
 
 
 def estimate(value, low, high):
@@ -37,7 +42,8 @@ def tuned(tmp_path, capsys):
         path = tmp_path / "result.json"
         path.write_text(json.dumps(result(**said)), encoding="utf-8")
         options = ["--json"] if as_json else []
-        code = main(["tune", str(path), "--string", str(string), "--no-simulation", *options, *words])
+        named = [] if string is None else ["--string", str(string)]
+        code = main(["tune", str(path), *named, "--no-simulation", *options, *words])
         out, err = capsys.readouterr()
         return code, json.loads(out) if as_json else out, err
 
@@ -78,6 +84,7 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     (("--compensate", "80%"), {}, 11, "swings by itself"),
     (("--loop", "bus", "--a", "1.5"), {}, 11, "is beyond ζ/(ω² J Στ)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
+    ((), {"verdict": "model_rejected"}, 11, "no J to tune for (model_rejected)"),
     (("--loop", "bus"), {"speed_lag_s": None}, 2, "how late the reported speed is"),
     (("--a", "20"), {}, 2, "--a: 20: must be from 0.01 to 10"),
     (("--inner-lags", "0"), {}, 2, "no lag at all"),
@@ -97,6 +104,35 @@ def test_over_the_bus_the_reported_speeds_lag_is_in_the_loop(tuned):
     soft = document["controllers"][1]
     assert soft["softest_a"] < 0.8
     assert soft["drive_parameters"] == []
+
+
+def compliant(**said):
+    """The reference case's string as the two-mass model has it, at the motor of a gear of 10."""
+    return {"stiffness_nm_rad": interval(3.14, 3.0, 3.3), "antiresonance_hz": interval(0.1299, 0.128, 0.132), **said}
+
+
+def test_without_a_string_k_and_j_l_are_as_the_result_has_them(tuned):
+    code, document, _ = tuned(string=None, model="two-mass", compliant=compliant())
+    assert code == 0
+    assert document["string"]["stiffness_nm_rad"] == pytest.approx(314.0)
+    assert document["string"]["modes_hz"][0] == pytest.approx(0.1299)
+    assert document["string"]["name"] == "k and J_L as identified (two-mass)"
+    soft = document["controllers"][1]
+    # what the exact string of the reference case has: 0.22 to 0.26, and I = ω² J with what is open of ω
+    assert soft["least_damping"]["value"] == pytest.approx(0.25, abs=0.03)
+    own = soft["integral_nm_rad_by_inertia"]
+    assert own["low"] / own["value"] == pytest.approx(1.0 - math.hypot(0.04, 0.029), abs=0.002)
+    assert any("name the pipe in a string.yaml" in warning for warning in document["warnings"])
+
+
+@pytest.mark.parametrize(("said", "words"), [
+    ({}, "--string is missing, and the result is of a rigid shaft"),
+    ({"compliant": compliant(stiffness_nm_rad=None)}, "leaves the spring's stiffness or its swing open"),
+])
+def test_without_either_the_string_is_asked_for(tuned, said, words):
+    code, document, _ = tuned(string=None, **said)
+    assert code == ExitCode.USAGE
+    assert words in document["error"]["message"]
 
 
 def test_files_that_are_none_are_named(tmp_path, capsys):
@@ -144,7 +180,8 @@ def test_the_page_has_the_pictures_and_the_speeds(tmp_path):
 def impedance(**said):
     """What identify --impedance says, at the motor."""
     loop = {"gain_nm_s_rad": estimate(203.0, 200.0, 206.0), "integral_nm_rad": estimate(264.5, 260.0, 269.0),
-            "torque_lag_s": estimate(0.012, 0.01, 0.014), "speed_filter_s": estimate(0.021, 0.018, 0.024)}
+            "torque_lag_s": estimate(0.012, 0.01, 0.014), "speed_filter_s": estimate(0.021, 0.018, 0.024),
+            "inner_lag_s": estimate(0.033, 0.032, 0.034)}
     return {"verdict": "valid", "by": "offset", "reason": "explained", "advice": "", **loop, **said}
 
 
@@ -171,6 +208,11 @@ def test_the_drives_present_gains_stand_beside_the_others_with_its_own_lags(tune
     assert present["inertia_wrong_by"] == []
     assert document["main_shaft"]["inner_lags_s"] == [0.021, 0.012]
     assert document["main_shaft"]["inner_lags_from"] == "as measured (--impedance)"
+    # each is known to 2 or 3 ms, and their sum to one: both go in as they hang together
+    assert document["main_shaft"]["inner_lag_s"] == pytest.approx(interval(0.033, 0.032, 0.034))
+    open_of = [one["reflection_at_lowest_mode"]["high"] - one["reflection_at_lowest_mode"]["low"]
+               for one in (present, stiff)]
+    assert open_of[0] > 2.0 * open_of[1]       # its gains are measured, too
     assert not any("--inner-lags" in warning for warning in document["warnings"])
     assert len(document["reflection"]["present"]) == len(document["reflection"]["hertz"])
 

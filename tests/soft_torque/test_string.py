@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from profiles import DataFileError
-from tdhil.soft_torque import ClosedSystem, DrillString, Line, load_string
+from tdhil.soft_torque import ClosedSystem, DrillString, Line, load_string, spring_and_mass, string_modes_hz
 from tests.soft_torque.cases import STRING, Pipe, chain_modes, lumped_chain, string_with
 
 GOOD = """\
@@ -144,3 +144,12 @@ def test_every_string_takes_energy_and_gives_none(sections, inertia, viscous):
     seen = string.impedance_at(s)
     assert np.all(seen.real >= -1e-9 * np.abs(seen))
     assert np.conj(string.impedance_at(np.conj(s))) == pytest.approx(seen)
+
+
+def test_a_spring_and_a_mass_as_identified_swing_as_they_were_seen_to():
+    string = spring_and_mass(314.0, 0.1299)
+    assert string.stiffness_nm_rad == pytest.approx(314.0)
+    first, second, *_ = string_modes_hz(string)
+    assert first == pytest.approx(0.1299, rel=1e-6)
+    assert second > 8.0 * first        # of the spring alone: far from what was identified
+    assert string.inertia_kg_m2 == pytest.approx(314.0 / (2 * pi * 0.1299) ** 2, rel=0.08)
