@@ -355,6 +355,3 @@ class CanopenProfile(DriveProfile):
     def rated_torque_by_hand(self) -> bool:
         """Does rig.yaml have to say what 100 % torque is?"""
         return self.torque.rated_torque_nm_per_lsb is None
-
-
-__all__ = ["CanopenProfile", "ReportingFilter", "Watchdog"]

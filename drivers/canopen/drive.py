@@ -605,6 +605,3 @@ class Cia402Drive:
 def rpdo_kind(number: int, identifier: int) -> str:
     """An RPDO of the drive, as it is named in messages."""
     return f"setpoints (RPDO{number}, {identifier:03X}h)"
-
-
-__all__ = ["HOST_NODE", "Cia402Drive"]

@@ -454,6 +454,3 @@ class Feedback:
             return False
         near = abs(took_s - self._usual_s) <= _USUAL_SHARE * self._period_s
         return near and took_s >= _QUICKEST_SHARE * quickest_s
-
-
-__all__ = ["STANDARD", "Shape", "shape_of"]

@@ -589,6 +589,3 @@ class ModbusDrive:
         finally:
             self._link.close()
         return left
-
-
-__all__ = ["ModbusDrive"]

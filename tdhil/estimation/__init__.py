@@ -1,64 +1,19 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
-from tdhil.estimation.identification import identify
-from tdhil.estimation.paper_method import (
-    STEP_S,
-    line_fit,
-    paper_estimate,
-)
+from tdhil.estimation.identification import identify as identify
+from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
 from tdhil.estimation.result import (
-    BudgetLine,
-    Compliant,
-    Estimate,
-    FrictionPoint,
-    Identification,
-    InertiaEstimate,
-    LineFit,
-    Options,
-    PaperEstimate,
-    ResidualTest,
-    SecondOpinion,
-    Verdict,
+    BudgetLine as BudgetLine, Compliant as Compliant, Estimate as Estimate, FrictionPoint as FrictionPoint,
+    Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
+    PaperEstimate as PaperEstimate, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
+    Verdict as Verdict,
 )
-from tdhil.estimation.rough_estimates import RoughFriction, RoughInertia, rough_friction, rough_inertia
+from tdhil.estimation.rough_estimates import (
+    RoughFriction as RoughFriction, RoughInertia as RoughInertia, rough_friction as rough_friction,
+    rough_inertia as rough_inertia,
+)
 from tdhil.estimation.samples import (
-    STICK_SLIP_REGULAR,
-    STICK_SLIP_SHARE,
-    Samples,
-    Stretch,
-    excited_window,
-    repeats,
-    stretches,
-    usable_samples,
+    STICK_SLIP_REGULAR as STICK_SLIP_REGULAR, STICK_SLIP_SHARE as STICK_SLIP_SHARE, Samples as Samples,
+    Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
+    usable_samples as usable_samples,
 )
-
-__all__ = [
-    "STEP_S",
-    "STICK_SLIP_REGULAR",
-    "STICK_SLIP_SHARE",
-    "BudgetLine",
-    "Compliant",
-    "Estimate",
-    "FrictionPoint",
-    "Identification",
-    "InertiaEstimate",
-    "LineFit",
-    "Options",
-    "PaperEstimate",
-    "ResidualTest",
-    "RoughFriction",
-    "RoughInertia",
-    "Samples",
-    "SecondOpinion",
-    "Stretch",
-    "Verdict",
-    "excited_window",
-    "identify",
-    "line_fit",
-    "paper_estimate",
-    "repeats",
-    "rough_friction",
-    "rough_inertia",
-    "stretches",
-    "usable_samples",
-]

@@ -590,6 +590,3 @@ def _conditions(case: PeriodicCase, asked: ImpedanceInput) -> tuple[str, ...]:
     if case.recording.lag_prior.source:
         found.append(f"reporting lags as stated by {case.recording.lag_prior.source}")
     return tuple(found)
-
-
-__all__ = ["OFFSET", "REFERENCE", "measure_impedance", "refusal"]

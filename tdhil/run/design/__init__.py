@@ -1,53 +1,15 @@
 """What to ask of the shaft: lines, amplitudes, mean speeds and periods for the tightest interval, and when to stop."""
 
 from tdhil.run.design.choice import (
-    Choice,
-    Knowledge,
-    choose,
-    refuse_unfit,
+    Choice as Choice, Knowledge as Knowledge, choose as choose, refuse_unfit as refuse_unfit,
 )
 from tdhil.run.design.prediction import (
-    Evidence,
-    Noise,
-    assumed_noise,
-    expected_half_width,
-    half_width,
-    longer,
-    measured_noise,
-    predicted,
+    Evidence as Evidence, Noise as Noise, assumed_noise as assumed_noise,
+    expected_half_width as expected_half_width, half_width as half_width, longer as longer,
+    measured_noise as measured_noise, predicted as predicted,
 )
 from tdhil.run.design.stopping_rule import (
-    LOOKS,
-    MARGIN,
-    Look,
-    Stopping,
-    interval_confidence,
-    interval_of,
-    least_scale,
-    look,
-    working_confidence,
+    LOOKS as LOOKS, MARGIN as MARGIN, Look as Look, Stopping as Stopping,
+    interval_confidence as interval_confidence, interval_of as interval_of, least_scale as least_scale,
+    look as look, working_confidence as working_confidence,
 )
-
-__all__ = [
-    "LOOKS",
-    "MARGIN",
-    "Choice",
-    "Evidence",
-    "Knowledge",
-    "Look",
-    "Noise",
-    "Stopping",
-    "assumed_noise",
-    "choose",
-    "expected_half_width",
-    "half_width",
-    "interval_confidence",
-    "interval_of",
-    "least_scale",
-    "longer",
-    "look",
-    "measured_noise",
-    "predicted",
-    "refuse_unfit",
-    "working_confidence",
-]

@@ -1,67 +1,21 @@
 """What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
 
 from tdhil.run.excitation.plan import (
-    LEAST_COUNTED,
-    ExcitationWish,
-    Plan,
-    PlannedSegment,
-    make_plan,
-    periodic_kind,
-    settling_periods,
+    LEAST_COUNTED as LEAST_COUNTED, ExcitationWish as ExcitationWish, Plan as Plan,
+    PlannedSegment as PlannedSegment, make_plan as make_plan, periodic_kind as periodic_kind,
+    settling_periods as settling_periods,
 )
 from tdhil.run.excitation.pulses import (
-    CALM_S,
-    SwingKind,
-    SwingPlan,
-    Way,
-    make_swings,
+    CALM_S as CALM_S, SwingKind as SwingKind, SwingPlan as SwingPlan, Way as Way, make_swings as make_swings,
 )
 from tdhil.run.excitation.reference import (
-    DriveMode,
-    ExcitationKind,
-    MotionLimits,
-    PeriodicReference,
-    PlanRefused,
-    RigGuess,
-    Transition,
-    excitation_kind,
-    make_transition,
+    DriveMode as DriveMode, ExcitationKind as ExcitationKind, MotionLimits as MotionLimits,
+    PeriodicReference as PeriodicReference, PlanRefused as PlanRefused, RigGuess as RigGuess,
+    Transition as Transition, excitation_kind as excitation_kind, make_transition as make_transition,
 )
 from tdhil.run.excitation.signals import (
-    ECHOES_S,
-    PeriodicKind,
-    Shape,
-    unit_peak,
+    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape, unit_peak as unit_peak,
 )
-from tdhil.run.excitation.speed_loop import Following, fit_following, held_back_to
-
-__all__ = [
-    "CALM_S",
-    "ECHOES_S",
-    "LEAST_COUNTED",
-    "DriveMode",
-    "ExcitationKind",
-    "ExcitationWish",
-    "Following",
-    "MotionLimits",
-    "PeriodicKind",
-    "PeriodicReference",
-    "Plan",
-    "PlanRefused",
-    "PlannedSegment",
-    "RigGuess",
-    "Shape",
-    "SwingKind",
-    "SwingPlan",
-    "Transition",
-    "Way",
-    "excitation_kind",
-    "fit_following",
-    "held_back_to",
-    "make_plan",
-    "make_swings",
-    "make_transition",
-    "periodic_kind",
-    "settling_periods",
-    "unit_peak",
-]
+from tdhil.run.excitation.speed_loop import (
+    Following as Following, fit_following as fit_following, held_back_to as held_back_to,
+)
