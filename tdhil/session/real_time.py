@@ -141,6 +141,3 @@ def _may_lock() -> bool:
 
 def _libc() -> ctypes.CDLL:
     return ctypes.CDLL(None, use_errno=True)
-
-
-__all__ = ["HOW", "PRIORITY", "Raised", "allowed", "real_time_priority"]

@@ -285,6 +285,3 @@ def _planned(
     )
     plan = Plan("multisine", "speed", (segment,), room, guess)
     return OffsetPlan(plan, tuple(float(one) for one in scale * shares), peak)
-
-
-__all__ = ["OffsetPlan", "largest_offset_nm", "reference_plan", "run_offset", "run_pilot"]

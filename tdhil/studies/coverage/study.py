@@ -344,10 +344,7 @@ class CoverageStudy:
 
     name: str = "coverage"
     title: str = "Coverage of the interval and closeness to the Cramér-Rao bound, plant by plant"
-
-    @property
-    def settings_model(self) -> type[CoverageSettings]:
-        return CoverageSettings
+    settings_model: type[CoverageSettings] = CoverageSettings
 
     def run(self, settings: CoverageSettings, progress: Progress) -> StudyOutcome:
         """Every run of every plant; the same settings give the same bits, whatever the number of processes.

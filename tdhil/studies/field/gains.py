@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tdhil.recording import FloatArray
-from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
+from tdhil.studies.field.bench import FieldBench
 from tdhil.studies.field.loops import best_kp, gain, tones_with_steady_rise
 from tdhil.studies.field.settings import GainSweepSettings, KiSweepSettings, KpSweepSettings
-from tdhil.studies.field.tone import PUBLISHED_STYLE, Amplitudes, amplitudes, colour, periods_for, tidy
+from tdhil.studies.field.tone import PUBLISHED_STYLE, Amplitudes, colour, swept_amplitudes, tidy
 from tdhil.studies.study import Progress, ResultTable, Statement, StudyOutcome
 
 if TYPE_CHECKING:
@@ -172,15 +172,6 @@ def _edge(value: float, low: float, high: float) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-@dataclass(frozen=True)
-class GainSweep:
-    """What came of a sweep: one run a value. ``loops`` are (P, I)."""
-
-    loops: tuple[tuple[float, float], ...]
-    found: tuple[Amplitudes, ...]
-    simulated_s: float
-
-
 @dataclass
 class KpSweep:
     """`tdhil study figure20`."""
@@ -188,16 +179,14 @@ class KpSweep:
     bench: FieldBench
     name: str = "figure20"
     title: str = "Field rig: input and output amplitude over P"
-
-    @property
-    def settings_model(self) -> type[KpSweepSettings]:
-        return KpSweepSettings
+    settings_model: type[KpSweepSettings] = KpSweepSettings
 
     def run(self, settings: KpSweepSettings, progress: Progress) -> StudyOutcome:
         """One run a P."""
-        sweep = _swept(self.bench, settings, [(kp, settings.ki_nm_rad) for kp in settings.kp_values_nm_s_rad], progress)
-        statements = said_of_kp(settings, settings.kp_values_nm_s_rad, sweep.found)
-        return _outcome(self.name, self.title, settings, sweep, 0, statements, published=(300.0, None))
+        loops = [(kp, settings.ki_nm_rad) for kp in settings.kp_values_nm_s_rad]
+        found, simulated_s = _swept(self.bench, settings, loops, progress)
+        statements = said_of_kp(settings, settings.kp_values_nm_s_rad, found)
+        return _outcome(self, settings, loops, found, simulated_s, 0, statements, published=(300.0, None))
 
 
 @dataclass
@@ -207,38 +196,27 @@ class KiSweep:
     bench: FieldBench
     name: str = "figure21"
     title: str = "Field rig: input and output amplitude over I"
-
-    @property
-    def settings_model(self) -> type[KiSweepSettings]:
-        return KiSweepSettings
+    settings_model: type[KiSweepSettings] = KiSweepSettings
 
     def run(self, settings: KiSweepSettings, progress: Progress) -> StudyOutcome:
         """One run an I."""
-        sweep = _swept(self.bench, settings, [(settings.kp_nm_s_rad, ki) for ki in settings.ki_values_nm_rad], progress)
-        statements = said_of_ki(settings, settings.ki_values_nm_rad, sweep.found)
-        return _outcome(self.name, self.title, settings, sweep, 1, statements, published=(200.0, 0.0594))
+        loops = [(settings.kp_nm_s_rad, ki) for ki in settings.ki_values_nm_rad]
+        found, simulated_s = _swept(self.bench, settings, loops, progress)
+        statements = said_of_ki(settings, settings.ki_values_nm_rad, found)
+        return _outcome(self, settings, loops, found, simulated_s, 1, statements, published=(200.0, 0.0594))
 
 
 def _swept(
     bench: FieldBench, settings: GainSweepSettings, loops: list[tuple[float, float]], progress: Progress
-) -> GainSweep:
-    found, simulated_s = [], 0.0
-    for index, (kp, ki) in enumerate(loops):
-        wish = FieldRun(
-            settings.rig, settings.frequency_hz, kp, ki, settings.seed + index,
-            amplitude_rad_s=settings.amplitude_rad_s, offset_rad_s=settings.offset_rad_s,
-            periods=periods_for(settings.frequency_hz, settings.measured_s), rate_hz=settings.rate_hz,
-            torque_limit_nm=settings.torque_limit_nm,
-        )
-        recording = bench.run(wish, part_of(progress, index, len(loops), f"P {kp:g}, I {ki:g}"))
-        found.append(amplitudes(recording))
-        simulated_s += float(recording.time_s[-1] - recording.time_s[0])
-    return GainSweep(tuple(loops), tuple(found), simulated_s)
+) -> tuple[tuple[Amplitudes, ...], float]:
+    runs = [(settings.frequency_hz, kp, ki, f"P {kp:g}, I {ki:g}") for kp, ki in loops]
+    return swept_amplitudes(bench, settings, runs, progress)
 
 
 def _outcome(
-    name: str, title: str, settings: GainSweepSettings, sweep: GainSweep, swept: int,
-    statements: tuple[Statement, ...], published: tuple[float, float | None],
+    study: KpSweep | KiSweep, settings: GainSweepSettings, loops: list[tuple[float, float]],
+    found: tuple[Amplitudes, ...], simulated_s: float, swept: int, statements: tuple[Statement, ...],
+    published: tuple[float, float | None],
 ) -> StudyOutcome:
     columns = (
         "kp_nm_s_rad", "ki_nm_rad", "input_rad_s", "output_rad_s", "difference_rad_s", "output_sd_rad_s",
@@ -249,7 +227,7 @@ def _outcome(
             kp, ki, a.input_rad_s, a.output_rad_s, abs(a.difference_rad_s), a.sd_rad_s,
             a.input_rad_s * float(gain(settings.rig, settings.frequency_hz, kp, ki, reported=True)), a.limited,
         )
-        for (kp, ki), a in zip(sweep.loops, sweep.found, strict=True)
+        for (kp, ki), a in zip(loops, found, strict=True)
     )
     other = settings.kp_nm_s_rad if swept else settings.ki_nm_rad
     curves: dict[float, Callable[[np.ndarray], np.ndarray]] = {
@@ -257,13 +235,13 @@ def _outcome(
         for hertz in sorted({settings.frequency_hz, *settings.other_tones_hz})
     }
     picture = GainPicture(
-        gain_name="PI"[swept], values=tuple(pair[swept] for pair in sweep.loops), found=sweep.found, curves=curves,
+        gain_name="PI"[swept], values=tuple(pair[swept] for pair in loops), found=found, curves=curves,
         main_hz=settings.frequency_hz, published=published, fixed=f"{'IP'[swept]} {other:g}",
     )
     return StudyOutcome(
-        name, title, (ResultTable("amplitudes", columns, rows),), statements,
+        study.name, study.title, (ResultTable("amplitudes", columns, rows),), statements,
         document={"runs": [dict(zip(columns, row, strict=True)) for row in rows]},
-        simulated_s=sweep.simulated_s,
+        simulated_s=simulated_s,
         draw=lambda figure: draw_gains(figure, picture),
         figure_size_in=(11.0, 4.8),
     )

@@ -7,22 +7,23 @@ difference from chance.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tdhil.recording import FloatArray
-from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
+from tdhil.studies.field.bench import FieldBench, part_of
 from tdhil.studies.field.settings import LoopPair, ScatterSettings, SimulatedRig, ToneSweepSettings
 from tdhil.studies.field.tone import (
     PUBLISHED_STYLE,
     Amplitudes,
     Scatter,
-    amplitudes,
     colour,
-    periods_for,
     scatter,
+    sine_run,
+    swept_amplitudes,
     tidy,
 )
 from tdhil.studies.study import Progress, ResultTable, Statement, StudyOutcome
@@ -90,25 +91,13 @@ class ToneSweep:
     bench: FieldBench
     name: str = "figure23"
     title: str = "Field rig: input and output amplitude over the tone"
-
-    @property
-    def settings_model(self) -> type[ToneSweepSettings]:
-        return ToneSweepSettings
+    settings_model: type[ToneSweepSettings] = ToneSweepSettings
 
     def run(self, settings: ToneSweepSettings, progress: Progress) -> StudyOutcome:
         """One run a tone."""
         tones = sorted(settings.frequencies_hz)
-        found, simulated_s = [], 0.0
-        for index, hertz in enumerate(tones):
-            wish = FieldRun(
-                settings.rig, hertz, settings.kp_nm_s_rad, settings.ki_nm_rad, settings.seed + index,
-                amplitude_rad_s=settings.amplitude_rad_s, offset_rad_s=settings.offset_rad_s,
-                periods=periods_for(hertz, settings.measured_s), rate_hz=settings.rate_hz,
-                torque_limit_nm=settings.torque_limit_nm,
-            )
-            recording = self.bench.run(wish, part_of(progress, index, len(tones), f"{hertz:g} Hz"))
-            found.append(amplitudes(recording))
-            simulated_s += float(recording.time_s[-1] - recording.time_s[0])
+        runs = [(hertz, settings.kp_nm_s_rad, settings.ki_nm_rad, f"{hertz:g} Hz") for hertz in tones]
+        found, simulated_s = swept_amplitudes(self.bench, settings, runs, progress)
         columns = (
             "frequency_hz", "input_rad_s", "output_rad_s", "difference_rad_s", "output_sd_rad_s",
             "linear_loop_output_rad_s", "published_output_rad_s", "published_difference_rad_s", "share_at_limit",
@@ -140,7 +129,9 @@ def closest_loop(settings: ToneSweepSettings) -> tuple[float, float, float, floa
     return float(kp[best]), float(ki[best]), float(low[best]), float(high[best])
 
 
-def _tone_texts(settings: ToneSweepSettings, tones: list[float], found: list[Amplitudes]) -> tuple[Statement, ...]:
+def _tone_texts(
+    settings: ToneSweepSettings, tones: list[float], found: Sequence[Amplitudes]
+) -> tuple[Statement, ...]:
     output = np.array([one.output_rad_s for one in found])
     difference = np.array([one.difference_rad_s for one in found])
     ratio = output / np.array([one.input_rad_s for one in found])
@@ -170,7 +161,9 @@ def _tone_texts(settings: ToneSweepSettings, tones: list[float], found: list[Amp
     )
 
 
-def _draw_tones(figure: Figure, settings: ToneSweepSettings, tones: list[float], found: list[Amplitudes]) -> None:
+def _draw_tones(
+    figure: Figure, settings: ToneSweepSettings, tones: list[float], found: Sequence[Amplitudes]
+) -> None:
     left, right = figure.subplots(1, 2)
     grid = np.geomspace(min(tones), max(tones), 300)
     loop = settings.amplitude_rad_s * gain(settings.rig, grid, settings.kp_nm_s_rad, settings.ki_nm_rad, reported=True)
@@ -216,10 +209,7 @@ class LoopScatter:
     bench: FieldBench
     name: str = "figure19"
     title: str = "Field rig: torque over acceleration under different P and I"
-
-    @property
-    def settings_model(self) -> type[ScatterSettings]:
-        return ScatterSettings
+    settings_model: type[ScatterSettings] = ScatterSettings
 
     def run(self, settings: ScatterSettings, progress: Progress) -> StudyOutcome:
         """Every loop once, the first one ``repeats`` times."""
@@ -227,12 +217,7 @@ class LoopScatter:
         wanted += [(settings.loops[0], settings.seed + more) for more in range(1, settings.repeats)]
         records = []
         for index, (loop, seed) in enumerate(wanted):
-            wish = FieldRun(
-                settings.rig, settings.frequency_hz, loop.kp_nm_s_rad, loop.ki_nm_rad, seed,
-                amplitude_rad_s=settings.amplitude_rad_s, offset_rad_s=settings.offset_rad_s,
-                periods=periods_for(settings.frequency_hz, settings.measured_s), rate_hz=settings.rate_hz,
-                torque_limit_nm=settings.torque_limit_nm,
-            )
+            wish = sine_run(settings, settings.frequency_hz, loop.kp_nm_s_rad, loop.ki_nm_rad, seed)
             report = part_of(progress, index, len(wanted), f"P {loop.kp_nm_s_rad:g}, I {loop.ki_nm_rad:g}")
             recording = self.bench.run(wish, report)
             span_s = float(recording.time_s[-1] - recording.time_s[0])

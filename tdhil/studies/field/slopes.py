@@ -377,10 +377,7 @@ class FieldSlopes:
     bench: FieldBench
     name: str = "figure22"
     title: str = "Field rig: torque over acceleration at four tones, and one inertia behind them"
-
-    @property
-    def settings_model(self) -> type[SlopeSettings]:
-        return SlopeSettings
+    settings_model: type[SlopeSettings] = SlopeSettings
 
     def run(self, settings: SlopeSettings, progress: Progress) -> StudyOutcome:
         """One run a tone, each with a seed of its own; then all records together."""

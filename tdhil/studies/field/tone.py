@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,9 @@ import numpy as np
 from tdhil.estimation import STEP_S, LineFit, Samples, excited_window, paper_estimate, stretches, usable_samples
 from tdhil.estimation.frequency_domain import period_lines
 from tdhil.recording import FloatArray, Recording
+from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
+from tdhil.studies.field.settings import AmplitudeSettings, ScatterSettings
+from tdhil.studies.study import Progress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,6 +80,30 @@ class Scatter:
 def periods_for(frequency_hz: float, measured_s: float) -> int:
     """Whole periods to ask for: settling, and at least three that count."""
     return max(1, math.ceil(SETTLE_S * frequency_hz - 1e-9)) + max(3, round(measured_s * frequency_hz))
+
+
+def sine_run(
+    settings: AmplitudeSettings | ScatterSettings, hertz: float, kp: float, ki: float, seed: int
+) -> FieldRun:
+    """A sine of the study's amplitude about its mean speed, for its measuring time."""
+    return FieldRun(
+        settings.rig, hertz, kp, ki, seed, amplitude_rad_s=settings.amplitude_rad_s,
+        offset_rad_s=settings.offset_rad_s, periods=periods_for(hertz, settings.measured_s), rate_hz=settings.rate_hz,
+        torque_limit_nm=settings.torque_limit_nm,
+    )
+
+
+def swept_amplitudes(
+    bench: FieldBench, settings: AmplitudeSettings, runs: Sequence[tuple[float, float, float, str]], progress: Progress
+) -> tuple[tuple[Amplitudes, ...], float]:
+    """One run for each (tone, P, I, what it is called), each with a seed of its own; and their simulated seconds."""
+    found, simulated_s = [], 0.0
+    for index, (hertz, kp, ki, text) in enumerate(runs):
+        wish = sine_run(settings, hertz, kp, ki, settings.seed + index)
+        recording = bench.run(wish, part_of(progress, index, len(runs), text))
+        found.append(amplitudes(recording))
+        simulated_s += float(recording.time_s[-1] - recording.time_s[0])
+    return tuple(found), simulated_s
 
 
 def excited(recording: Recording) -> Samples:

@@ -164,11 +164,7 @@ class OverDesign:
     def __init__(self, name: str, title: str, model: type[DesignSettings]) -> None:
         self.name = name
         self.title = title
-        self._model = model
-
-    @property
-    def settings_model(self) -> type[DesignSettings]:
-        return self._model
+        self.settings_model = model
 
     def carried_out(self, settings: DesignSettings, progress: Progress) -> DesignResult:
         """Every run, with a word on how far they are."""

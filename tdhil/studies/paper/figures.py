@@ -135,10 +135,7 @@ class SignalStudy:
 
     name = "figure11"
     title = "Figure 11: step and sine through the same loop"
-
-    @property
-    def settings_model(self) -> type[SignalSettings]:
-        return SignalSettings
+    settings_model: type[SignalSettings] = SignalSettings
 
     def run(self, settings: SignalSettings, progress: Progress) -> StudyOutcome:
         runs = [changed(settings, signal="sine"), changed(settings, signal="step")]

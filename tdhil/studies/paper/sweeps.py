@@ -180,12 +180,8 @@ class SweepStudy:
     def __init__(self, name: str, title: str, model: type[SweepSettings], claims: Claims) -> None:
         self.name = name
         self.title = title
-        self._model = model
+        self.settings_model = model
         self._claims = claims
-
-    @property
-    def settings_model(self) -> type[SweepSettings]:
-        return self._model
 
     def run(self, settings: SweepSettings, progress: Progress) -> StudyOutcome:
         runs = settings.runs()
