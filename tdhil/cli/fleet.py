@@ -206,15 +206,18 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
     if as_json:
         print_json(summary.document())
         return
+    from tdhil.fleet import counted
     from tdhil.report import PlainConsole
 
     console = PlainConsole()
     found = summary.document()
     left = f", {summary.left} left to do" if summary.left else ""
     before = f" ({summary.done_before} of them done before)" if summary.done_before else ""
-    console.print(f"{found['logs']} logs{before}{left} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
+    logs = counted(found["logs"], "log")
+    console.print(f"{logs}{before}{left} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
     console.print(_counts(found))
     _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
+    _list(console, "from a part of the run", [f"{one['log']}: {one['text']}" for one in found["in_part"]])
     _list(console, "other than the result in the log", [
         f"{one['log']}: {_was(one['stored_verdict'], one['stored_inertia_kg_m2'])} → "
         f"{_was(one['verdict'], one['inertia_kg_m2'])}" for one in found["changed"]])
@@ -222,7 +225,7 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
     if summary.live:
         console.print(f"left alone: {summary.live} being written")
     if summary.bare_traces:
-        console.print(f"left out: {summary.bare_traces} CSV files without a .yaml beside them")
+        console.print(f"left out: {counted(summary.bare_traces, 'CSV file')} without a .yaml of the same name")
 
 
 def _counts(found: dict[str, Any]) -> Table:
@@ -256,7 +259,8 @@ def _result_text(row: FleetRow) -> str:
     if row.inertia_kg_m2 is None:
         return f"{row.verdict}: {row.reason}"
     low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
-    return f"{row.verdict}, J {row.inertia_kg_m2:.5g} ({low:.5g} to {high:.5g}) kg·m²"
+    part = "" if row.part_text is None else f", {row.part_text}"
+    return f"{row.verdict}, J {row.inertia_kg_m2:.5g} ({low:.5g} to {high:.5g}) kg·m²{part}"
 
 
 if TYPE_CHECKING:

@@ -89,10 +89,13 @@ def run_compare(namespace: argparse.Namespace) -> int:
 
 
 def _print_trend(document: Mapping[str, Any]) -> None:
+    from tdhil.fleet import counted
     from tdhil.report import PlainConsole
 
     console = PlainConsole()
-    console.print(f"rig {document['rig']}: {document['results']} results that stand, of {document['logs']} logs")
+    stand = "stands" if document["results"] == 1 else "stand"
+    console.print(f"rig {document['rig']}: {counted(document['results'], 'result')} that {stand}, of "
+                  f"{counted(document['logs'], 'log')}", soft_wrap=True)
     for one in document["quantities"]:
         console.print(f"{one['name']}: {one['text']}", soft_wrap=True)
     for note in document["notes"]:
@@ -108,8 +111,8 @@ def _print_compared(document: Mapping[str, Any]) -> None:
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     table.add_column("setting")
-    for log in document["logs"]:
-        table.add_column(Path(log).name, overflow="fold")
+    for heading in _headings(document["logs"]):
+        table.add_column(heading, overflow="fold")
     for one in document["settings"]:
         table.add_row("≠" if one["differs"] else "", one["name"], *one["values"])
     table.add_section()
@@ -120,10 +123,16 @@ def _print_compared(document: Mapping[str, Any]) -> None:
     console.print(table)
     for one in document["differences"]:
         console.print(f"{one['from']} and {one['to']}: {one['text']}", soft_wrap=True)
-        rest = [f"{other['name']} {'differs' if other['differs'] else 'no difference seen'}"
+        rest = [f"{other['name']}: {'differs' if other['differs'] else 'no difference seen'}"
                 for other in one["quantities"] if other["column"] != "inertia_kg_m2"]
         if rest:
             console.print("  " + ", ".join(rest), soft_wrap=True)
+
+
+def _headings(logs: Sequence[str]) -> Sequence[str]:
+    """Their files' names; where two have one name, the paths as they were given."""
+    names = [Path(log).name for log in logs]
+    return names if len(set(names)) == len(names) else logs
 
 
 def _inertia_text(row: Mapping[str, Any]) -> str:
@@ -200,13 +209,14 @@ def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
 
 def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
     axis: Any = figure.subplots()
-    for number, (log, lines) in enumerate(zip(document["logs"], document["apparent_inertia"], strict=True)):
+    headings = _headings(document["logs"])
+    for number, (heading, lines) in enumerate(zip(headings, document["apparent_inertia"], strict=True)):
         known = [line for line in lines if None not in (line["value"], line["low"], line["high"])]
         axis.errorbar(
             [line["hertz"] for line in known], [line["value"] for line in known],
             yerr=[[max(0.0, line["value"] - line["low"]) for line in known],
                   [max(0.0, line["high"] - line["value"]) for line in known]],
-            fmt="o", ms=3, lw=1, color=_COLOURS[number % len(_COLOURS)], label=Path(log).name)
+            fmt="o", ms=3, lw=1, color=_COLOURS[number % len(_COLOURS)], label=heading)
     axis.set_xlabel("Hz")
     axis.set_ylabel("apparent inertia, kg·m²")
     axis.grid(alpha=0.3)
@@ -214,7 +224,7 @@ def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
 
 
 def _settings_html(document: Mapping[str, Any]) -> str:
-    head = "".join(f"<th>{html.escape(Path(log).name)}</th>" for log in document["logs"])
+    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in _headings(document["logs"]))
     rows = "".join(
         f"<tr><td>{'≠' if one['differs'] else ''}</td><td>{html.escape(one['name'])}</td>"
         + "".join(f"<td>{html.escape(value)}</td>" for value in one["values"]) + "</tr>"

@@ -73,6 +73,11 @@ class FleetSummary:
             "failed": dict(sorted(Counter(row.error_kind for row in self.rows if row.failed).items(), key=str)),
             "failures": [{"log": row.log, "kind": row.error_kind, "text": row.error_text}
                          for row in self.rows if row.failed],
+            "in_part": [
+                {"log": row.log, "aborted_stage": row.aborted_stage, "aborted_by": row.aborted_by,
+                 "complete": row.complete, "text": row.part_text}
+                for row in self.rows if row.part_text is not None
+            ],
             "changed": [
                 {"log": row.log, "verdict": row.verdict, "stored_verdict": row.stored_verdict,
                  "inertia_kg_m2": row.inertia_kg_m2, "stored_inertia_kg_m2": row.stored_inertia_kg_m2}

@@ -9,9 +9,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
+from tdhil.recording import ABORTED
 from tdhil.version import __version__
 
-ROW_FORMAT: Final = 1
+ROW_FORMAT: Final = 2
 """Grows when rows of before can't stand beside new ones."""
 
 UNREAD: Final = "unread"
@@ -37,8 +38,10 @@ class FleetRow:
 
     Of the inertia ``low`` to ``high`` is the repeatability on this drive, ``low_total`` to ``high_total`` has the
     torque scale in it, which is right to ``torque_scale_rel_sd`` (1 sd, a share). ``stored_…`` is the result that the
-    run left in its log, ``changed`` whether this one differs from it. None: not known, or there is none. No field
-    depends on which machine or process did it, nor on when.
+    run left in its log, ``changed`` whether this one differs from it. A run that was aborted has its result from what
+    came before: ``aborted_stage`` is the stage that gave up, ``aborted_by`` the kind of error that ended it;
+    ``complete`` is False where the log ended before the run did. None: not known, or there is none. No field depends
+    on which machine or process did it, nor on when.
     """
 
     log: str
@@ -92,6 +95,8 @@ class FleetRow:
     samples: int | None = None
     periods_used: int | None = None
     complete: bool | None = None
+    aborted_stage: str | None = None
+    aborted_by: str | None = None
     simulated: bool | None = None
     drive_name: str | None = None
     drive_vendor: int | None = None
@@ -116,12 +121,25 @@ class FleetRow:
         """Is it the row of a log that gave nothing?"""
         return self.error_kind is not None
 
+    @property
+    def part_text(self) -> str | None:
+        """Which part of a run its result is from, in words; None where that is all of it."""
+        if self.aborted_stage is not None or self.aborted_by is not None:
+            stage = f" in stage {self.aborted_stage}" if self.aborted_stage is not None else ""
+            return f"aborted{stage}" + (f" ({self.aborted_by})" if self.aborted_by is not None else "")
+        return "log cut short" if self.complete is False and not self.failed else None
+
 
 COLUMNS: Final[Mapping[str, type]] = {
     one.name: next(kind for kind in (bool, int, float, str) if str(one.type).startswith(kind.__name__))
     for one in fields(FleetRow)
 }
 """Each column's type; all but the log, the verdict and the settings may be empty."""
+
+
+def counted(count: int, noun: str) -> str:
+    """Write "1 log", "2 logs"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def row_key(sha256: str, settings: Settings) -> str:
@@ -177,6 +195,8 @@ def row_of(
         "warnings": "\n".join(document.get("warnings") or ()) or None,
         "periods_used": document.get("periods_used"),
         "complete": document.get("complete"),
+        "aborted_stage": next((one["name"] for one in document.get("stages") or () if one["outcome"] == ABORTED), None),
+        "aborted_by": (document.get("ended") or {}).get("kind"),
         "simulated": document.get("simulated"),
         "drive_name": drive.get("name"),
         **{f"drive_{name}": drive.get(name) for name in ("vendor", "product", "revision", "serial")},

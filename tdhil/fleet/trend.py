@@ -10,10 +10,11 @@ from typing import Any, Final
 
 from tdhil.errors import UsageError
 from tdhil.fleet.changes import LEAST, Difference, History, Measured, difference, history
-from tdhil.fleet.rows import FleetRow, Settings, row_of
+from tdhil.fleet.rows import FleetRow, Settings, counted, row_of
 from tdhil.fleet.task import content_hash, read_any
 
 _GOOD: Final = ("valid", "valid_wide")
+_SHOWN: Final = 5       # logs by name in a note
 
 
 @dataclass(frozen=True)
@@ -66,16 +67,22 @@ def trend_document(rows: Sequence[FleetRow], rig: str) -> dict[str, Any]:
         known = sorted({row.rig for row in rows if row.rig is not None})
         shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
         raise UsageError(f"no log is of a rig {rig!r}", where="--rig",
-                         next_step=f"There are: {shown}" if known else "No log in the table names its rig")
+                         next_step=f"There are: {shown}" if known else "No log in the table names its rig: `name:` in "
+                         "rig.yaml does, or `rig:` in the .yaml beside a trace")
     standing = [row for row in mine if row.verdict in _GOOD]
     dated = sorted(((_time_s(row), row) for row in standing if _time_s(row) is not None),
                    key=lambda one: (one[0], one[1].log))
     kept = [(float(time_s or 0.0), row) for time_s, row in dated]
     notes = []
     if len(mine) > len(standing):
-        notes.append(f"{len(mine) - len(standing)} of {len(mine)} logs have no result that stands: left out")
+        without = len(mine) - len(standing)
+        notes.append(f"{without} of {counted(len(mine), 'log')} without a result that stands: left out")
     if len(standing) > len(kept):
-        notes.append(f"{len(standing) - len(kept)} logs don't say when they were recorded: left out")
+        notes.append(f"{counted(len(standing) - len(kept), 'log')} without a date: left out")
+    if in_part := [row for _, row in kept if row.part_text is not None]:
+        shown = ", ".join(f"{row.log}: {row.part_text}" for row in in_part[:_SHOWN])
+        more = f", and {len(in_part) - _SHOWN} more" if len(in_part) > _SHOWN else ""
+        notes.append(f"{len(in_part)} of {counted(len(kept), 'result')} from a part of the run only ({shown}{more})")
     if len({row.simulated for _, row in kept}) > 1:
         notes.append("simulated runs and real ones are mixed")
     drives = {drive_of(row) for _, row in kept}
@@ -93,12 +100,13 @@ def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dic
     points = [(row, one) for time_s, row in rows if (one := measured(row, quantity, time_s)) is not None]
     document: dict[str, Any] = {
         "name": quantity.name, "column": quantity.column, "unit": quantity.unit,
-        "points": [{"log": row.log, "date": row.date, "value": one.value, "low": one.low, "high": one.high}
+        "points": [{"log": row.log, "date": row.date, "value": one.value, "low": one.low, "high": one.high,
+                    "in_part": row.part_text}
                    for row, one in points],
         "probability": None, "changes": [], "drift": None,
     }
     if len(points) < LEAST:
-        return document | {"text": f"{len(points)} results: {LEAST} are needed for a trend"}
+        return document | {"text": f"{counted(len(points), 'result')}: {LEAST} are needed for a trend"}
     found = history([one for _, one in points])
     document["probability"] = {"none": found.none, "step": found.step, "drift": found.drift}
     document["changes"] = [
@@ -203,7 +211,7 @@ def _settings(
         "tolerance": asked.get("tolerance", 0.05),
         "recorded by": row.recorded_by,
         "simulated": row.simulated,
-        "complete": row.complete,
+        "run": row.part_text or "whole",
     }
     return {name: "–" if value in (None, "") else f"{value:.6g}" if isinstance(value, float) else str(value)
             for name, value in found.items()}
@@ -261,4 +269,5 @@ def _compare_text(first: FleetRow, other: FleetRow, quantities: Sequence[Mapping
     if told.shared_scale and not (first.drive_serial and other.drive_serial):
         scale = "no serial numbers: taken for one drive, whose torque scale cancels"
     says = "differ" if told.differs else "can't be told apart"
-    return f"the inertias {says}: {_change_text(told, 'kg·m²')} at {told.confidence:.0%}; {scale}"
+    parts = "".join(f"; {row.log}: {row.part_text}" for row in (first, other) if row.part_text is not None)
+    return f"the inertias {says}: {_change_text(told, 'kg·m²')} at {told.confidence:.0%}; {scale}{parts}"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from tdhil.config import Rig, RunOptions
-from tdhil.errors import LogError
+from tdhil.errors import LogError, TdhilError
 from tdhil.recording import RunLog, RunWriter
 from tdhil.run import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
 from tdhil.session.connection import Connection, PeerPlan
@@ -111,8 +111,7 @@ class RunSession:
         writer.path = place.path
         if place.live:
             attendant.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")
-        elif place.older is not None:
-            attendant.say(f"an older {place.wanted} was kept as {place.older}")
+        self._older_told = False
         self._outcome: RunOutcome | None = None
         said = {"operator": request.operator, "note": request.note}
         self.log = RunLog(writer, configuration(request) | said)
@@ -132,6 +131,15 @@ class RunSession:
 
         ``stop``: asked from elsewhere; signals go there too, where this is the main thread.
         """
+        try:
+            return self._move(stop)
+        except TdhilError as error:
+            if self._outcome is None:       # a log without a cause would be said to hold too few samples
+                with suppress(LogError):
+                    self.log.failure(0.0, error)
+            raise
+
+    def _move(self, stop: StopRequest | None) -> RunOutcome:
         request, log, attendant = self._request, self.log, self._attendant
         options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
         trace = None if options.trace is None else Path(options.trace)
@@ -181,19 +189,31 @@ class RunSession:
         try:
             self.log.close()
         finally:
-            self._place.settle(stub=self._stub)
+            self._settle()
 
     def abandon(self) -> None:
         """Finish the log where something else is the cause already. Raises nothing of the log."""
         with suppress(LogError):
             self.log.close()
+        self._settle()
+
+    def _settle(self) -> None:
         self._place.settle(stub=self._stub)
+        self._tell_older()
+
+    def _tell_older(self) -> None:
+        """Where an older log is now, once: not before that is certain, since a refused run gives its name back."""
+        older = self._place.older
+        if not self._older_told and older is not None and older.exists():
+            self._older_told = True
+            self._attendant.say(f"an older {self._place.wanted} was kept as {older}")
 
     def _confirm(self, task: Task, preflight: Preflight, idle: Idle) -> None:
         request = self._request
         taken = accepted_lines(request.connection.profile, request.options.accept_unverified)
         self._attendant.confirm(task, preflight, idle, taken)
         self._place.motion = True
+        self._tell_older()
 
     def _task(self, identity: Identity) -> Task:
         request, log = self._request, self.log

@@ -34,8 +34,11 @@ def rig_plants(count: int) -> list[CoveragePlant]:
     return plants
 
 
-def write_log(path: Path, recording: Recording, rig: str, number: int, result: dict[str, object] | None = None) -> None:
-    """The recording as a finished log of rig ``rig``, a run each week."""
+def write_log(
+    path: Path, recording: Recording, rig: str, number: int, result: dict[str, object] | None = None,
+    aborted_by: str | None = None,
+) -> None:
+    """The recording as a finished log of rig ``rig``, a run each week; ``aborted_by``: the kind of error that did."""
     epoch_ns = int((BEGAN + timedelta(weeks=number)).timestamp() * 1e9)
     run = {
         "tdhil": "0.1.0", "drive": "canopen", "embedded_simulator": True, "bench": {"name": rig, "load": "none"},
@@ -43,6 +46,8 @@ def write_log(path: Path, recording: Recording, rig: str, number: int, result: d
         "profile": {"name": "generic/cia402", "title": "CiA 402"},
         "started": (BEGAN + timedelta(weeks=number)).isoformat(), "identify": {"tolerance": 0.05, "confidence": 0.95},
     }
+    if aborted_by is not None:
+        run["ended"] = {"kind": aborted_by, "what": "it ended", "exit_code": 6, "time_s": float(recording.time_s[-1])}
     whole = asdict(recording)
     rows = np.zeros(len(recording.time_s), _SAMPLE_ROW)
     for name, tag in _TAGS:
@@ -65,7 +70,9 @@ def write_log(path: Path, recording: Recording, rig: str, number: int, result: d
             if n % each == each - 1:
                 container.close_chunk()
         colds = [excitation_message(recording.excitation, recording.levels, recording.ramps),
-                 stage_message(Stage("acquire", began, last, "ok"))]
+                 stage_message(
+                 Stage("acquire", began, last, "ok") if aborted_by is None      # a moment later, with all that counts
+                 else Stage("acquire", began, last + 1.0, "aborted"))]
         if result is not None:
             colds.append(result_message(result))
         for message in colds:

@@ -14,10 +14,22 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.fleet import FleetRequest, LogTask, Settings, find_logs, identify_log, read_table, run_fleet
+from tdhil.fleet import (
+    FleetRequest,
+    LogTask,
+    Settings,
+    compare_document,
+    find_logs,
+    identified,
+    identify_log,
+    read_table,
+    run_fleet,
+    trend_document,
+)
 from tdhil.fleet import cluster as cluster_module
 from tdhil.process_pool import TaskLimits
 from tests.fleet import poison
+from tests.fleet.simulated_logs import write_log
 
 pytestmark = pytest.mark.one_worker("fleet")
 
@@ -60,6 +72,42 @@ def test_one_log_is_what_replay_gives(few):
     assert (row.rig, row.drive_serial, row.profile, row.torque_scale_rel_sd) == ("R1", 1, "generic/cia402", 0.03)
     assert row.date == "2026-01-12T08:00:00+00:00"
     assert row.speed_lag_low_s < 0.4 < row.speed_lag_high_s
+
+
+def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
+    """By the row, the summary, trend, compare and watch; a whole run's row says nothing of the kind."""
+    import tdhil
+
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    recording = tdhil.read(few / "R1-001.mcap").recording
+    for number in range(5):
+        write_log(logs / f"{number}.mcap", recording, "R1", number, aborted_by="DriveFault" if number == 3 else None)
+    whole = (logs / "4.mcap").read_bytes()
+    (logs / "4.mcap").write_bytes(whole[:len(whole) * 9 // 10])
+    out = tmp_path / "fleet.sqlite"
+    assert main(["fleet", str(logs), "--out", str(out), "--jobs", "1"]) == 0
+    text = capsys.readouterr().out
+    assert "from a part of the run:" in text
+    assert "3.mcap: aborted in stage acquire (DriveFault)" in text
+    assert "4.mcap: log cut short" in text
+    rows = read_table(out)
+    assert [(row.aborted_stage, row.aborted_by, row.complete) for row in rows] == [
+        *[(None, None, True)] * 3, ("acquire", "DriveFault", True), (None, None, False)]
+    assert [row.verdict in ("valid", "valid_wide") for row in rows] == [True] * 5
+    found = trend_document(rows, "R1")
+    (note,) = (note for note in found["notes"] if "part" in note)
+    assert note.startswith("2 of 5 results from a part of the run only")
+    assert "3.mcap: aborted in stage acquire (DriveFault)" in note
+    assert [point["in_part"] for point in found["quantities"][0]["points"]] == [
+        None, None, None, "aborted in stage acquire (DriveFault)", "log cut short"]
+    compared = compare_document([identified(logs / f"{number}.mcap", Settings()) for number in (2, 3)])
+    assert next(one for one in compared["settings"] if one["name"] == "run") == {
+        "name": "run", "values": ["whole", "aborted in stage acquire (DriveFault)"], "differs": True}
+    assert compared["differences"][0]["text"].endswith("3.mcap: aborted in stage acquire (DriveFault)")
+    assert main(["watch", str(logs), "--once", "--out", str(out), "--jobs", "1"]) == 0
+    assert [line.rpartition(" kg·m²")[2] for line in capsys.readouterr().out.splitlines()] == [
+        "", "", "", ", aborted in stage acquire (DriveFault)", ", log cut short"]
 
 
 @pytest.mark.heavy
@@ -359,7 +407,7 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     text = capsys.readouterr().out
     assert "7 logs (7 of them done before)" in text
     assert "empty.mcap: the file is empty" in text
-    assert "left out: 1 CSV files" in text
+    assert "left out: 1 CSV file without" in text
     for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):
         assert main(["fleet", str(few), "--out", str(out), *wrong]) == 2
     assert main(["fleet", str(few), "--out", str(tmp_path / "fleet.txt")]) == 2

@@ -107,8 +107,12 @@ def test_a_bus_that_can_not_be_opened_is_no_reason_to_lose_the_last_log_s_name(t
     good = log_with(tmp_path / "run.mcap", "setup", "speed")
     before = good.read_bytes()
     done = tdhil("identify", "--log", good, "-i", "socketcan", "-c", "no_such_can")
-    assert done.code != 0
+    assert done.code == 4
     assert good.read_bytes() == before
+    assert "was kept as" not in done.err      # it has its name again
+    replayed = tdhil("replay", tmp_path / "run.refused.mcap")
+    assert replayed.code == 4
+    assert "nothing to identify from: no_such_can" in replayed.err
 
 
 # -- files that are somebody else's ---------------------------------------------------------------------------
