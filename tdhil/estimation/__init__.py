@@ -10,7 +10,7 @@ from tdhil.estimation.result import (
 )
 from tdhil.estimation.rough_estimates import (
     RoughFriction as RoughFriction, RoughInertia as RoughInertia, rough_friction as rough_friction,
-    rough_inertia as rough_inertia,
+    rough_inertia as rough_inertia, rough_inertia_before_echo as rough_inertia_before_echo,
 )
 from tdhil.estimation.samples import (
     STICK_SLIP_REGULAR as STICK_SLIP_REGULAR, STICK_SLIP_SHARE as STICK_SLIP_SHARE, Samples as Samples,

@@ -11,6 +11,7 @@ what is left is the level's own scatter, which carries the friction through the 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,42 @@ def rough_inertia(
     friction_error = 2.0 * own.level_sd_nm * duration / abs(impulse)
     relative = float(np.hypot(_LEAST_REL, friction_error) + scatter / abs(change))
     return RoughInertia(inertia, min(relative, _MOST_REL), own)
+
+
+_BEFORE_S = 1.0         # of a ramp: what flowed and turned
+_BEFORE_ECHO_ERROR = 0.3    # reports that lag by some 0.4 s, and what a ramp leaves to come
+
+
+def rough_inertia_before_echo(
+    ramps: Sequence[tuple[FloatArray, FloatArray, FloatArray, float]], echo_s: float, impedance_nm_s_rad: float,
+    friction: RoughFriction,
+) -> RoughInertia | None:
+    """Of a motor above a drill string that is never at rest: from the time of each ramp before its echo comes back.
+
+    ``ramps``: time, speed, torque, (N,) each, and when the ramp began. Until ``echo_s`` (2L/v) later the string is the
+    resistance ζ, ``impedance_nm_s_rad``, and J Δω = ∫ (T − T_0 − ζ (ω − ω_0)) dt. What the bit does adds noise, of
+    which the ramps' scatter tells. None without a ramp that tells anything.
+    """
+    found = []
+    for time, speed, torque, start_s in ramps:
+        before = (time >= start_s - _BEFORE_S) & (time < start_s)
+        first, last = np.searchsorted(time, (start_s, start_s + echo_s))
+        if np.count_nonzero(before) < 4 or last - first < 8:
+            continue
+        speed_0, torque_0 = float(np.mean(speed[before])), float(np.mean(torque[before]))
+        change = float(speed[last - 1]) - speed_0
+        surplus = torque[first:last] - torque_0 - impedance_nm_s_rad * (speed[first:last] - speed_0)
+        impulse = float(np.sum(0.5 * (surplus[1:] + surplus[:-1]) * np.diff(time[first:last])))
+        if change != 0.0:
+            found.append((abs(change), impulse / change))
+    if len(found) < 2:
+        return None
+    weights, values = np.array(found).T
+    inertia = float(np.average(values, weights=weights))
+    if not (np.isfinite(inertia) and inertia > 0.0):
+        return None
+    scatter = 2.0 * float(np.std(values, ddof=1)) / math.sqrt(len(values)) / inertia
+    return RoughInertia(inertia, min(math.hypot(_BEFORE_ECHO_ERROR, scatter), _MOST_REL), friction)
 
 
 def _sd_of_mean(time: FloatArray, torque: FloatArray) -> float:

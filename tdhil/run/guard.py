@@ -71,6 +71,12 @@ FOLLOW_MEAN_S, FOLLOW_BLOCK_S = 0.5, 0.1
 AT_LIMIT_SHARE = 0.9
 """Of the torque limit, from which on the torque counts as being at it."""
 
+LIGHTEN = (
+    "Lift the bit off bottom, take weight off it, or turn faster (limits.speed_min_rad_s); a wider speed window leaves"
+    " it more room"
+)
+"""What helps a shaft that a drill string under load disturbs."""
+
 PACE_S, LATE_SHARE = 2.0, 0.2
 """A loop that was late in this share of its cycles over this time can't hold its rate (row 8)."""
 
@@ -115,6 +121,9 @@ class Guard:
         """Why no torque below zero may be commanded in torque mode; empty: it may. Set by whoever runs the stages."""
         self.to_brake = ""
         """What would change that."""
+        self.disturbed = ""
+        """What a drill string under load does to the shaft, in words, where it gets no calmer; empty: nothing. Limits
+        stay as they are: it is for the message of whoever meets one."""
         self.torque_offset_nm = 0.0
         """The largest torque offset that may be commanded, either way; 0: none. Set by the stage that uses one."""
         self.reckoning = False
@@ -265,15 +274,17 @@ class Guard:
         leads = f"{speed_rad_s:.3f} rad/s reported and {command.torque_nm:.1f} N·m lead to {predicted:.3f} rad/s"
         if predicted > limits.speed_max_rad_s:
             raise LimitHit(
-                f"the speed is about to leave its window: {leads}, beyond {limits.speed_max_rad_s:g} rad/s",
+                self._besides(
+                    f"the speed is about to leave its window: {leads}, beyond {limits.speed_max_rad_s:g} rad/s"
+                ),
                 where=where,
-                next_step="The shaft was stopped. Lower the amplitude or the offset",
+                next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or the offset')}",
             )
         if predicted < lowest:
             raise LimitHit(
-                f"the shaft is about to turn backwards: {leads}",
+                self._besides(f"the shaft is about to turn backwards: {leads}"),
                 where=where,
-                next_step="The shaft was stopped. Lower the amplitude or raise the offset",
+                next_step=f"The shaft was stopped. {self._helps('Lower the amplitude or raise the offset')}",
             )
         self._check_lower_end(speed_rad_s, where)
 
@@ -281,10 +292,19 @@ class Guard:
         limits = self._limits
         if speed_rad_s < limits.speed_min_rad_s - self._speed_noise_rad_s:
             raise LimitHit(
-                f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s",
+                self._besides(
+                    f"the speed has left its window: {speed_rad_s:.3f} rad/s is below {limits.speed_min_rad_s:g} rad/s"
+                ),
                 where=where,
-                next_step="The shaft was stopped. Lower the amplitude or raise the offset; did the load grow?",
+                next_step="The shaft was stopped. "
+                + self._helps("Lower the amplitude or raise the offset; did the load grow?"),
             )
+
+    def _besides(self, what: str) -> str:
+        return f"{what}; {self.disturbed}" if self.disturbed else what
+
+    def _helps(self, usual: str) -> str:
+        return LIGHTEN if self.disturbed else usual
 
     def _check_age(self, sample: Sample, where: str) -> None:
         if sample.fresh:
@@ -336,8 +356,11 @@ class Guard:
                 next_step="The shaft was stopped. Did a second master, a tool or a parameter of the drive change it?",
             )
 
-    def torque_told(self, torque_nm: float, limit_active: bool) -> tuple[str, str]:
-        """How a torque stands to its limit, and what would help a shaft that does not get its speed with it."""
+    def torque_told(self, torque_nm: float, limit_active: bool, disturbed: bool = False) -> tuple[str, str]:
+        """How a torque stands to its limit, and what would help a shaft that does not get its speed with it.
+
+        ``disturbed``: a drill string under load keeps it from that.
+        """
         limit_nm = self._limits.torque_nm
         if limit_active or abs(torque_nm) >= AT_LIMIT_SHARE * limit_nm:
             by = "the drive's internal limit acts" if limit_active else f"at its limit of {limit_nm:g} N·m"
@@ -346,6 +369,8 @@ class Guard:
                 "Does a brake or the load hold the shaft? Else it needs a higher torque limit (limits.torque_nm in"
                 " rig.yaml, and the drive's own)",
             )
+        if disturbed or self.disturbed:
+            return f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m", LIGHTEN
         return (
             f"torque {torque_nm:.1f} N·m, not at its limit of {limit_nm:g} N·m",
             "Does the drive take its speed from elsewhere (panel, another master), hold a speed limit or a ramp of its"

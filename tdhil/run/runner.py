@@ -167,7 +167,7 @@ class Runner:
             resolution = preflight.speed_resolution_rad_s
             slow: tuple[Sample, ...] = ()
             if mode is Mode.TORQUE:
-                slow = slow_down(loop, limits, speed.model, assumptions, speed.high.speed_rad_s, resolution)
+                slow = slow_down(loop, limits, speed, assumptions, resolution)
         ramps: tuple[Ramp, ...] = (speed.ramp,)
         drifted: TorqueResult | None = None
         if mode is Mode.TORQUE:
@@ -196,7 +196,7 @@ class Runner:
                 control = MeanSpeedControl(model, 0.25 * limits.torque_nm, assumptions)
                 run_hold(
                     loop, limits, model, control, plan.start_rad_s, drifted.speed_rad_s,
-                    preflight.speed_resolution_rad_s,
+                    preflight.speed_resolution_rad_s, speed.wander_rad_s,
                 )
         else:
             self._book.skip("hold", f"{why}: the drive's own speed control holds the mean speed")

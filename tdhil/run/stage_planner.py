@@ -14,11 +14,14 @@ from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
 from tdhil.run.excitation import Plan, PlanRefused, RigGuess, SwingPlan
-from tdhil.run.guard import Guard
+from tdhil.run.guard import LIGHTEN, Guard
 from tdhil.run.planning import Planned, as_followed, plan_acquisition
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.stages import Course, SpeedResult
 from tdhil.run.task import Display, Say, Task
+
+MOST_WANDER = 0.8
+"""Of the speed window, that may be kept free of the excitation because a string under load takes the shaft there."""
 
 RESERVE_S = 30.0
 """Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
@@ -41,8 +44,18 @@ class StagePlanner:
         """
         loop = self._loop
         request, limits, model = task.request, task.limits, speed.model
+        # Where its torque is held, a string under load takes the shaft from its mean: that stays free at either end.
+        free = speed.wander_rad_s if mode is Mode.TORQUE else 0.0
+        width = limits.speed_max_rad_s - limits.speed_min_rad_s
+        if 2.0 * free >= MOST_WANDER * width:
+            raise LimitHit(
+                f"the speed window of {width:.3g} rad/s leaves no room for an excitation: {loop.guard.disturbed}",
+                where="plan of stage 5",
+                next_step=f"The shaft was stopped. {LIGHTEN}",
+            )
         room = excitation.MotionLimits(
-            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
+            limits.speed_min_rad_s + free, limits.speed_max_rad_s - free, limits.torque_nm,
+            Guard.foresight_s(task.assumptions),
         )
         course = speed.course if mode is Mode.SPEED else None
         last = loop.last

@@ -99,9 +99,9 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
     noise = plant.bit_noise_nm * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)
     speeds, acted = turned(plant, drive, noise)
     for lag_s in plant.speed_lags_s:
-        speeds = _late(speeds, lag_s)
+        speeds = late(speeds, lag_s)
     for lag_s in plant.torque_lags_s:
-        acted = _late(acted, lag_s)
+        acted = late(acted, lag_s)
     segment = Segment(0.0, (settle + periods) * period_s, period_s, settle, plant.mean_rad_s, tuple(lines_hz), (), ())
     every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
     return [
@@ -116,7 +116,7 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
     ]
 
 
-def _late(signal, lag_s):
+def late(signal, lag_s):
     """A first-order lag, of what is between samples a straight line."""
     keep = np.exp(-STEP_S / lag_s)
     ramp = 1.0 - (1.0 - keep) * lag_s / STEP_S

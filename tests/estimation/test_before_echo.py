@@ -130,3 +130,12 @@ def test_a_swing_that_goes_on_is_no_scatter(swing):
     assert found == pytest.approx(2.0, rel=0.15)
     assert np.mean([line.s_tt for line in plain]) > 2.0 * (1.0 + 0.5 * swing**2) * 0.5
     assert unleaked(plain[::2], fits) == plain[::2]
+
+
+def test_lines_that_the_string_drowns_name_it(record):
+    """A multisine's few lines, above a bit that scatters by far more than they move the shaft."""
+    lines = LINES_HZ[1:8:2]
+    weak = records(replace(PLANT, bit_noise_nm=2000.0), [1], lines, 5.0 * np.ones(len(lines)), PERIOD_S, 8)[0]
+    found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
+    assert found.verdict is Verdict.NOT_IDENTIFIABLE
+    assert "the string below by ±" in found.reason and "--excitation prbs" in found.advice

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, lsim
 
-from tdhil.estimation import rough_friction, rough_inertia
+from tdhil.estimation import RoughFriction, rough_friction, rough_inertia, rough_inertia_before_echo
 from tdhil.recording.recording import Level
+from tests.estimation.loaded_bench import STEP_S, Loaded, late, turned
 
 
 def ramp(inertia=104.0, viscous=8.0, coulomb=60.0, speed_lag=0.4, torque_lag=0.15, seed=0, down=False, hold=5.0):
@@ -66,3 +67,25 @@ def test_levels_about_which_the_shaft_swings_are_known_by_their_means():
     assert rough_inertia(time, speed + swing, torque, *levels) is None
     found = rough_inertia(time, speed + swing, torque, *levels, swinging=True)
     assert found.inertia_kg_m2 == pytest.approx(104.0, rel=0.2)
+
+
+@pytest.mark.parametrize("bottom", [60.0, 374.0])
+def test_above_a_restless_string_the_time_before_the_echo_tells(bottom):
+    """Six ramps above a bit that scatters by 500 N·m: the motor's own inertia, whatever hangs below."""
+    plant, runs = Loaded(bit_noise_nm=500.0, bottom=bottom, hold=400.0, speed_lags_s=(0.02,)), 8
+    echo_s = 2.0 * plant.pipe().delay_s
+    time, starts = STEP_S * np.arange(2400), 6.0 + np.cumsum([0.0, 8.3, 6.2, 9.1, 7.7, 6.6])
+    drive = sum(8000.0 * (-1.0) ** n * ((time >= at) & (time < at + 0.75 * echo_s)) for n, at in enumerate(starts))
+    white, keep = np.random.default_rng(3).standard_normal((len(time), runs)), np.exp(-STEP_S / 0.3)
+    noise = 500.0 * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)
+    speeds, torques = (late(one, lag) for one, lag in zip(turned(plant, drive, noise), (0.40, 0.15), strict=True))
+
+    def found(run, ramps):
+        seen = [(time, speeds[:, run], torques[:, run], at) for at in ramps]
+        return rough_inertia_before_echo(seen, echo_s, 296.5, RoughFriction(20.0, 2500.0, 50.0))
+
+    told = [found(run, starts) for run in range(runs)]
+    assert all(abs(one.inertia_kg_m2 / plant.motor - 1.0) < max(0.35, one.rel_error) for one in told)
+    assert np.mean([one.inertia_kg_m2 for one in told]) == pytest.approx(plant.motor, rel=0.2)
+    assert all(0.3 <= one.rel_error < 0.8 for one in told)
+    assert found(0, starts[:1]) is None

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from tdhil.run.excitation import RigGuess
 from tdhil.run.guard import Guard
 from tdhil.run.settings import ControlAssumptions
-from tdhil.run.stages.brake_test import Before, NoPulse, Pulse, plan_pulse
+from tdhil.run.stages.brake_test import Before, NoPulse, Pulse, plan_pulse, slow_speed
+from tdhil.run.stages.speed import mean_speeds
 from tests.run.fake_drive import LIMITS
 
 USUAL = RigGuess(104.0, 8.0, 60.0)
@@ -104,3 +105,20 @@ def test_with_a_string_the_torque_goes_down_and_up_on_ramps():
     down = [pulse.flowing_nm, *pulse.setpoints_nm()]
     steps = [abs(after - before) for before, after in pairwise(down)]
     assert max(steps) <= 1.1 * 400.0 * 0.02
+
+
+@given(wander=st.floats(0.0, 4.0), speed=st.floats(1.0, 8.0))
+def test_a_pulse_leaves_a_restless_string_its_room(wander, speed):
+    """What the string may take the shaft by besides, and the pulse, end above the window's lower end together."""
+    limits = replace(LIMITS, load="string", torque_ramp_nm_s=20.0)
+    before = Before(speed, 83.0, 0.02, 0.0, wander)
+    pulse = plan_pulse(limits, USUAL, ControlAssumptions(), before, 0.02)
+    if isinstance(pulse, Pulse):
+        assert speed - pulse.slowing_rad_s - wander >= limits.speed_min_rad_s
+
+
+def test_it_is_tried_faster_where_a_string_is_restless():
+    low, high = mean_speeds(LIMITS)
+    assert slow_speed(LIMITS) == low
+    assert slow_speed(LIMITS, 0.5) == low + 0.5
+    assert slow_speed(LIMITS, 100.0) == 0.5 * (LIMITS.speed_min_rad_s + LIMITS.speed_max_rad_s) <= high

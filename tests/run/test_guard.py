@@ -369,3 +369,29 @@ def test_feedback_that_stands_still_while_the_torque_offset_moves_is_none():
         for cycle in range(200):
             command = OFFSET._replace(torque_offset_nm=0.1 * cycle)
             watch.check_sample(command, sample(5.0, 50.0, time_s=cycle * PERIOD_S))
+
+
+@given(speed=st.floats(-1.0, 12.0), torque=st.floats(-500.0, 500.0), commanded=st.floats(-400.0, 400.0))
+def test_a_string_under_load_moves_no_limit(speed, torque, commanded):
+    """What is known of its swing is for the message alone."""
+    said = []
+    for disturbed in ("", "the string below swings by ±1200 N·m every 5.3 s"):
+        held = guard()
+        held.model, held.disturbed = MODEL, disturbed
+        try:
+            held.check_sample(Command(Mode.TORQUE, 5.0, commanded), sample(speed, torque))
+            said.append(None)
+        except TdhilError as error:
+            said.append((type(error), error.what.removesuffix(f"; {disturbed}")))
+    assert said[0] == said[1]
+
+
+@pytest.mark.parametrize(("speed", "commanded"), ((0.4, 60.0), (9.9, 400.0)))
+def test_it_is_named_where_its_swing_takes_the_shaft_out_of_the_window(speed, commanded):
+    held = guard()
+    held.model, held.disturbed = MODEL, "the string below swings by ±1200 N·m every 5.3 s"
+    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s") as hit:
+        held.check_sample(Command(Mode.TORQUE, 5.0, commanded), sample(speed))
+    assert "off bottom" in hit.value.next_step
+    assert "off bottom" in held.torque_told(100.0, False)[1]
+    assert "off bottom" not in held.torque_told(400.0, False)[1]

@@ -10,11 +10,15 @@ import pytest
 
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import LimitHit, PreflightRefused
+from tdhil.recording import LagPrior
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
+from tdhil.run.stage_planner import StagePlanner
 from tdhil.run.stages.brake_test import Answer, Before, Listener, NoPulse, Pulse, plan_pulse
+from tdhil.run.stages.speed import SpeedResult
 from tdhil.run.stages.steady import Swing, calm_string, swing_of
 from tdhil.run.string_release import SwingDamper
+from tdhil.run.task import Task
 from tests.run.fake_drive import PERIOD_S, FakeDrive, World
 
 LIMITS = MachineLimits(
@@ -203,3 +207,14 @@ def test_yielding_stays_within_its_bounds_and_forward():
     assert min(speeds) >= 0.0
     assert max(speeds) <= 1.4 + 1e-9
     assert damper.step(math.nan) == 0.4
+
+
+def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
+    here = World(FakeDrive(), LIMITS)
+    here.guard.disturbed = Swing(1200.0, 3.0, 5.3, 0.9).told
+    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.0, 5.3, 0.9))
+    planner = StagePlanner(here.bench, here.log, here.display, print)
+    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top by ±3\.00 rad/s") as hit:
+        planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
+    assert "off bottom" in hit.value.next_step
+    assert "speed loop" not in str(hit.value)

@@ -21,8 +21,8 @@ from drivers import Command, Mode, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
-from tdhil.run.stages.speed import mean_speeds
-from tdhil.run.stages.steady import CALM_S, calm_string, swing_of, trace, wait_until_steady
+from tdhil.run.stages.speed import SpeedResult, mean_speeds
+from tdhil.run.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The braking probe's pulse: how strong, how long, and what it would do on a drive that takes it the wrong way. Pure.
@@ -114,13 +114,15 @@ class NoPulse:
 class Before:
     """The steady rotation that it starts from: what flows (less its offset), and what counts as noise of a report.
 
-    ``swing_nm``: what a drill string on it may push with meanwhile, either way.
+    ``swing_nm``: what a drill string on it may push with meanwhile, either way; ``wander_rad_s``: how far it takes the
+    shaft from its mean.
     """
 
     speed_rad_s: float
     flowing_nm: float
     speed_noise_rad_s: float
     swing_nm: float = 0.0
+    wander_rad_s: float = 0.0
 
 
 def plan_pulse(
@@ -130,7 +132,8 @@ def plan_pulse(
     lightest = assumptions.smallest_inertia_share * model.inertia_kg_m2
     reaction_s = assumptions.reaction_s
     room_up = UP_SHARE * (limits.speed_max_rad_s - before.speed_rad_s)
-    room_down = DOWN_SHARE * (before.speed_rad_s - max(0.0, limits.speed_min_rad_s))
+    down = before.speed_rad_s - max(0.0, limits.speed_min_rad_s)
+    room_down = min(DOWN_SHARE * down, down - before.wander_rad_s)
     ahead_s = reaction_s + assumptions.largest_speed_lag_s
     slowest = before.speed_rad_s - room_down - before.speed_noise_rad_s
     turning_back_nm = slowest * lightest / ahead_s - model.steady_torque_nm(before.speed_rad_s)
@@ -284,21 +287,28 @@ TORQUE_SHARE = 0.25
 """Of the torque limit, that slowing down may take."""
 
 
-def slow_speed(limits: MachineLimits) -> float:
-    """The speed of the probe, rad/s: the lower one of stage 2 if the shaft turns forward there."""
-    low_rad_s, _ = mean_speeds(limits)
-    return low_rad_s if low_rad_s > 0.0 else 0.25 * limits.speed_max_rad_s
+def slow_speed(limits: MachineLimits, wander_rad_s: float = 0.0) -> float:
+    """The speed of the probe, rad/s: the lower one of stage 2 if the shaft turns forward there.
+
+    Above a string that takes the shaft ``wander_rad_s`` from its mean so much faster, up to the middle of the window.
+    """
+    low_rad_s, high_rad_s = mean_speeds(limits)
+    if low_rad_s <= 0.0:
+        return 0.25 * limits.speed_max_rad_s
+    middle_rad_s = 0.5 * (limits.speed_min_rad_s + limits.speed_max_rad_s)
+    return min(low_rad_s + wander_rad_s, middle_rad_s, high_rad_s)
 
 
 def slow_down(
-    loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, from_rad_s: float,
+    loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, assumptions: ControlAssumptions,
     speed_resolution_rad_s: float,
 ) -> tuple[Sample, ...]:
     """Down to the probe's speed in speed mode; the samples of steady rotation there. LimitHit if it gets none.
 
-    Of a drill string so many that its swing shows in them.
+    Of a drill string so many that its swing shows in them, and averages out where it gets no calmer.
     """
-    target = slow_speed(limits)
+    model, from_rad_s = speed.model, speed.high.speed_rad_s
+    target = slow_speed(limits, speed.wander_rad_s)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
     rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2)
     steps = loop.cycles(abs(target - from_rad_s) / rate)
@@ -308,7 +318,7 @@ def slow_down(
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
     if limits.load == "string":
         calmed = calm_string(loop, limits, target, tolerance)
-        return tuple(calmed.samples[-loop.cycles(CALM_S) :])
+        return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if calmed.swing.restless(limits) else CALM_S) :])
     loop.hold(command, assumptions.largest_speed_lag_s)
     settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
     return tuple(settled[-loop.cycles(STEADY_S) :])
@@ -317,7 +327,7 @@ def slow_down(
 def probe_braking(
     loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions,
     steady: Sequence[Sample],
-    flowing_nm: float, speed_resolution_rad_s: float, where: str,
+    flowing_nm: float, speed_resolution_rad_s: float, where: str, wander_rad_s: float = 0.0,
 ) -> list[Sample]:
     """Try it, in torque mode, at ``flowing_nm`` and the speed of ``steady``; its samples, none if no pulse is safe.
 
@@ -331,7 +341,7 @@ def probe_braking(
     steady = steady[-loop.cycles(STEADY_S) :]
     for _ in range(TRIES):
         noise = speed_noise_rad_s(steady, speed_resolution_rad_s)
-        before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise, swing_nm)
+        before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise, swing_nm, wander_rad_s)
         pulse = plan_pulse(limits, model, assumptions, before, loop.period_s)
         if isinstance(pulse, NoPulse):
             loop.guard.no_braking, loop.guard.to_brake = pulse.why, pulse.next_step

@@ -7,6 +7,7 @@ from collections import deque
 from drivers import Command, LimitHit, Mode
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
+from tdhil.run.guard import LIGHTEN
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -61,12 +62,15 @@ def run_hold(
     target_rad_s: float,
     start_rad_s: float,
     speed_resolution_rad_s: float,
+    wander_rad_s: float = 0.0,
 ) -> None:
     """Bring the mean speed into a window of 2 % and keep it there for 3 s, in torque mode.
 
+    ``wander_rad_s``: how far a drill string under load takes it from there anyhow, which is as near as it gets.
+
     The wanted speed is ramped from where the shaft is, at a rate that takes a quarter of the torque limit.
     """
-    tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s)
+    tolerance_rad_s = max(3.0 * speed_resolution_rad_s, WINDOW_SHARE * target_rad_s, wander_rad_s)
     recent: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
     rate = min(0.25 * limits.torque_nm / model.inertia_kg_m2, (limits.speed_max_rad_s - limits.speed_min_rad_s) / 5.0)
     inside_since_s: float | None = None
@@ -89,7 +93,10 @@ def run_hold(
         elif sample.time_s - inside_since_s >= SETTLED_S:
             return
     raise LimitHit(
-        f"no steady speed near {target_rad_s:.3f} rad/s within {timeout_s:.0f} s (last {mean:.3f} rad/s)",
+        f"no steady speed near {target_rad_s:.3f} rad/s within {timeout_s:.0f} s (last {mean:.3f} rad/s)"
+        + (f"; {loop.guard.disturbed}" if loop.guard.disturbed else ""),
         where="stage hold",
-        next_step="Does the load change by itself, or does a brake drag? Look at speed and torque in the log",
+        next_step=LIGHTEN
+        if loop.guard.disturbed
+        else "Does the load change by itself, or does a brake drag? Look at speed and torque in the log",
     )

@@ -12,21 +12,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers import Command, DriveFault, Mode, Sample
-from tdhil.estimation import RoughInertia, Samples, rough_inertia
+from tdhil.estimation import (
+    RoughFriction,
+    RoughInertia,
+    Samples,
+    rough_friction,
+    rough_inertia,
+    rough_inertia_before_echo,
+)
 from tdhil.recording import FloatArray, Level, Ramp
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.speed_check import Onlooker, SpeedUnitCheck
 from tdhil.run.stages.steady import (
-    CALM_SHARE,
     SteadyLevel,
+    Swing,
     calm_string,
     hold_damped,
     steady_level,
     trace,
     wait_until_steady,
 )
+from tdhil.run.string_release import SwingDamper
 
 LEVEL_S = 6.0
 RESTLESS_LEVEL_S = 24.0
@@ -41,6 +49,17 @@ GOOD_ENOUGH = 0.2
 STRING_ERROR = 0.75
 """Relative uncertainty of the rough inertia of a drill string's shaft: what the motor feels at a frequency is anything
 from its own inertia to all of the string's. A plan has to leave room for it, and a harder ramp tells no more."""
+
+ECHO_SHARE, BEFORE_RAMPS_S = 0.75, (6.0, 7.3, 5.2, 8.1, 6.7, 5.6)
+"""Of a string that gets no calmer: ramps between the speeds, each over this share of the time before its echo, so long
+after the one before, which differs so that what they leave swinging adds up to nothing."""
+
+RESTLESS_ERROR = 0.5
+"""As `STRING_ERROR`, of a shaft whose own inertia is known by what it did before an echo: where the string swings
+along, the motor still moves further than by its inertia alone."""
+
+WANDER = 1.5
+"""Under torque alone a restless shaft goes so many times as far as it does under a speed control that yields."""
 
 TRIES = 4
 NOBODY = Onlooker()
@@ -73,6 +92,12 @@ class SpeedResult:
     last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
     steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
     course: Course | None = None       # how the drive followed the ramp
+    swing: Swing | None = None         # of a drill string that gets no calmer
+
+    @property
+    def wander_rad_s(self) -> float:
+        """How far a restless string takes the shaft from its mean speed, either way, where its torque is held."""
+        return 0.0 if self.swing is None else WANDER * self.swing.speed_rad_s
 
     @property
     def levels(self) -> tuple[Level, ...]:
@@ -119,6 +144,13 @@ def run_speed(
         )
         if rough is not None and rough.rel_error <= good_enough:
             break
+        if high_held.swing is not None and limits.echo_s > 0.0:
+            friction = rough_friction(
+                moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
+            )
+            rough = _before_echo(loop, limits, (low_rad_s, high_rad_s), friction)
+            good_enough = RESTLESS_ERROR
+            break
         rate *= 4.0
         loop.log.event(loop.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
         _ramp(loop, high_rad_s, low_rad_s, rate)
@@ -130,6 +162,8 @@ def run_speed(
             where="stage speed",
             next_step=_TOO_RESTLESS if limits.load == "string" else _WRONG_TORQUE,
         )
+    if high_held.swing is not None:
+        loop.guard.disturbed = high_held.swing.told
     model = RigGuess(
         rough.inertia_kg_m2,
         max(0.0, rough.friction.viscous_nm_s_rad),
@@ -146,7 +180,32 @@ def run_speed(
         tuple(high_samples[-loop.cycles(0.5) :]),
         tuple(_samples(part, torque_offset_nm) for part in (low_samples, high_samples)),
         _course(low_samples, ramped, high_held, mean_speeds(limits)),
+        high_held.swing,
     )
+
+
+def _before_echo(
+    loop: ControlLoop, limits: MachineLimits, speeds_rad_s: tuple[float, float], friction: RoughFriction | None
+) -> RoughInertia | None:
+    """Of a restless string whose pipe is known: from quick ramps between the levels, begun and ended at the upper."""
+    if friction is None:
+        return None
+    rate = abs(speeds_rad_s[1] - speeds_rad_s[0]) / (ECHO_SHARE * limits.echo_s)
+    loop.log.event(loop.now_s, "plan", f"rough inertia from ramps at {rate:.3g} rad/s², before their echo")
+    seen, to = [], speeds_rad_s[1]
+    for number, between_s in enumerate(BEFORE_RAMPS_S):
+        before, asked = hold_damped(loop, _damper(loop, limits, to), between_s)
+        to = speeds_rad_s[number % 2]
+        ramped = _ramp(loop, asked[-1], to, rate)
+        after = loop.hold(Command(Mode.SPEED, to, 0.0), limits.echo_s)
+        one = trace([*before, *ramped, *after])
+        seen.append((one.time_s, one.speed_rad_s, one.torque_nm, before[-1].time_s))
+    hold_damped(loop, _damper(loop, limits, to), BEFORE_RAMPS_S[0])
+    return rough_inertia_before_echo(seen, limits.echo_s, limits.wave_impedance_nm_s_rad, friction)
+
+
+def _damper(loop: ControlLoop, limits: MachineLimits, speed_rad_s: float) -> SwingDamper:
+    return SwingDamper(limits.torque_nm, limits.speed_max_rad_s, speed_rad_s, loop.period_s)
 
 
 @dataclass(frozen=True)
@@ -156,6 +215,7 @@ class _Held:
     settling: list[Sample]
     level: list[Sample]
     setpoints_rad_s: list[float]
+    swing: Swing | None = None
 
 
 def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tuple[float, float]) -> Course:
@@ -200,9 +260,10 @@ def _settle_and_hold(
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
-        restless = calmed.swing.torque_nm > CALM_SHARE * limits.torque_nm
+        restless = calmed.swing.restless(limits)
         level, asked = hold_damped(loop, calmed.damper, RESTLESS_LEVEL_S if restless else LEVEL_S)
-        return _Held([*calmed.samples, *later], level, [*calmed.setpoints_rad_s, *asked_later, *asked])
+        setpoints = [*calmed.setpoints_rad_s, *asked_later, *asked]
+        return _Held([*calmed.samples, *later], level, setpoints, calmed.swing if restless else None)
     command = Command(Mode.SPEED, speed_rad_s, 0.0)
     settling = wait_until_steady(loop, command, speed_rad_s, tolerance_rad_s, timeout_s=60.0)
     settling += loop.hold(command, lags_s)

@@ -52,13 +52,14 @@ def run_torque(
     """
     before = trace(slow)
     flowing_nm = _within(float(before.torque_nm.mean()) - torque_offset_nm, limits.torque_nm)
-    keep_rad_s = slow_speed(limits)
+    keep_rad_s = slow_speed(limits, speed.wander_rad_s)
     # Seeded for a few cycles before the switch, so that the target is there when the mode is.
     samples = [*slow, *loop.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * loop.period_s)]
     samples.append(loop.switch_mode(Command(Mode.TORQUE, keep_rad_s, flowing_nm)))
     loop.log.event(loop.now_s, "mode", f"torque mode confirmed, seeded with {flowing_nm:.1f} N·m")
     samples += probe_braking(
-        loop, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where
+        loop, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where,
+        speed.wander_rad_s,
     )
     target_nm = _within(speed.model.steady_torque_nm(speed.high.speed_rad_s), limits.torque_nm)
     steps = max(1, loop.cycles(abs(target_nm - flowing_nm) / (SLOPE_SHARE_PER_S * limits.torque_nm)))
