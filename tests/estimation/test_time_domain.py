@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tdhil.estimation import Options, Verdict, identify
-from tdhil.estimation.samples import usable_samples
+from tdhil.estimation.samples import Samples, usable_samples
 from tdhil.estimation.time_domain.equation import PARAMETERS, evaluate
 from tdhil.estimation.time_domain.taylor import flat_top
-from tdhil.estimation.time_domain.windows import joined, measure, runs, thinned, windows
+from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
 from tdhil.recording.recording import LagPrior
 from tdhil.studies.coverage import plants
 from tdhil.studies.coverage.simulate import simulate as simulate_plan
@@ -51,6 +51,25 @@ def test_without_noise_the_truth_solves_every_bin():
     wrong = truth.copy()
     wrong[0] *= 1.02
     assert np.sum(np.abs(evaluate(wrong, bins).error[low]) ** 2) > 20.0 * np.sum(error**2)
+
+
+@pytest.mark.parametrize(("rate_hz", "length_s"), [(20.0, 2.0), (10.0, 5.0), (20.0, 12.0), (400.0, 2.0)])
+def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, length_s):
+    """Ten samples to a taper: sums over them had been off by several percent of the torque, and J followed."""
+    rng = np.random.default_rng(3)
+    count = int(rate_hz * length_s)
+    time = (np.arange(count) + rng.uniform(-0.05, 0.05, count)) / rate_hz
+    omega, size, phase = 2.0 * np.pi * np.array([0.17, 0.4, 0.9]), np.array([2.0, 1.0, 0.6]), rng.uniform(0.0, 6.0, 3)
+    turned = np.outer(time, omega) + phase
+    speed, rise = 12.0 + np.sin(turned) @ size, np.cos(turned) @ (omega * size)
+    stretch = OneWayStretch(Samples(time, speed, 104.0 * rise + 8.0 * speed + 60.0), 1.0)
+    bins = joined([measure(window) for window in windows((stretch,))])
+    assert np.max(bins.hertz) < 0.21 * rate_hz
+    truth = np.zeros(PARAMETERS)
+    truth[:2], truth[7] = (104.0, 8.0), 60.0
+    low = bins.hertz < 1.5
+    error = np.abs(evaluate(truth, bins).error[low])
+    assert np.max(error) < 2e-3 * np.max(np.abs(bins.torque[low, 0]))
 
 
 def test_windage_follows_the_shaft_s_own_speed_not_the_reported_one():
