@@ -91,15 +91,25 @@ def run(namespace: argparse.Namespace) -> int:
 
 def run_accounts(namespace: argparse.Namespace) -> int:
     """Add, list, remove, or set a password; a service that runs sees it within a second."""
-    from tdhil.service import AccountsFile
+    from tdhil.errors import UsageError
+    from tdhil.service import AccountsFile, require_folder
 
-    namespace.data.mkdir(parents=True, exist_ok=True, mode=0o750)
+    if namespace.action == "add":
+        try:
+            namespace.data.mkdir(parents=True, exist_ok=True, mode=0o750)
+        except OSError as error:
+            raise UsageError(f"can't be made ({error.strerror or error})", where=f"--data {namespace.data}",
+                             next_step="Name a folder that can be") from error
+    require_folder(namespace.data)
     accounts = AccountsFile(namespace.data.resolve())
     users = namespace.kind == "users"
     first = not accounts.read()
     if namespace.action == "list":
         for one in (accounts.known.users if users else accounts.known.tokens).values():
             print(f"{one.name:<33}{one.role:<10}{one.since}")  # noqa: T201
+        if first:
+            print(f"Nobody: {namespace.data} has no accounts, and is served to this computer alone.",  # noqa: T201
+                  file=sys.stderr)
         return 0
     if namespace.action == "add" and users:
         accounts.add_user(namespace.name, namespace.role, _password())

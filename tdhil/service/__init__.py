@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from tdhil.service.client import Client as Client, ServiceError as ServiceError
     from tdhil.service.console import attend as attend
     from tdhil.service.serving import (
-        HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, serve as serve,
+        HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, require_folder as require_folder,
+        serve as serve,
     )
     from tdhil.service.states import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
 else:

@@ -141,7 +141,7 @@ class AccountsFile:
                 stamp = (looked.st_mtime_ns, looked.st_size, looked.st_ino)
                 if stamp != self._stamp:
                     self._known, self._stamp = _accounts_of(self.path.read_bytes()), stamp
-            except FileNotFoundError:
+            except (FileNotFoundError, NotADirectoryError):
                 if self._stamp is not None:        # it was there: whoever took it away didn't remove the users
                     raise UsageError("the accounts have gone", where=str(self.path),
                                      next_step="Bring them back") from None

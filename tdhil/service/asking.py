@@ -115,7 +115,7 @@ class RigFile:
     def way(self, asked: Mapping[str, Any] | None = None) -> tuple[RunOptions, Connection]:
         """Its options and the way to its drive. Raises UsageError and DataFileError."""
         if self.rig is None:
-            raise UsageError(self.problem, where=self.path.name, next_step="Mend the rig's file")
+            raise UsageError(self.problem, next_step="Mend the rig's file")
         cli = {name: value for name, value in (asked or {}).items() if name in RUN_OPTIONS}
         options, connection = connection_of(cli, self.rig, resolve(cli, self.rig))
         return options, connection
@@ -149,6 +149,12 @@ class Rigs:
     @property
     def built_in(self) -> bool:
         return self.folder is None or not any(self.folder.glob("*.yaml"))
+
+    @property
+    def left_out(self) -> list[str]:
+        """Files that were meant as a rig's, and whose names are none."""
+        found = () if self.folder is None else self.folder.glob("*.y*ml")
+        return sorted(one.name for one in found if one.suffix != ".yaml" or not RIG_ID.fullmatch(one.stem))
 
     def all(self) -> list[RigFile]:
         """By their ids."""
@@ -206,7 +212,7 @@ def edited(old: str, text: str, name: str) -> tuple[str, ...]:
 def require_motion(rig: RigFile) -> None:
     """May anybody ask for motion of this rig over HTTP? Raises UsageError and NotAllowed."""
     if rig.rig is None:
-        raise UsageError(rig.problem, where=rig.path.name, next_step="Mend the rig's file")
+        raise UsageError(rig.problem, next_step="Mend the rig's file")
     if rig.simulated or rig.motion != "never":
         return
     where = rig.rig.source("service.motion") or rig.path.name

@@ -113,8 +113,8 @@ def serve(
     ``mqtt``: the address of a broker that is told states and results.
     ``names``: more names of this host; ``logs``: folders whose logs a fleet may go through, beside the service's runs.
 
-    Raises UsageError for what can't be served, accounts that can't be read among it, and LogError for a folder that
-    can't be written.
+    Raises UsageError for what can't be served, accounts that can't be read among it, and LogUnopened for a folder that
+    can't be made.
     """
     require_service()
     from tdhil.service.accounts import AccountsFile
@@ -124,6 +124,10 @@ def serve(
     if tls is not None:
         tls.context()
     allowed = _names(host, names)
+    for one in viewers:
+        if not re.fullmatch(r"[a-z][a-z0-9+.-]*://[^/?#\s]*", one):
+            raise UsageError("must be where pages come from: scheme, host and port", where=f"--viewer {one[:100]}",
+                             next_step="Such as http://localhost:8080, or file://")
     if rigs is not None and not rigs.is_dir():
         raise UsageError("there is no such folder", where=f"--rigs {rigs}", next_step="It has a file for each rig")
     for folder in logs:
@@ -153,6 +157,9 @@ def serve(
         say(f"It answers to {', '.join(sorted(allowed))}; name others with --allowed-host.")
     if supervisor.rigs.built_in:
         say("No rig file is there: two simulated rigs to play with. Nothing real moves.")
+    if left_out := supervisor.rigs.left_out:
+        say(f"Left out, as no rig's file is called so: {', '.join(left_out)}."
+            " It is NAME.yaml, of letters, digits, _, . and -")
     say("A stop over HTTP is no emergency stop: keep the hard-wired one within reach. Ctrl-C brakes what moves.")
     if publisher is not None:
         publisher.start()
@@ -170,16 +177,23 @@ def serve(
     return int(ExitCode.OK)
 
 
+def require_folder(data: Path) -> None:
+    """Who asks of a folder that isn't there has misspelt it. Raises UsageError."""
+    if not data.is_dir():
+        raise UsageError("there is no such folder", where=f"--data {data}", next_step="Name the service's own")
+
+
 def check_idle(data: Path, say: Say) -> int:
     """May the program be replaced now? Exit code 4, and who is in the way, where a run of this folder lives, where a
     shaft was not seen at rest and nobody has signed it off, or whatever tdhil of this computer holds a drive. Asks
-    files and locks; neither the web nor a drive.
+    files and locks; neither the web nor a drive. Raises UsageError where the folder isn't there.
     """
     from tdhil.service.states import State
     from tdhil.service.store import Store
     from tdhil.service.wire import lives
     from tdhil.session import holders
 
+    require_folder(data)
     store = Store(data.resolve())
     busy = []
     for run in store.ids():
@@ -263,7 +277,11 @@ def _alone(folder: Path) -> Any:
     """One service a folder: held as long as it runs. Raises UsageError."""
     import fcntl
 
-    file = (folder / "service.lock").open("a")
+    try:
+        file = (folder / "service.lock").open("a")
+    except OSError as error:
+        raise UsageError(f"can't be written ({error.strerror or error})", where=f"--data {folder}",
+                         next_step="Name a folder that can be") from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

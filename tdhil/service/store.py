@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from tdhil.errors import LogError
+from tdhil.errors import LogUnopened
 from tdhil.service.states import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
@@ -137,13 +137,13 @@ class Store:
         self._lock = threading.Lock()
 
     def prepare(self) -> None:
-        """Make the folders. Raises LogError where they can't be written."""
+        """Make the folders. Raises LogUnopened where they can't be written."""
         try:
             for path in (self.runs, self.folder / "audit"):
                 path.mkdir(parents=True, exist_ok=True, mode=0o750)
         except OSError as error:
-            raise LogError(f"can't be made ({error.strerror or error})", where=str(self.folder),
-                           next_step="Name a folder for the runs with --data") from error
+            raise LogUnopened(f"can't be made ({error.strerror or error})", where=str(self.folder),
+                              next_step="Name a folder for the runs with --data") from error
 
     def new_id(self) -> str:
         """An id, and its folder."""

@@ -247,6 +247,32 @@ def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsy
     assert main(["serve", "--port", "99999", "--data", str(tmp_path)]) == ExitCode.USAGE
 
 
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--data", "file"], "file: can't be made"), (["--data", "/proc/nothing"], "/proc/nothing: can't be made"),
+    (["--data", "taken"], "taken: can't be written"), (["--data", "d", "--viewer", "foo"], "--viewer foo"),
+    (["--data", "d", "--viewer", "http://a/b"], "--viewer http://a/b"),
+    (["--check-idle", "--data", "d"], "--data d: there is no such folder"),
+    (["users", "list", "--data", "d"], "--data d: there is no such folder"),
+    (["users", "add", "anna", "--role", "admin", "--data", "file/d"], "--data file/d: can't be made"),
+])
+def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tdhil.service.serving._uvicorn", lambda *_: pytest.fail("it served"))
+    (tmp_path / "file").touch()
+    (tmp_path / "taken" / "service.lock").mkdir(parents=True)
+    assert main(["serve", "--port", "0", *arguments]) == ExitCode.USAGE
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):
+    for name in ("a.yaml", "rig 7.yaml", "b.yml", "notes.txt"):
+        (tmp_path / name).write_text("run: {simulate: true}\n")
+    monkeypatch.setattr("tdhil.service.serving._uvicorn", lambda *_: None)
+    assert main(["serve", "--port", "0", "--rigs", str(tmp_path), "--data", str(tmp_path / "data")]) == ExitCode.OK
+    assert "Left out, as no rig's file is called so: b.yml, rig 7.yaml." in capsys.readouterr().err
+
+
 def test_a_client_says_what_the_service_says():
     with pytest.raises(CommunicationLost, match="Is tdhil serve running"):
         tdhil.Client("http://127.0.0.1:1").rigs()
