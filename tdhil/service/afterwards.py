@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from starlette.responses import FileResponse, Response
 
-from tdhil.config import MODELS
+from tdhil.config import resolve
 from tdhil.errors import UsageError
 from tdhil.service.access import principal
-from tdhil.service.answers import FaultView, FleetBody, PictureView
+from tdhil.service.answers import FaultView, FleetBody, PictureView, ReplayBody
+from tdhil.service.asking import options_of
 from tdhil.service.edge import Answer, Site, off
 from tdhil.service.fleets import TABLE, FleetView
 from tdhil.service.states import NotAllowed, NotThere
@@ -85,16 +86,16 @@ async def _fleet(site: Site, request: Request, body: None) -> FleetView:
     return await off(lambda: site.fleets.get(request.path_params["fleet"]))
 
 
+def settings_of(body: ReplayBody | FleetBody) -> dict[str, Any]:
+    """What a log is to be identified with, as a run is asked for it. Raises UsageError for what no run would take."""
+    given = {"model": body.model, "tolerance": body.tolerance, "confidence": body.confidence}
+    found = options_of(given)
+    resolve(found, None)
+    return found
+
+
 async def _ask_fleet(site: Site, request: Request, body: FleetBody) -> FleetView:
-    if body.model is not None and body.model not in MODELS:
-        raise UsageError(f"there is no model {body.model[:40]!r}", where="model",
-                         next_step=f"There are {', '.join(MODELS)}")
-    if body.confidence is not None and not 0.5 <= body.confidence < 1.0:
-        raise UsageError("must be at least 0.5 and below 1", where="confidence")
-    if body.tolerance is not None and not body.tolerance > 0.0:
-        raise UsageError("must be a positive share", where="tolerance")
-    asked = {"model": body.model, "confidence": body.confidence, "tolerance": body.tolerance}
-    settings = {name: value for name, value in asked.items() if value is not None}
+    settings = settings_of(body)
     who = principal(request).name
     found = await off(lambda: site.fleets.ask(body.folder, body.below, settings, who))
     site.supervisor.note(who, "fleet asked", None, "", folder=body.folder, below=body.below, fleet=found.id, **settings)

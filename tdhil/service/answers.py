@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 
 from tdhil.service.accounts import Role
 from tdhil.service.fleets import FleetView
@@ -232,8 +232,14 @@ class ErrorView:
 # -- what is sent ---------------------------------------------------------------------------------------------------
 
 
+class Body:
+    """What is sent has no more in it than what is known here: a key that is misspelt is refused, not passed over."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+
 @dataclass(frozen=True)
-class ConfirmBody:
+class ConfirmBody(Body):
     """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it.
 
     ``lease``: where the rig is watched, a random key of 16 to 200 characters, which only its sender knows and renews.
@@ -245,7 +251,7 @@ class ConfirmBody:
 
 
 @dataclass(frozen=True)
-class LeaseBody:
+class LeaseBody(Body):
     """The page with this key is seen; or how it goes. ``new_key``: from now on that one, and the old one is void."""
 
     key: str
@@ -254,23 +260,23 @@ class LeaseBody:
 
 
 @dataclass(frozen=True)
-class SignOffBody:
+class SignOffBody(Body):
     """Who saw the shaft at rest says so."""
 
     note: str
 
 
 @dataclass(frozen=True)
-class ReplayBody:
-    """None: as the run had it."""
+class ReplayBody(Body):
+    """None: as the run had it. A share is a number, or a text such as ``1%``."""
 
     model: str | None = None
-    tolerance: float | None = None
-    confidence: float | None = None
+    tolerance: float | str | None = None
+    confidence: float | str | None = None
 
 
 @dataclass(frozen=True)
-class RigFileBody:
+class RigFileBody(Body):
     """The whole file; ``sha256``: of the one that it is to replace."""
 
     text: str
@@ -278,7 +284,7 @@ class RigFileBody:
 
 
 @dataclass(frozen=True)
-class LoginBody:
+class LoginBody(Body):
     """A person's."""
 
     name: str
@@ -286,7 +292,7 @@ class LoginBody:
 
 
 @dataclass(frozen=True)
-class PasswordBody:
+class PasswordBody(Body):
     """One's own: the old one and the new."""
 
     old: str
@@ -294,7 +300,7 @@ class PasswordBody:
 
 
 @dataclass(frozen=True)
-class UserBody:
+class UserBody(Body):
     """Somebody new."""
 
     name: str
@@ -303,14 +309,14 @@ class UserBody:
 
 
 @dataclass(frozen=True)
-class NewPasswordBody:
+class NewPasswordBody(Body):
     """Somebody else's, by an admin."""
 
     password: str
 
 
 @dataclass(frozen=True)
-class TokenBody:
+class TokenBody(Body):
     """A machine's."""
 
     name: str
@@ -318,7 +324,7 @@ class TokenBody:
 
 
 @dataclass(frozen=True)
-class FleetBody:
+class FleetBody(Body):
     """Which logs, and with what; None: as each run had it.
 
     ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside of it.
@@ -327,8 +333,8 @@ class FleetBody:
     folder: str = ""
     below: str = ""
     model: str | None = None
-    tolerance: float | None = None
-    confidence: float | None = None
+    tolerance: float | str | None = None
+    confidence: float | str | None = None
 
 
 @dataclass(frozen=True)
@@ -534,7 +540,7 @@ def document() -> dict[str, Any]:
                            {"name": "token", "in": "query", "schema": {"type": "string"},
                             "description": "a machine's, where no header can be sent: browsers"}],
             "responses": {"101": {"description": "a WebSocket; closed with 4401 for nobody, 4403 for a lesser role"},
-                          "403": {"description": "refused"}},
+                          **dict.fromkeys(("400", "401", "403", "404", "426"), error)},
         }}
     return {
         "openapi": "3.1.0",

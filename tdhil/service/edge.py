@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
+from dataclasses import fields
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 from urllib.parse import urlsplit
 
@@ -35,6 +37,7 @@ POLICY: Final = (
     "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
 )
 """Of every page: nothing from elsewhere, and no script or style in the page itself."""
+_NONE: Final[Mapping[str, str]] = MappingProxyType({})
 _BROKEN_HINT: Final = "The terminal of tdhil serve says more"
 
 
@@ -143,12 +146,12 @@ def told_of(error: BaseException) -> ErrorView:
     return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
 
 
-def error_response(error: BaseException) -> Response:
-    """The whole answer."""
-    headers = {"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {}
+def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:
+    """The whole answer. ``status``: where it is another than the error's own."""
+    headers = {**headers, **({"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {})}
     if isinstance(error, TooManyTries):
         headers["retry-after"] = f"{error.wait_s:.0f}"
-    return JSONResponse(plain(told_of(error), ErrorView), status_of(error), headers=headers)
+    return JSONResponse(plain(told_of(error), ErrorView), status or status_of(error), headers=headers)
 
 
 async def body_of(request: Request, route: Route) -> Any:
@@ -175,7 +178,11 @@ async def body_of(request: Request, route: Route) -> Any:
         return adapter(route.body).validate_json(json.dumps(sent), strict=True)
     except ValidationError as error:
         first = error.errors()[0]
-        raise UsageError(first["msg"], where=".".join(map(str, first["loc"])) or "body") from None
+        where = ".".join(map(str, first["loc"]))[:60] or "body"
+        if first["type"] == "unexpected_keyword_argument":
+            known = ", ".join(one.name for one in fields(route.body))
+            raise UsageError("is nothing that is asked for here", where=where, next_step=f"There are {known}") from None
+        raise UsageError(first["msg"], where=where) from None
 
 
 def _no_number(name: str) -> Any:

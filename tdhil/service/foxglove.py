@@ -68,12 +68,16 @@ class _Reader:
 
 @dataclass
 class Relay:
-    """What one viewer of one rig is told. ``current``: the rig's run, looked up in a thread."""
+    """What one viewer of one rig is told. ``current``: the rig's run, looked up in a thread.
+
+    ``simulated``: is the rig, as long as no run says it of itself?
+    """
 
     rig: str
     current: Callable[[], Running | None]
     send_text: Callable[[str], Awaitable[None]]
     send_bytes: Callable[[bytes], Awaitable[None]]
+    simulated: bool = False
     clock: Callable[[], float] = time.monotonic
     _wanted: dict[int, int] = field(default_factory=dict)
     _new: set[int] = field(default_factory=set)            # channels that no reader has yet
@@ -127,7 +131,7 @@ class Relay:
 
     async def _introduce(self, running: Running | None) -> None:
         """Who speaks; a session of its own for each run, so that a viewer begins anew with it."""
-        simulated = " SIMULATED" if running is not None and running.simulated else ""
+        simulated = " SIMULATED" if (self.simulated if running is None else running.simulated) else ""
         run = None if running is None else running.run
         metadata = {"rig": self.rig, "run": run or "", "simulated": str(bool(simulated)).lower()}
         await self._say({"op": "serverInfo", "name": f"tdhil, rig {self.rig}{simulated}", "capabilities": [],

@@ -31,7 +31,7 @@ from starlette.middleware import Middleware
 from starlette.middleware.authentication import AuthenticationMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
-from starlette.routing import BaseRoute, Mount, WebSocketRoute
+from starlette.routing import BaseRoute, Match, Mount, WebSocketRoute
 from starlette.routing import Route as Way
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
@@ -114,7 +114,8 @@ class Web:
         self.feeds = Feeds()
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
         self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
-        self._works = anyio.CapacityLimiter(1)         # arithmetic, one piece at a time
+        self._works = anyio.CapacityLimiter(1)         # arithmetic that somebody waits for, one piece at a time
+        self._replays = anyio.CapacityLimiter(1)       # and what has time, so that no plan stands behind it
         self.logins = anyio.CapacityLimiter(1)        # passwords too: each takes 32 MB
         self._waiting: dict[tuple[str, str], ReplayView] = {}
         self._made = threading.Lock()
@@ -160,8 +161,10 @@ class Web:
             Way("/login", self._login_page),
             Way("/favicon.ico", lambda request: RedirectResponse("/static/icon.svg")),
         ]
-        sockets = [WebSocketRoute(f"{base}{one.path}", self._socket(one.role, getattr(self, f"_{one.name}")))
-                   for base in (API, "") for one in SOCKETS]
+        sockets: list[BaseRoute] = []
+        for path, one in ((f"{base}{one.path}", one) for base in (API, "") for one in SOCKETS):
+            sockets += [WebSocketRoute(path, self._socket(one.role, getattr(self, f"_{one.name}"))),
+                        Way(path, self._no_socket(one.role))]
         return [*api, *at_the_root, *sockets, *pages, Mount("/static", StaticFiles(directory=HERE / "static"))]
 
     @asynccontextmanager
@@ -180,13 +183,26 @@ class Web:
             import traceback
 
             traceback.print_exception(error, file=sys.stderr)
-        if request.url.path.startswith(API) or request.method != "GET":
-            return error_response(error)
-        if isinstance(error, NotLoggedIn) and self.access.login:
+        path, status, headers = request.url.path, None, {}
+        if isinstance(error, HTTPException) and error.status_code == 405:
+            methods = ", ".join(sorted(self._methods(request)))
+            error, status, headers = UsageError(
+                f"takes {methods}, and no {request.method[:20]}", where=path[:100]), 405, {"allow": methods}
+        elif isinstance(error, HTTPException) and error.status_code == 404:
+            error = NotThere("there is nothing here", where=path[:100], next_step=f"{API}/openapi.json says what is")
+        if path.startswith(API) or request.method != "GET":
+            return error_response(error, status, headers)
+        if isinstance(error, NotLoggedIn) and self.access.login:       # a page
             there = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
             return RedirectResponse(f"/login?{urlencode({'next': there})}", 303)
         told = told_of(error).error
         return self._render(request, "error.html", "", status_of(error), told=told)
+
+    def _methods(self, request: Request) -> set[str]:
+        """What may be done at an address, by all of its routes."""
+        found = (one.methods for one in self.app.routes
+                 if isinstance(one, Way) and one.matches(request.scope)[0] is not Match.NONE)
+        return {method for methods in found for method in methods or ()}
 
     # -- the API -----------------------------------------------------------------------------------------------------
 
@@ -336,7 +352,7 @@ class Web:
 
     async def _ask_replay(self, request: Request, body: Any) -> tuple[int, ReplayView]:
         run, who = request.path_params["run"], principal(request).name
-        asked = {name: value for name, value in asdict(body).items() if value is not None}
+        asked = afterwards.settings_of(body)
         view = await off(lambda: self._new_replay(run, asked, who))
         rig = (await off(lambda: self.store.request(run))).rig
         self.supervisor.note(who, f"replay {view.name} asked", run, rig, options=asked)
@@ -399,8 +415,10 @@ class Web:
 
     async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """A piece of arithmetic, one at a time: its document. Raises Refused."""
-        work = partial(self.supervisor.work, what, run, asked)
-        found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=self._works))["document"]
+        work, limiter = partial(self.supervisor.work, what, run, asked), self._works
+        if what == "replay":
+            limiter = self._replays
+        found: dict[str, Any] = (await anyio.to_thread.run_sync(work, limiter=limiter))["document"]
         return found
 
     async def _result(self, request: Request, body: Any) -> Response:
@@ -567,12 +585,22 @@ class Web:
 
         return guarded
 
+    def _no_socket(self, role: Role) -> Callable[[Request], Awaitable[Response]]:
+        """Somebody asks for a socket's address as if it were a page."""
+        async def serve(request: Request) -> Response:
+            path = request.url.path
+            require(principal(request), role, route=path, open_here=not self.access.login)
+            error = UsageError("is a WebSocket", where=path[:100], next_step="Open it as ws:// or wss://")
+            return error_response(error, 426, {"upgrade": "websocket", "connection": "upgrade"})
+
+        return serve
+
     async def _watch(self, socket: WebSocket) -> None:
         run = socket.path_params["run"]
         try:
             folder = await off(lambda: self.store.place(run))
-        except NotThere:
-            await socket.close(4404, "there is no such run")
+        except NotThere as error:
+            await socket.send_denial_response(error_response(error))
             return
         await socket.accept()
         feed = self.feeds.of(run, lambda: Feed(folder / "run.mcap", lambda: self.store.status(run)))
@@ -603,15 +631,17 @@ class Web:
         rig_id = socket.path_params["rig"]
         protocol = next((one for one in PROTOCOLS if one in socket.scope["subprotocols"]), None)
         try:
-            await off(lambda: self.supervisor.rigs.get(rig_id))
-        except NotThere:
-            await socket.close(4404, "there is no such rig")
+            rig = await off(lambda: self.supervisor.rigs.get(rig_id))
+        except NotThere as error:
+            await socket.send_denial_response(error_response(error))
             return
         if protocol is None:
-            await socket.close(1002, f"offer {' or '.join(PROTOCOLS)}")
+            wrong = UsageError("speaks the Foxglove protocol", where=socket.url.path[:100],
+                               next_step=f"Offer a sub-protocol: {' or '.join(PROTOCOLS)}")
+            await socket.send_denial_response(error_response(wrong, 400))
             return
         await socket.accept(protocol)
-        relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes)
+        relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes, rig.simulated)
         self._relays += 1
         try:
             async with anyio.create_task_group() as both:

@@ -129,6 +129,9 @@ def test_every_route_for_everybody(guarded, monkeypatch):
                     code = closes(guarded, f"{API}{path}", headers, described["x-websocket"])
                     if code != (None if rank >= needed else 4401 if rank < 0 else 4403):
                         wrong.append((who, method, template, code))
+                    code = guarded("GET", path, headers).status_code           # as if it were a page
+                    if code != (426 if rank >= needed else 401):
+                        wrong.append((who, "page of", template, code))
                     continue
                 if name == "logout" and who.startswith("session"):
                     continue               # it works, and would end the session of the next ones

@@ -11,13 +11,12 @@ from typing import Any
 
 import jsonschema
 import pytest
-from starlette.testclient import TestClient
-from starlette.websockets import WebSocketDisconnect
+from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from tdhil.errors import UsageError
 from tdhil.service.answers import API, ROUTES, SOCKETS, document
 from tdhil.service.states import State
-from tests.service.conftest import URL, Service, wait_for
+from tests.service.conftest import HANGS_S, URL, Service, wait_for
 
 # -- what there is
 
@@ -44,12 +43,29 @@ def test_what_others_build_on_is_there_and_described(call, client, route):
     method, _, path = route.partition(" ")
     described = call.document["paths"][f"{API}{path}"][method.lower()]
     assert described["x-role"]
-    if "101" in described["responses"]:
-        return
     answer = client.request(method, f"{API}{path.format(rig='no-rig', run='no-run')}")
     assert answer.status_code in {int(code) for code in described["responses"]}, answer.text
     if answer.status_code != 200:
-        assert answer.json()["error"]["what"] != "Not Found"
+        assert answer.json()["error"]["what"] != "there is nothing here"
+    assert (answer.status_code == 426) is ("101" in described["responses"])
+
+
+@pytest.mark.parametrize(("method", "path", "allowed"), [
+    ("DELETE", f"{API}/rigs", {"GET", "HEAD"}), ("GET", f"{API}/rigs/a/runs", {"POST"}), ("POST", "/", {"GET", "HEAD"}),
+    ("PUT", f"{API}/rigs/a/file", {"GET", "HEAD", "POST"}),
+])
+def test_what_an_address_does_not_take_is_told_with_what_it_takes(client, method, path, allowed):
+    answer = client.request(method, path)
+    assert (answer.status_code, set(answer.headers["allow"].split(", "))) == (405, allowed)
+    told = answer.json()["error"]
+    assert told["where"] == path
+    assert all(one in told["what"] for one in allowed)
+
+
+def test_an_address_at_which_nothing_is_says_so(client):
+    told = client.get(f"{API}/nosuch").json()["error"]
+    assert (told["where"], told["next_step"]) == (f"{API}/nosuch", f"{API}/openapi.json says what is")
+    assert "/nosuch: there is nothing here" in client.get("/nosuch").text
 
 
 def test_rigs_say_what_they_are(call):
@@ -149,7 +165,30 @@ def test_a_replay_stands_beside_the_first_result(call, service, monkeypatch):
     assert found["result"] == first
     assert [one["name"] for one in found["replays"]] == ["001", "002"]
     call("GET", f"/runs/{run}/replays/003", 404)
-    call("POST", f"/runs/{run}/replays", 422, json={"model": 7})
+    for wrong in ({"model": 7}, {"model": "nosuch"}, {"tolerance": -1}, {"tolerance": "a lot"}, {"confidence": 2},
+                  {"tolerence": 0.01}):
+        told = call("POST", f"/runs/{run}/replays", 422, json=wrong)["error"]
+        assert next(iter(wrong)) in told["message"]
+    assert [one["name"] for one in call("GET", f"/runs/{run}", 200)["replays"]] == ["001", "002"]
+    assert call("POST", f"/runs/{run}/replays", 202, json={"tolerance": "1%"})["asked"] == {"tolerance": 0.01}
+
+
+def test_no_plan_waits_for_a_replay(call, service, monkeypatch):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    asked, goes_on = [], threading.Event()
+
+    def work(what: str, run: str | None, asked_for: Any) -> dict[str, Any]:
+        asked.append(what)
+        assert what == "plan" or goes_on.wait(HANGS_S)
+        return {"document": {}}
+
+    monkeypatch.setattr(service.supervisor, "work", work)
+    call("POST", f"/runs/{run}/replays", 202, json={})
+    wait_for("the replay to begin", lambda: asked)
+    call("POST", "/rigs/a/plan", 200, json={})
+    goes_on.set()
+    assert asked == ["replay", "plan"]
 
 
 def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_end(call, service, monkeypatch):
@@ -159,7 +198,7 @@ def test_a_replay_that_cannot_be_says_why_and_one_of_a_live_run_waits_for_its_en
     run = call.start()["id"]
     service.wait(run, "done")
     worked(service, monkeypatch, UsageError("no such model", where="model"))
-    name = call("POST", f"/runs/{run}/replays", 202, json={"model": "x"})["name"]
+    name = call("POST", f"/runs/{run}/replays", 202, json={"model": "string"})["name"]
     failed = wait_for("the replay", lambda: (
         found if (found := call("GET", f"/runs/{run}/replays/{name}", 200))["state"] == "failed" else None))
     assert failed["error"]["what"] == "no such model"
@@ -416,17 +455,12 @@ def test_nothing_but_its_own_files_is_served(client, service):
 # -- whence
 
 
-def refused_socket(client: TestClient, headers: dict[str, str]) -> int:
-    """The code with which a live socket is closed before it is open."""
+@pytest.mark.parametrize("headers", [{"Origin": URL}, {}])
+def test_a_socket_from_its_own_page_gets_as_far_as_the_run(client, headers):
     address = f"{URL.replace('http', 'ws')}{API}/live/20260101-000000-000000"
-    with pytest.raises(WebSocketDisconnect) as closed, client.websocket_connect(address, headers=headers):
+    with pytest.raises(WebSocketDenialResponse) as denied, client.websocket_connect(address, headers=headers):
         pass
-    return closed.value.code
-
-
-def test_a_socket_from_its_own_page_gets_as_far_as_the_run(client):
-    assert refused_socket(client, {"Origin": URL}) == 4404
-    assert refused_socket(client, {}) == 4404
+    assert (denied.value.status_code, denied.value.json()["error"]["kind"]) == (404, "NotThere")
 
 
 @pytest.mark.parametrize("host", [

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import uvicorn
 from mcap.reader import make_reader
-from starlette.testclient import TestClient
+from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 from websockets.sync.client import connect
 
@@ -121,7 +121,7 @@ def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
         viewer = Viewer(peer.send)
         while not viewer.statuses():
             viewer.take(peer.recv(HANGS_S))
-        assert viewer.told[0]["name"] == "tdhil, rig a"
+        assert viewer.told[0]["name"] == "tdhil, rig a SIMULATED"
         assert viewer.told[0]["capabilities"] == []
         viewer.subscribe()
         run, path = moving(service)
@@ -330,12 +330,17 @@ def test_a_viewer_can_only_read(bench, said, answer):
 
 def test_a_rig_that_is_none_and_a_protocol_that_is_none_are_refused(service):
     with TestClient(service.web.asgi, base_url=URL) as client:
-        for path, protocols, code in (("/foxglove/none", PROTOCOLS[:1], 4404), ("/foxglove/a", ["foxglove.v9"], 1002),
-                                      (f"{API}/foxglove/a", [], 1002)):
-            with pytest.raises(WebSocketDisconnect) as refused, client.websocket_connect(
+        for path, protocols, code in (("/foxglove/none", PROTOCOLS[:1], 404), ("/foxglove/a", ["foxglove.v9"], 400),
+                                      (f"{API}/foxglove/a", [], 400)):
+            with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(
                     f"{SOCKETS}{path}", subprotocols=protocols):
                 pass
-            assert refused.value.code == code
+            assert refused.value.status_code == code
+            assert code == 404 or PROTOCOLS[0] in refused.value.json()["error"]["next_step"]
+        for rig, simulated in (("real", ""), ("a", " SIMULATED")):
+            address = f"{SOCKETS}{API}/foxglove/{rig}"
+            with client.websocket_connect(address, subprotocols=list(PROTOCOLS)[::-1]) as socket:
+                assert socket.receive_json()["name"] == f"tdhil, rig {rig}{simulated}"
         with client.websocket_connect(f"{SOCKETS}{API}/foxglove/a", subprotocols=list(PROTOCOLS)[::-1]) as socket:
             assert socket.receive_json()["op"] == "serverInfo"
             assert "tdhil_foxglove_viewers 1.0" in client.get("/metrics").text
