@@ -187,8 +187,9 @@ class Supervisor:
         """
         status, request = self.store.status(run), self.store.request(run)
         if status.ended or (request.simulated and request.motion != "watched"):
-            raise Conflict(f"there is nothing to confirm: the run is {status.state}", where=f"run {run}",
-                           next_step="A simulated rig asks for no confirmation")
+            nothing = f"there is nothing to confirm: the run is {status.state}"
+            self.note(who, "confirmation refused", run, status.rig, why=nothing)
+            raise Conflict(nothing, where=f"run {run}", next_step="A simulated rig asks for no confirmation")
         try:
             found = ask(self.store.place(run),
                         {"do": "confirm", "code": code, "binding": binding, "by": who, "lease": lease})

@@ -438,6 +438,8 @@ def test_two_who_confirm_at_once_are_one_who_did(guarded):
     guarded.service.wait(run, "done")
     wait_for("the audit", lambda: len([one for one in guarded.audit() if "confirm" in one[1]]) == 3)
     assert [who for who, what, _ in guarded.audit() if what == "confirmed"] == [by]
+    assert guarded("POST", f"/runs/{run}/confirm", guarded.sessions["admin"], json={"code": "1"}).status_code == 409
+    wait_for("the one who came too late", lambda: guarded.audit()[-1][1] == "confirmation refused")
 
 
 @pytest.mark.parametrize("option", [

@@ -71,7 +71,7 @@ def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys):
         assert holders() == [holder_of("modbus 127.0.0.1:1 unit 1"), holder_of("modbus 127.0.0.1:2 unit 1")]
         assert idle(tmp_path / "none") == ExitCode.REFUSED
         assert f"a drive is held by process {os.getpid()}" in capsys.readouterr().err
-    assert idle(tmp_path / "none") == ExitCode.OK
+    assert idle(tmp_path / "none") == ExitCode.USAGE       # who misspelt it has asked nothing
     assert not (tmp_path / "none").exists()
 
 
