@@ -189,7 +189,8 @@ class Web:
             error, status, headers = UsageError(
                 f"takes {methods}, and no {request.method[:20]}", where=path[:100]), 405, {"allow": methods}
         elif isinstance(error, HTTPException) and error.status_code == 404:
-            error = NotThere("there is nothing here", where=path[:100], next_step=f"{API}/openapi.json says what is")
+            listed = f"{API}/openapi.json says what is" if path.startswith(API) else ""
+            error = NotThere("there is nothing here", where=path[:100], next_step=listed)
         if path.startswith(API) or request.method != "GET":
             return error_response(error, status, headers)
         if isinstance(error, NotLoggedIn) and self.access.login:       # a page
@@ -431,7 +432,8 @@ class Web:
         if not path.is_file():
             raise NotThere(f"this run has no {name}", where=f"run {run}", next_step="It may come when it has ended")
         rig = (await off(lambda: self.store.request(run))).rig
-        self.supervisor.note(who, f"downloaded {name}", run, rig)
+        if request.method == "GET":
+            self.supervisor.note(who, f"downloaded {name}", run, rig)
         called = f"{rig}-{run}-{name}"
         grows = name == "run.mcap" and not (await off(lambda: self.store.status(run))).ended
         if grows and ("range" not in request.headers or "if-range" in request.headers):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import shutil
 import signal
 import socket
@@ -115,7 +116,7 @@ def results(served: Served, run: str, monkeypatch: pytest.MonkeyPatch) -> tuple[
     store = served.service.store
     folder = store.place(run)
     inertia = {**estimate(104.0), "low_total": 100.0, "high_total": 108.0, "half_width_total_rel": 0.04,
-               "repeatability_rel": 0.01}
+               "repeatability_rel": 0.01, "confidence": 0.9}
     write_json(folder / "result.json", {
         "verdict": "valid", "inertia_kg_m2": inertia, "reason": HOSTILE, "advice": "", "model": "rigid+lags",
         "warnings": [HOSTILE, "speed was quantised"], "viscous_nm_s_rad": estimate(8.0), "speed_lag_s": estimate(0.4),
@@ -178,7 +179,7 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     page.keyboard.press("Enter")
     page.wait_for_url("**/start/a")
     page.get_by_label("How tight").focus()
-    page.keyboard.type("2.5")
+    page.keyboard.type("2,5")
     page.keyboard.press("Enter")       # as the first button would have it: a plan, and nothing begins by mistake
     page.get_by_role("row", name="expected interval of J").get_by_text("±2.1 %").wait_for()
     assert served.service.store.ids() == []
@@ -187,7 +188,7 @@ def test_from_the_rigs_to_a_result_by_keyboard_alone(page, served, monkeypatch):
     page.keyboard.press("Enter")
     page.wait_for_url("**/live")
     page.get_by_role("link", name="To the result").click()
-    page.get_by_text("J = 104 (100 to 108) kg·m²").wait_for()
+    page.get_by_text("J = 104.0 (100.0 to 108.0) kg·m²").wait_for()
     (run,) = served.service.store.ids()
     assert served.service.store.request(run).options == {"tolerance": 0.025}
 
@@ -352,6 +353,8 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
     results(served, run, monkeypatch)
     page.goto(f"/runs/{run}")
     page.get_by_text("speed was quantised").wait_for()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", page.locator("time").first.inner_text())
+    page.get_by_role("row", name="J, 90 % interval to quote").wait_for()
     page.locator(".pictures img").evaluate("one => one.decode()")
     page.get_by_text("Friction over speed, in numbers").click()
     page.get_by_role("row", name="2 76").wait_for()
@@ -361,10 +364,13 @@ def test_from_a_result_to_a_replay_and_two_runs_compared(page, served, monkeypat
                                                         "half_width_total_rel": 0.05}}
     monkeypatch.setattr(served.service.supervisor, "work", lambda what, run, asked: {"document": again})
     page.get_by_label("Model").select_option("rigid")
-    page.get_by_label("How tight").fill("0.1")
+    page.get_by_label("How tight").fill("a lot")
     page.get_by_role("button", name="Replay").click()
-    page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99 to 110)").wait_for()
-    page.get_by_role("row", name="the run itself").get_by_text("104 (100 to 108)").wait_for()
+    page.get_by_text("tolerance: a number and its unit are wanted").wait_for()         # and it isn't passed over
+    page.get_by_label("How tight").fill("0,1")
+    page.get_by_role("button", name="Replay").click()
+    page.get_by_role("row", name="model rigid, tolerance 0.001").get_by_text("104.5 (99.0 to 110.0)").wait_for()
+    page.get_by_role("row", name="the run itself").get_by_text("104.0 (100.0 to 108.0)").wait_for()
     served.service.supervisor.work = lambda what, run, asked: {"document": {
         "results": [], "differences": [], "settings": [], "apparent_inertia": [], "friction": []}}
     page.goto("/runs")

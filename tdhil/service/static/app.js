@@ -96,17 +96,31 @@
   }
 
   const number = (value, digits = 4) => (value === null || value === undefined ? "–" : Number(value).toPrecision(digits).replace(/\.?0+$/, (m) => (m.includes(".") ? "" : m)));
-  function inertia(one) {
-    if (!one || one.inertia_kg_m2 === null || one.inertia_kg_m2 === undefined) return null;
-    return `${number(one.inertia_kg_m2)} (${number(one.low_kg_m2)} to ${number(one.high_kg_m2)}) kg·m²`;
+  /** A value with its interval, to as many places as that tells: two digits of its half, as the terminal's card. */
+  function interval(value, low, high) {
+    if (value === null || value === undefined) return null;
+    if (low === null || low === undefined || high === null || high === undefined) return number(value);
+    const half = (high - low) / 2, places = half > 0 ? Math.min(12, Math.max(0, 1 - Math.floor(Math.log10(half)))) : 4;
+    return `${value.toFixed(places)} (${low.toFixed(places)} to ${high.toFixed(places)})`;
   }
+  const withUnit = (text) => (text === null ? null : `${text} kg·m²`);
+  const inertia = (one) => (one ? withUnit(interval(one.inertia_kg_m2, one.low_kg_m2, one.high_kg_m2)) : null);
   function ofResult(result) {
     const J = result && result.inertia_kg_m2;
-    return J ? `${number(J.value)} (${number(J.low_total)} to ${number(J.high_total)}) kg·m²` : null;
+    return J ? withUnit(interval(J.value, J.low_total, J.high_total)) : null;
   }
   const percent = (share) => (share === null || share === undefined ? "" : `±${(100 * share).toPrecision(2)} %`);
-  const clock = (iso) => (iso ? new Date(iso).toLocaleTimeString(undefined, { hour12: false }) + "." + String(new Date(iso).getMilliseconds()).padStart(3, "0") : "");
-  const when = (iso) => (iso ? new Date(iso).toLocaleString(undefined, { hour12: false }) : "");
+  /** This computer's own time, written so that no month is taken for a day. */
+  const two = (one, digits = 2) => String(one).padStart(digits, "0");
+  const time = (at) => `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+  const clock = (iso) => (iso ? `${time(new Date(iso))}.${two(new Date(iso).getMilliseconds(), 3)}` : "");
+  function when(iso) {
+    if (!iso) return "";
+    const at = new Date(iso);
+    return Number.isNaN(at.getTime()) ? iso : `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${time(at)}`;
+  }
+  /** What was typed in as per cent, for the service to judge. */
+  const share = (text) => `${text.trim().replace(",", ".").replace(/\s*%$/, "")}%`;
   function span(seconds) {
     const whole = Math.max(0, Math.round(seconds));
     return whole < 90 ? `${whole} s` : `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s`;
@@ -124,7 +138,7 @@
     return el("article", { class: "card", "aria-labelledby": `rig-${rig.id}` },
       el("h2", { id: `rig-${rig.id}` }, rig.name, " ", badge(rig.simulated) || ""),
       el("p", { class: rig.state === "blocked" || rig.state === "unusable" ? "alarm" : "dim" }, said),
-      rig.last ? el("p", {}, el("span", { class: "figure" }, inertia(rig.last)), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, "no result yet"),
+      rig.last ? el("p", {}, el("span", { class: "figure" }, `J = ${inertia(rig.last)}`), el("br"), el("a", { href: `/runs/${rig.last.id}` }, when(rig.last.asked))) : el("p", { class: "dim" }, "no result yet"),
       el("p", { class: "row" },
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
@@ -163,9 +177,9 @@
   function asked(form) {
     const found = {};
     const text = (name) => (form.elements[name] ? form.elements[name].value.trim() : "");
-    if (text("tolerance")) found.tolerance = `${text("tolerance").replace(/\s*%$/, "")}%`;
-    if (text("max_time")) found.max_time = `${text("max_time").replace(/\s*min$/, "")}min`;
-    if (text("seed")) found.seed = Number(text("seed"));
+    if (text("tolerance")) found.tolerance = share(text("tolerance"));
+    if (text("max_time")) found.max_time = `${text("max_time").replace(",", ".").replace(/\s*min$/, "")}min`;
+    if (text("seed")) found.seed = /^\d+$/.test(text("seed")) ? Number(text("seed")) : text("seed");
     for (const name of ["excitation", "operator", "note"]) if (text(name)) found[name] = text(name);
     for (const name of ["fault", "accept_unverified"]) if (text(name)) found[name] = text(name).split(/[\s,]+/);
     for (const name of ["real_time", "accept_speed_unit", "reset_fault"]) if (form.elements[name] && form.elements[name].checked) found[name] = true;
@@ -548,8 +562,9 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, may, number, ofResult, pages, percent, show, span, when };
+  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, share, show, span, when };
   document.addEventListener("DOMContentLoaded", () => {
+    for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {
       (pages[document.body.dataset.page] || (() => {}))();
     } finally {                 // until its script listens, a page takes neither click nor key: both would be lost

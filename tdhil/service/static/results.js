@@ -1,7 +1,7 @@
 // What came of runs: one, several side by side, a rig over time, many logs. As in app.js, what comes from elsewhere is text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, number, ofResult, pages, percent, show, span, when } = window.tdhil;
+  const { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, share, show, span, when } = window.tdhil;
 
   // -- one run
 
@@ -13,8 +13,8 @@
     if (!result) return parts;
     const rows = [["verdict", result.verdict]];
     const J = result.inertia_kg_m2;
-    const estimate = (one, unit) => (one ? `${number(one.value)} (${number(one.low)} to ${number(one.high)}) ${unit}` : null);
-    if (J) rows.push(["J, 95 % interval to quote", `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${number(J.value)} (${number(J.low)} to ${number(J.high)}) kg·m²  ${percent(J.repeatability_rel)}`]);
+    const estimate = (one, unit) => (one ? `${of(one)} ${unit}` : null);
+    if (J) rows.push([`J, ${number(100 * (J.confidence ?? 0.95))} % interval to quote`, `${ofResult(result)}  ${percent(J.half_width_total_rel)}`], ["repeatability, this drive", `${of(J)} kg·m²  ${percent(J.repeatability_rel)}`]);
     for (const [name, key, unit] of [["viscous friction", "viscous_nm_s_rad", "N·m·s/rad"], ["Coulomb friction", "coulomb_nm", "N·m"], ["lag of speed", "speed_lag_s", "s"], ["lag of torque", "torque_lag_s", "s"]]) {
       const text = estimate(result[key], unit);
       if (text) rows.push([name, text]);
@@ -45,9 +45,9 @@
       el("figure", {}, el("img", { src: `${API}/runs/${id}/pictures/${one.number}`, alt: one.caption, loading: "lazy" }), el("figcaption", {}, one.caption))]));
     const curve = (result && result.friction_curve) || [];
     if (curve.length) byId("pictures").append(numbers("Friction over speed, in numbers", ["speed, rad/s", "torque, N·m"],
-      curve.map((one) => [number(one.speed_rad_s), interval(one.torque_nm)])));
+      curve.map((one) => [number(one.speed_rad_s), of(one.torque_nm)])));
   }
-  const interval = (one) => (one.value === null || one.value === undefined ? "–" : `${number(one.value)} (${number(one.low)} to ${number(one.high)})`);
+  const of = (one) => interval(one.value, one.low, one.high) ?? "–";
   const region = (label, table) => el("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": label }, table);
   /** A table that is folded away. Cells are texts or elements. */
   const numbers = (label, heads, rows) => el("details", {}, el("summary", {}, label), region(label, el("table", {},
@@ -81,7 +81,7 @@
       const said = byId("replay-said"), body = {};
       said.hidden = true;
       if (replay.elements.model.value) body.model = replay.elements.model.value;
-      if (replay.elements.tolerance.value.trim()) body.tolerance = Number(replay.elements.tolerance.value) / 100;
+      if (replay.elements.tolerance.value.trim()) body.tolerance = share(replay.elements.tolerance.value);
       try {
         await call("POST", `/runs/${id}/replays`, body);
       } catch (error) {
@@ -133,6 +133,15 @@
   const ALIVE_MS = 3000;
   const alive = () => every(ALIVE_MS, () => call("GET", "/healthz"));     // a page that asks only once says it when nobody is there any more
 
+  /** What stands at an axis of time, by the distance of its marks in s: see uPlot's `axis.values`. */
+  const TIMES = [
+    [365 * 86400, "{YYYY}", null, null, null, null, null, null, 1],
+    [28 * 86400, "{YYYY}-{MM}", null, null, null, null, null, null, 1],
+    [86400, "{MM}-{DD}", "\n{YYYY}", null, null, null, null, null, 1],
+    [60, "{HH}:{mm}", "\n{YYYY}-{MM}-{DD}", null, "\n{MM}-{DD}", null, null, null, 1],
+    [1, ":{ss}", "\n{YYYY}-{MM}-{DD} {HH}:{mm}", null, "\n{MM}-{DD} {HH}:{mm}", null, "\n{HH}:{mm}", null, 1],
+  ];
+
   /** Points with their intervals; series: [{colour, points: [{x, value, low, high}]}]. Drawn anew for another width or scheme. */
   function points(where, series, { label, time = false, marks = [] }) {
     const all = series.flatMap((one) => one.points);
@@ -146,7 +155,7 @@
       plot = new uPlot({
         width: where.clientWidth || 320, height: 240, legend: { show: false }, cursor: { show: false },
         scales: { x: { time, range: () => [xs[0] - side, xs[xs.length - 1] + side] }, y: { range: () => [low - pad, high + pad] } },
-        axes: [{ ...axis, size: 48, label: time ? undefined : label, labelSize: time ? 0 : 22 }, { ...axis, size: 62 }],
+        axes: [{ ...axis, size: 48, label: time ? undefined : label, labelSize: time ? 0 : 22, ...(time ? { values: TIMES } : {}) }, { ...axis, size: 62 }],
         series: [{}, ...series.map(() => ({ stroke: "transparent", paths: () => null, points: { show: false } }))],
         hooks: { draw: [(self) => {
           const c = self.ctx, px = devicePixelRatio;
@@ -201,7 +210,7 @@
           el("p", { class: quantity.changes.length || quantity.drift ? "alarm" : "" }, quantity.text),
           ...quantity.changes.map((one) => el("p", {}, el("a", { href: `/compare?runs=${encodeURIComponent(one.before)},${encodeURIComponent(one.after)}` }, `Compare the runs before and after, ${when(one.before_date)} and ${when(one.after_date)}`))),
           el("figure", {}, el("figcaption", {}, "each with its repeatability on this drive; dashed: a change"), plot),
-          numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), interval(one)]))));
+          numbers(`${quantity.name} in numbers`, ["run", `${quantity.unit}, interval`], quantity.points.map((one) => [el("a", { href: `/runs/${encodeURIComponent(one.log)}` }, when(one.date)), of(one)]))));
         points(plot, [{ colour: "--c0", points: quantity.points.map((one) => ({ ...one, x: at(one.date) })) }],
           { time: true, marks: quantity.changes.map((one) => (at(one.before_date) + at(one.after_date)) / 2) });
       }
@@ -234,15 +243,15 @@
       };
       show(where, ...said,
         region("Results", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...heads)), el("tbody", {},
-          line("J, interval to quote, kg·m²", comparison.results.map((one) => (one.inertia_kg_m2 === null ? "–" : `${number(one.inertia_kg_m2)} (${number(one.inertia_low_total_kg_m2)} to ${number(one.inertia_high_total_kg_m2)})`))),
-          line("J, repeatability, kg·m²", comparison.results.map((one) => interval({ value: one.inertia_kg_m2, low: one.inertia_low_kg_m2, high: one.inertia_high_kg_m2 }))),
+          line("J, interval to quote, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_total_kg_m2, one.inertia_high_total_kg_m2) ?? "–")),
+          line("J, repeatability, kg·m²", comparison.results.map((one) => interval(one.inertia_kg_m2, one.inertia_low_kg_m2, one.inertia_high_kg_m2) ?? "–")),
           line("verdict", comparison.results.map((one) => one.verdict))))),
         others.length ? numbers("Friction and lags", ["quantity", "", "by how much"], others) : null,
         ...curve("Apparent inertia, line by line, kg·m²", "frequency, Hz", "apparent_inertia", "hertz"),
         ...curve("Friction, N·m", "speed, rad/s", "friction", "speed_rad_s"),
         el("h2", {}, "Settings"), el("p", { class: "dim" }, "≠ marks what differs."),
         region("Settings", el("table", {}, el("thead", {}, el("tr", {}, el("td", {}), ...ids.map((id, k) => el("th", { scope: "col" }, dot(k), ` ${k + 1}`)))),
-          el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.values, one.differs))))));
+          el("tbody", {}, ...comparison.settings.map((one) => line(`${one.differs ? "≠ " : ""}${one.name}`, one.name === "date" ? one.values.map(when) : one.values.map((value) => ({ True: "yes", False: "no" }[value] ?? value)), one.differs))))));
     });
   }
   const percentOf = (share) => `${share > 0 ? "+" : ""}${(100 * share).toPrecision(2)} %`;
@@ -302,7 +311,7 @@
       event.preventDefault();
       const body = { folder: form.elements.folder.value, below: form.elements.below.value.trim() };
       if (form.elements.model.value) body.model = form.elements.model.value;
-      if (form.elements.tolerance.value.trim()) body.tolerance = Number(form.elements.tolerance.value.replace(",", ".").replace("%", "")) / 100;
+      if (form.elements.tolerance.value.trim()) body.tolerance = share(form.elements.tolerance.value);
       try {
         const found = await call("POST", "/fleets", body);
         location.assign(`/fleets/${found.id}`);
@@ -322,7 +331,7 @@
 
   function fleetRow(row) {
     const own = /^runs\/([0-9]{8}-[0-9]{6}-[0-9a-f]{6})\/run\.mcap$/.exec(row.log);
-    const J = row.inertia_kg_m2 === null ? "–" : `${number(row.inertia_kg_m2)} (${number(row.inertia_low_total_kg_m2)} to ${number(row.inertia_high_total_kg_m2)})`;
+    const J = interval(row.inertia_kg_m2, row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2) ?? "–";
     const was = row.changed ? `other: ${row.stored_verdict} ${number(row.stored_inertia_kg_m2)}` : row.changed === false ? "the same" : "";
     return el("tr", row.error_kind ? { class: "refused" } : {}, el("th", { scope: "row" }, own ? el("a", { href: `/runs/${own[1]}` }, own[1]) : row.log),
       el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : row.verdict), el("td", {}, J), el("td", {}, was));
