@@ -225,7 +225,8 @@ def _run(request: RunRequest, console: Console, report: Path | None) -> int:
                 console.print(f"tdhil: {error}", style="bold red", markup=False, soft_wrap=True)
             code = code or int(exit_code(error))
         if document is not None:
-            save_report(document, session.log.recording(complete=True), report)      # it names the log's SHA-256
+            # it names the log's SHA-256
+            save_report(document, session.log.recording(complete=True), report, session.log.virtual_string)
     return code
 
 

@@ -93,7 +93,7 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     """What the virtual string of this log did, and print it."""
     from tdhil.report import stderr_console
 
-    for name in ("report", "model", "confidence", "tolerance"):
+    for name in ("model", "confidence", "tolerance"):
         if getattr(namespace, name) is not None:
             raise UsageError("is for a run that identifies; this log is of a virtual string", where=f"--{name}")
     recorded.require_motion()
@@ -103,7 +103,10 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     )
     for problem in recorded.problems:
         stderr_console().print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
-    print_result(found.document, namespace.json)
+    try:
+        print_result(found.document, namespace.json)
+    finally:
+        save_report(found.document, recorded.recording, namespace.report, recorded.virtual_string)
     return int(ExitCode.PARTIAL if not recorded.whole and found.exit_code is ExitCode.OK else found.exit_code)
 
 

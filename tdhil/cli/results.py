@@ -11,15 +11,23 @@ from typing import TYPE_CHECKING, Any
 from tdhil.cli.streams import OutputLost
 
 if TYPE_CHECKING:
-    from tdhil.recording import Recording
+    from tdhil.recording import FloatArray, Recording
 
 
-def save_report(document: Mapping[str, Any], recording: Recording, path: Path | None) -> None:
-    """Where one was asked for, the page as a file. Raises UsageError if it can't be written."""
+def save_report(
+    document: Mapping[str, Any], recording: Recording, path: Path | None, virtual_string: FloatArray | None = None
+) -> None:
+    """Where one was asked for, the page as a file. Raises UsageError if it can't be written.
+
+    ``virtual_string``: its cycles, where the document is of one.
+    """
     if path is not None:
-        from tdhil.report import write_report
+        from tdhil.report import write_evaluation_report, write_report
 
-        written = write_report(document, recording, path)
+        if _is_evaluation(document) and virtual_string is not None:
+            written = write_evaluation_report(document, virtual_string, path)
+        else:
+            written = write_report(document, recording, path)
         if written != path:
             print(f"tdhil: {path} has come there meanwhile; the report is {written}", file=sys.stderr)  # noqa: T201
 
@@ -34,7 +42,7 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     """Stdout: one JSON document, or the card. Where stdout takes nothing, the card goes to stderr, and it raises."""
     from tdhil.report import PlainConsole, print_card, print_evaluation
 
-    show = print_evaluation if document.get("kind") == "evaluation" else print_card
+    show = print_evaluation if _is_evaluation(document) else print_card
     try:
         if as_json:
             print_json(document)
@@ -44,3 +52,7 @@ def print_result(document: Mapping[str, Any], as_json: bool) -> None:
     except (BrokenPipeError, OutputLost):
         show(document, PlainConsole(sys.stderr))
         raise
+
+
+def _is_evaluation(document: Mapping[str, Any]) -> bool:
+    return document.get("kind") == "evaluation"

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from tdhil.report.console import PlainConsole as PlainConsole
     from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document
     from tdhil.report.evaluation import (
-        evaluation_document as evaluation_document, print_evaluation as print_evaluation,
+        evaluation_document as evaluation_document, evaluation_report as evaluation_report,
+        print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
     )
     from tdhil.report.html import (
         Shown as Shown, check_report_path as check_report_path, pictures_in as pictures_in,

@@ -1,21 +1,32 @@
-"""What came of a virtual string on a drive: as a document for machines, and on a terminal."""
+"""What came of a virtual string on a drive: as a document for machines, on a terminal, and as a page with pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.recording import Recording
+from tdhil.recording import FloatArray, Recording
 from tdhil.report.console import PlainConsole
+from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, shown_date
 from tdhil.report.document import SIMULATED, provenance
+from tdhil.report.html import sha256_of, write_blocks
+from tdhil.report.plots import DARK, OURS, QUIET, envelope
+from tdhil.soft_torque import COLUMNS, RPM, Phase
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
+    from matplotlib.figure import FigureBase
+
     from tdhil.soft_torque import Evaluation, EvaluationCase
+
+Part = Mapping[str, Any]
 
 _STYLES = {"as_predicted": "bold green", "differs": "bold yellow"}
 
@@ -101,3 +112,169 @@ def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if document["bit"]:
         yield "bit", f"{document['bit']}: all of this holds for it alone"
     yield "log", document["log"]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# As a page.
+
+_COLOURS = {"as_predicted": "green", "differs": "yellow"}
+_VERDICTS = {
+    "as_predicted": "as predicted: the drive does with this string what tune says",
+    "differs": "differs from what tune says",
+    "not_found": "not found: there is no critical speed to tell",
+    "invalid": "invalid: what turned was not the string",
+}
+_CLOSE_S = 60.0
+_CLOSE = (
+    (Phase.HOLD, 5.0, "At the first set speed the bit must stick and slip."),
+    (Phase.RELEASED, 35.0, "The bit turns; it is lifted off bottom, and what swings decays."),
+)
+"""Phases shown by themselves, for `_CLOSE_S`, from so many seconds before."""
+
+
+def write_evaluation_report(document: Part, rows: FloatArray, path: Path) -> Path:
+    """The page, HTML or PDF by its name; where it went. ``rows``: of `COLUMNS`, a cycle each, as the log has them.
+
+    Raises UsageError where it can't be written.
+    """
+    return write_blocks(evaluation_report(document, rows, sha256_of(Path(document["log"]))), path)
+
+
+def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:
+    """The blocks of the page."""
+    facts = [document["string"] or "a virtual string", shown_date(document["date"])]
+    sections = [Section("Measured, and as tune says", (
+        Table((Column("", 0.34), Column("measured", 0.33, number=True), Column("by tune", 0.33, number=True)),
+              tuple(_beside(document))),
+    ))]
+    if len(rows):
+        shown = (
+            Picture(partial(draw_close, rows=rows, phase=Phase(phase), before_s=before_s), 1.9, caption)
+            for phase, before_s, caption in _CLOSE if np.any(rows[:, COLUMNS.index("phase")] == phase)
+        )
+        sections.append(Section("Bit and top drive", (
+            *shown,
+            Picture(partial(draw_course, rows=rows), 3.4,
+                    "The whole course: the ramp of the set speed, and trials at steady set speeds, each from a bit "
+                    "about to break away. Below: torque of drive and string at the main shaft."),
+        )))
+    if document["trials"]:
+        sections.append(Section("Trials", (
+            Table((Column("set speed, rpm", 0.3, number=True), Column("the bit ends", 0.7)),
+                  tuple((f"{one['set_rpm']:.1f}", "turning" if one["turns"] else "sticking")
+                        for one in sorted(document["trials"], key=lambda one: float(one["set_rpm"])))),
+        )))
+    sections += [
+        Section("What it rests on", (Pairs(tuple(_rests_on(document))),)),
+        Section("Run", (Pairs(tuple(_run(document, sha256))),)),
+    ]
+    return Report(
+        title="Speed controller on a virtual drill string",
+        subtitle=" · ".join(fact for fact in facts if fact),
+        simulated=f"{SIMULATED}: drive and rig are simulated, nothing real turned" if document["simulated"] else "",
+        answer=_answer(document),
+        warnings=() if document["complete"] else ("The run was cut short: this is what there is of it.",),
+        sections=tuple(sections),
+        footer=f"tdhil {document['tdhil']}" + (f" · log SHA-256 {sha256[:16]}…" if sha256 else ""),
+    )
+
+
+def _answer(document: Part) -> Answer:
+    verdict, critical, law = document["verdict"], document["critical_rpm"], document["controller"]
+    value = "No critical speed" if critical is None else f"The bit is freed from {critical['value']:.1f} rpm"
+    gains = law["at_main_shaft"]
+    line = (f"{law['kind']} controller, in {'the drive' if law['own_loop'] else 'the host'}: P = "
+            f"{gains['gain_nm_s_rad']:.4g} N·m·s/rad, I = {gains['integral_nm_rad']:.4g} N·m/rad at the main shaft")
+    return Answer(_COLOURS.get(verdict, "red"), value, (line,), _VERDICTS[verdict], f"{document['reason']}.", "")
+
+
+def _beside(document: Part) -> Iterator[tuple[str, str, str]]:
+    """(what, measured, predicted)."""
+    critical, cure = document["critical_rpm"], document["predicted_critical_rpm"]
+    yield ("critical speed, rpm",
+           "not found" if critical is None else f"{critical['value']:.1f}, above {critical['low']:.1f}",
+           f"{cure['value']:.0f} ({cure['low']:.0f} to {cure['high']:.0f})")
+    damping, expected = document["least_damping"], document["predicted_least_damping"]
+    yield ("least damping of the lowest modes",
+           "not seen" if damping is None else f"{damping['value']:.3f} at {damping['hertz']:.3f} Hz",
+           f"{expected['value']:.3f} ({expected['low']:.3f} to {expected['high']:.3f})")
+    for what, value in document["torque_rms_nm"].items():
+        yield f"torque at the top, rms, {what}, N·m", "not seen" if value is None else f"{value:.0f}", "–"
+    ramp = document["ramp_rpm"]
+    yield "last stick on the ramp, rpm", "none" if ramp is None else f"{ramp:.1f}", "–"
+
+
+def _rests_on(document: Part) -> Iterator[tuple[str, str]]:
+    loop, rig, law = document["loop"], document["rig_at_motor"], document["controller"]["at_main_shaft"]
+    if document["bit"]:
+        yield "bit", f"{document['bit']}: all of this holds for it alone"
+    yield "meant", f"{document['meant_inertia_kg_m2']:.4g} kg·m² at the main shaft"
+    if law["compensated_kg_m2"]:
+        yield "inertia compensated", f"{law['compensated_kg_m2']:.4g} kg·m²"
+    yield "turned", (f"{rig['inertia_kg_m2']:.4g} kg·m² at the motor, gear {rig['gear_ratio']:g}, the reported speed "
+                     f"{rig['speed_lag_s']:.3g} s late; torques scaled by {loop['scale']:.3g}")
+    yield "torque limit", ("never acted" if not loop["clamped_cycles"] else
+                           f"acted in {loop['clamped_cycles']} cycles: the string's torque was cut off")
+    yield "torque that nobody commanded", f"{loop['unknown_rms_nm']:.0f} N·m rms"
+    yield "energy by the loop's own errors", f"{loop['put_in_j']:.0f} J at most"
+    yield "reported speed beside the observer's", f"{loop['innovation_rms_rad_s']:.2g} rad/s rms"
+
+
+def _run(document: Part, sha256: str) -> Iterator[tuple[str, str]]:
+    cycle = document["cycle"] or {}
+    if cycle.get("rate_hz"):
+        yield "cycles a second", f"{cycle['rate_hz']:g}"
+    for name in ("operator", "note", "connection"):
+        if document.get(name):
+            yield name, str(document[name])
+    for key, name in (("profile", "name"), ("rig", "name"), ("drive", "name")):
+        if (document.get(key) or {}).get(name):
+            yield key, str(document[key][name])
+    yield "stages", ", ".join(f"{one['name']} {one['outcome']} ({one['duration_s']:.0f} s)"
+                              for one in document["stages"])
+    yield "log", document["log"]
+    if sha256:
+        yield "SHA-256", sha256
+
+
+def _columns(rows: FloatArray) -> dict[str, FloatArray]:
+    return {name: rows[:, number] for number, name in enumerate(COLUMNS)}
+
+
+def draw_close(figure: FigureBase, rows: FloatArray, phase: Phase, before_s: float) -> None:
+    """A minute about the begin of a phase."""
+    of = _columns(rows)
+    time, axes = of["time_s"], figure.subplots()
+    begin = max(time[0], time[of["phase"] == phase][0] - before_s)
+    at = np.flatnonzero((time >= begin) & (time <= begin + _CLOSE_S))
+    at = at[:: max(1, len(at) // 1200)]
+    for name, (label, colour, style) in _SPEEDS.items():
+        axes.plot(time[at] - time[0], of[name][at] / RPM, color=colour, ls=style, lw=1.0, label=label)
+    axes.set(xlabel="time, s", ylabel="rpm")
+    axes.grid(alpha=0.3)
+    axes.margins(x=0.0)
+    axes.legend(fontsize="small", loc="upper right", ncols=3)
+
+
+_SPEEDS = {"bit_rad_s": ("bit", OURS, "-"), "top_rad_s": ("top drive", QUIET, "-"), "set_rad_s": ("set", DARK, "--")}
+
+
+def draw_course(figure: FigureBase, rows: FloatArray) -> None:
+    """All of it: every column spans all that was in its time."""
+    of = _columns(rows)
+    time = of["time_s"] - of["time_s"][0]
+    above, below = figure.subplots(2, 1, sharex=True)
+    speeds, torques = (("bit_rad_s", OURS), ("top_rad_s", QUIET)), (("string_nm", OURS), ("drive_nm", QUIET))
+    for axes, scale, signals in ((above, RPM, speeds), (below, 1e3, torques)):
+        for name, colour in signals:
+            at, low, high = envelope(time, of[name] / scale)
+            axes.fill_between(at, low, high, color=colour, edgecolor=colour, lw=0.6, alpha=0.8,
+                              label=_SPEEDS[name][0] if name in _SPEEDS else name.removesuffix("_nm"))
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.0)
+    at, low, _ = envelope(time, of["set_rad_s"] / RPM)
+    above.plot(at, low, color=DARK, ls="--", lw=1.0, label="set")
+    above.set_ylabel("rpm")
+    below.set(xlabel="time, s", ylabel="torque, kN·m")
+    for axes in (above, below):
+        axes.legend(fontsize="small", loc="upper right", ncols=3)

@@ -281,4 +281,4 @@ def load_what_the_end_needs(report: bool) -> None:
     with Console(file=io.StringIO()).status(""):
         pass      # rich loads its spinners when it needs them
     if report:
-        from tdhil.report import draw_run, require_extra  # noqa: F401
+        from tdhil.report import draw_run, evaluation_report, require_extra  # noqa: F401

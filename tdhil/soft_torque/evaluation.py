@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from math import inf, pi, sqrt
+from math import inf, pi
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from profiles import TdhilError
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
-from tdhil.soft_torque.tuning import Interval
+from tdhil.soft_torque.tuning import Interval, lowest_modes_below_hz
 from tdhil.soft_torque.virtual_string import COLUMNS, Phase, Program, Rig
 
 LOWEST_RATE_HZ = 20.0
@@ -240,7 +240,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: Program) -> Evaluation:
     unknown = float(np.sqrt(np.mean(column["unknown_nm"][coupled] ** 2))) if coupled.any() else 0.0
     clamped = int(column["clamped"].sum())
     foreign = unknown / max(1e-9, float(np.sqrt(np.mean(net[coupled] ** 2)))) if coupled.any() else 0.0
-    outcome, why = _verdict(case, clamped, foreign, did_stick, critical, decay, unknown)
+    reached = float(set_rad_s.max())
+    outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached)
     return Evaluation(
         outcome, why, critical, ramp, trials, _rms(column["drive_nm"][holding]),
         _rms(column["drive_nm"][steady][-round(10.0 / period_s) :]), None if decay is None else decay[0],
@@ -250,8 +251,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: Program) -> Evaluation:
 
 
 def _verdict(
-    case: EvaluationCase, clamped: int, foreign: float, did_stick: bool, critical: Interval | None,
-    decay: tuple[float, float] | None, unknown_nm: float,
+    case: EvaluationCase, program: Program, clamped: int, foreign: float, did_stick: bool, critical: Interval | None,
+    decay: tuple[float, float] | None, unknown_nm: float, reached: float,
 ) -> tuple[Outcome, str]:
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
     if clamped:
@@ -264,6 +265,8 @@ def _verdict(
     if not did_stick:
         return Outcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
     if critical is None:
+        if reached < program.highest_rad_s - 0.5 * RPM:
+            return Outcome.NOT_FOUND, f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning"
         return Outcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
     off = max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
     words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
@@ -315,11 +318,11 @@ def _decay(rows: Array, case: EvaluationCase, period_s: float) -> tuple[float, f
     basis = np.linalg.svd(windows, full_matrices=False)[2][:DECAY_ORDER]
     steps = np.linalg.eigvals(np.linalg.pinv(basis[:, :-1].T) @ basis[:, 1:].T)
     poles = np.log(steps[np.abs(steps) > 1e-6]) / (each * period_s)
-    first, *others = case.prediction.string_modes_hz
-    second = others[0] if others else 4.0 * first
+    held = case.prediction.string_modes_hz
+    highest = lowest_modes_below_hz(held)
     swinging = [
         (-float(pole.real) / abs(pole), abs(pole) / (2.0 * pi)) for pole in poles
-        if pole.imag > 0.0 and 0.4 * first <= abs(pole) / (2.0 * pi) <= sqrt(first * second)
+        if pole.imag > 0.0 and 0.4 * held[0] <= abs(pole) / (2.0 * pi) <= highest
     ]
     return min(swinging, default=None)
 

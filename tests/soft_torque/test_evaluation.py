@@ -137,10 +137,11 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
     (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), Outcome.DIFFERS, "critical speed 66.1 rpm, predicted 56 to 59"),
     (rows(49.0, (49.5, 48.6), damping=0.22), Outcome.DIFFERS, "critical"),
     (rows(40.0, ()), Outcome.NOT_FOUND, "did not stick"),
-    (rows(99.0, (60.0, 70.0)), Outcome.NOT_FOUND, "never ended turning"),
+    (rows(99.0, (60.0, 70.0)), Outcome.NOT_FOUND, "ended at 70 rpm, before the bit had ended turning"),
+    (rows(99.0, (60.0, 79.0)), Outcome.NOT_FOUND, "never ended turning"),
     (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), Outcome.INVALID, "torque limit"),
     (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), Outcome.INVALID, "nobody commanded"),
-], ids=["higher", "lower", "never stuck", "never turned", "clamped", "another rig"])
+], ids=["higher", "lower", "never stuck", "cut short", "never turned", "clamped", "another rig"])
 def test_the_verdict(log, outcome, said):
     found = evaluate(log, CASE, PROGRAM)
     assert found.outcome is outcome and said in found.why
