@@ -1,4 +1,4 @@
-"""`tdhil identify --dry-run`: the plan and what may be expected of it. Connects to nothing, moves nothing."""
+"""`--dry-run`: the plan of a run and what may be expected of it. Connects to nothing, moves nothing."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 from profiles.quantities import RPM
 from tdhil.cli.results import print_json
 from tdhil.config import Rig, RunOptions
-from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_document, plan_dry
+from tdhil.session import BEFORE_ACQUIRE_S, Figure, plan_course, plan_document, plan_dry
+from tdhil.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from tdhil.run import MachineLimits, Planned
+    from tdhil.soft_torque import EvaluationCase
 
 
 def dry_run(
@@ -37,6 +39,45 @@ def dry_run(
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)
+    return 0
+
+
+def dry_run_course(
+    options: RunOptions, rig: Rig | None, case: EvaluationCase, simulated: bool, rate_hz: float
+) -> int:
+    """A virtual string's course within the limits; exit code 0. Raises what a run would raise before it moves."""
+    program, limits = plan_course(case, rig, simulated, rate_hz)
+    ratio = case.rig.gear_ratio
+    plain = {
+        "dry_run": True, "controller": case.prediction.kind, "rate_hz": rate_hz,
+        "set_speed_rad_s": {"min": program.start_rad_s, "max": program.highest_rad_s},
+        "moving_torque_nm": program.peak_nm * case.scale, "duration_s": program.longest_s,
+        "limits": {"speed_min_rad_s": limits.speed_min_rad_s, "speed_max_rad_s": limits.speed_max_rad_s,
+                   "torque_nm": limits.torque_nm, "time_s": limits.time_s},
+        "tdhil": __version__,
+    }
+    if options.json:
+        print_json(plain)
+        return 0
+    from rich.text import Text
+
+    from tdhil.report import PlainConsole
+
+    console = PlainConsole()
+    console.print(Text("DRY RUN: nothing is connected to, nothing moves", style="magenta"))
+    table = _table(f"stage 5: virtual string, {case.prediction.kind} controller, {rate_hz:g} cycles a second")
+    for heading in ("", "planned", "limit"):
+        table.add_column(heading, overflow="fold")
+    table.add_row(
+        "set speed", f"{RPM.of_si(program.start_rad_s):.1f} to at most {RPM.of_si(program.highest_rad_s):.1f} rpm, "
+        "main shaft", f"{RPM.of_si(limits.speed_min_rad_s / ratio):.4g} to "
+        f"{RPM.of_si(limits.speed_max_rad_s / ratio):.4g} rpm for the top's swing",
+    )
+    table.add_row("torque on the rotor", f"up to {plain['moving_torque_nm']:.0f} N·m, and friction",
+                  f"±{limits.torque_nm:g} N·m")
+    table.add_row("time, s", f"{program.longest_s:.0f} at the longest (+ about {BEFORE_ACQUIRE_S:.0f})",
+                  f"{limits.time_s:g}")
+    console.print(table)
     return 0
 
 

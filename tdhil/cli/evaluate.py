@@ -23,10 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                       "its torque offset")
     what.add_argument("--result", type=Path, metavar="result.json",
                       help="of tdhil identify on the rig that turns, where that isn't the machine that was tuned for")
+    what.add_argument("--dry-run", action="store_true",
+                      help="lay the course within the rig's limits, or say what keeps it; nothing moves")
     what.add_argument("--report", type=Path, metavar="FILE",
                       help="the result with pictures in one file: evaluation.html, or evaluation.pdf on A4")
     add_peer_arguments(parser)
-    parser.set_defaults(run=run, dry_run=False)
+    parser.set_defaults(run=run)
 
 
 def run(namespace: argparse.Namespace) -> int:

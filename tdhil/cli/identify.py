@@ -133,9 +133,9 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
 
     Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
     """
-    from tdhil.cli.dry_run import dry_run
+    from tdhil.cli.dry_run import dry_run, dry_run_course
     from tdhil.report import stderr_console
-    from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, with_faults
+    from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -153,6 +153,12 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     _check_files(namespace, options)
     if namespace.dry_run:
         simulated = options.simulate or not connection.configured
+        if evaluation is not None:
+            bench = suited(rig, plan_peer(options, connection).plant)
+            profile = connection.profile
+            usual = profile.cycle if profile.bus == "modbus" else profile.cyclic
+            rate_hz = options.rate_hz or usual.rate_hz
+            return dry_run_course(options, bench, evaluation, simulated, rate_hz)
         lets_go = connection.profile.quick_stop.ends == "off"
         return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         MachineLimits as MachineLimits, StopRequest as StopRequest,
     )
     from tdhil.run.speed_check import speed_warnings as speed_warnings
+    from tdhil.run.stages import course_of as course_of
     from tdhil.run.stage_log import stage_warnings as stage_warnings
     from tdhil.run.stop import not_confirmed as not_confirmed
     from tdhil.run.task import (

@@ -39,10 +39,10 @@ from tdhil.run.stages import (
     MeanSpeedControl,
     SpeedResult,
     TorqueResult,
+    course_of,
     go_to,
     measure_offsets,
     probe_sign,
-    refuse_longer,
     refuse_other_rig,
     run_hold,
     run_offset,
@@ -55,7 +55,7 @@ from tdhil.run.stages import (
 )
 from tdhil.run.stop import StopReport, StopSequence
 from tdhil.run.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
-from tdhil.soft_torque import EvaluationCase, Program, Window, program_for, refuse_untrue
+from tdhil.soft_torque import EvaluationCase, Program
 
 
 def _nothing(text: str) -> None:
@@ -209,23 +209,13 @@ class Runner:
 
     def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> Program:
         """The virtual string's course, before anything moves. Raises what refuses it."""
-        limits = task.limits
-        if limits.load != "none":
-            raise PreflightRefused(
-                f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
-                next_step="Evaluate before the string is below the drive",
-            )
         if case.own_loop and preflight.torque_offset_resolution_nm <= 0.0:
             raise PreflightRefused(
                 "the drive has no torque offset that its profile knows of, through which the string could reach it",
                 where="--own-loop", next_step="Leave --own-loop out: the host's controller in torque mode needs none",
             )
-        refuse_untrue(case, loop.period_s)
-        window = Window(
-            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(task.assumptions)
-        )
-        program = loop.compute(partial(program_for, case, window), Command(Mode.SPEED, 0.0, 0.0))
-        refuse_longer(program, limits)
+        course = partial(course_of, case, task.limits, loop.period_s, Guard.foresight_s(task.assumptions))
+        program = loop.compute(course, Command(Mode.SPEED, 0.0, 0.0))
         self._log.configure(evaluation={"case": case.plain(), "program": asdict(program)})
         return program
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     )
     from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
     from tdhil.session.plan_ahead import (
-        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_document as plan_document, plan_dry as plan_dry,
+        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_course as plan_course,
+        plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.recorded import (
         RunRecord as RunRecord, is_log as is_log, read as read,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from tdhil.session.stop_signals import stop_on_signals as stop_on_signals
     from tdhil.session.task import (
         bench_of as bench_of, excitation_request as excitation_request, facts as facts,
-        machine_limits as machine_limits, stated_lags as stated_lags,
+        machine_limits as machine_limits, stated_lags as stated_lags, suited as suited,
     )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from tdhil.run import Knowledge, MachineLimits, Planned, excitation
     from tdhil.run.excitation import RigGuess
+    from tdhil.soft_torque import EvaluationCase, Program
 
 
 SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
@@ -58,6 +59,17 @@ def plan_dry(
             str(error), where="plan of stage 5", next_step=error.next_step
         ) from error
     return planned, figures, limits
+
+
+def plan_course(
+    case: EvaluationCase, rig: Rig | None, simulated: bool, rate_hz: float
+) -> tuple[Program, MachineLimits]:
+    """A virtual string's course, and the machine's limits. Raises what keeps it from being turned."""
+    from tdhil.run import ControlAssumptions, Guard, course_of
+
+    limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig))
+    assumptions = ControlAssumptions().at_period(1.0 / rate_hz)
+    return course_of(case, limits, 1.0 / rate_hz, Guard.foresight_s(assumptions)), limits
 
 
 def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:

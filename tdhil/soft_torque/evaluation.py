@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from math import inf, pi
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -136,14 +136,12 @@ def program_for(case: EvaluationCase, window: Window) -> Program:
     top = trace.top_rad_s[:, 0] * ratio
     rate = np.gradient(top, trace.time_s, axis=0)
     ahead = top + window.foresight_s * rate
-    lowest, highest = np.minimum(top, np.maximum(ahead, 0.0)).min(axis=0), np.maximum(top, ahead).max(axis=0)
+    highest = np.maximum(top, ahead).max(axis=0)
     backwards = ahead.min(axis=0) < -0.01 * window.highest_rad_s
     bearable = [k for k in range(len(below)) if top[:, k].min() > window.lowest_rad_s and not backwards[k]]
     if not bearable:
-        raise EvaluationRefused(
-            f"the top swings down to {lowest[:-1].max() / ratio / RPM:.1f} rpm before the bit turns: this window "
-            f"begins at {window.lowest_rad_s / ratio / RPM:.1f} rpm, and the shaft must not be about to turn back",
-            where="limits.speed_min_rad_s", next_step="Lower it, or take a stiffer controller (--use)")
+        forward = [float(top[:, k].min()) for k in range(len(below)) if not backwards[k]]
+        _refuse_low(case, window, max(forward, default=0.0))
     room = window.highest_rad_s - float(highest[-1]) + cure.high * RPM * ratio
     if room < (cure.high + TOLERANCE_RPM) * RPM * ratio:
         raise EvaluationRefused(
@@ -163,6 +161,21 @@ def program_for(case: EvaluationCase, window: Window) -> Program:
     if case.own_loop:      # which has to make up for the string's torque by itself
         program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
     return program
+
+
+def _refuse_low(case: EvaluationCase, window: Window, lowest_rad_s: float) -> NoReturn:
+    """At every set speed at which the bit shall stick the top swings too low, at the best to ``lowest_rad_s``."""
+    if lowest_rad_s <= 0.0:
+        raise EvaluationRefused(
+            f"a top drive of {case.meant.inertia_kg_m2:.4g} kg·m² at the main shaft is so light beside this string and "
+            f"bit that the {case.prediction.kind} controller would let it be about to turn back before the bit turns",
+            where="--use", next_step="Take a stiffer one; or tune for a heavier machine, with its own result, and name "
+            "this rig's by --result: the string's torques are scaled to it")
+    raise EvaluationRefused(
+        f"the top swings down to {lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm before the bit turns; this window "
+        f"begins at {window.lowest_rad_s / case.rig.gear_ratio / RPM:.1f} rpm",
+        where="limits.speed_min_rad_s",
+        next_step=f"Set it to {0.95 * lowest_rad_s:.2g} rad/s or less, or take a stiffer controller (--use)")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

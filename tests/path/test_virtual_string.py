@@ -12,13 +12,8 @@ import pytest
 from tests.path.path_runs import Shaft, host, peer, tdhil, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-PLANT = """plant: {kind: rigid, inertia_kg_m2: 1500, viscous_nm_s_rad: 8, coulomb_nm: 60}
-drive: {rated_torque_nm: 20000, torque_limit_nm: 30000, speed_limit_rpm: 250, speed_gain_nm_s_rad: 6000,
-        speed_integral_gain_nm_rad: 4000}
-"""
-RIG = """limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 15, torque_nm: 15000, probe_torque_nm: 1000,
-         probe_travel_rad: 3, time_s: 1500, quick_stop_rad_s2: 2, watchdog_s: 0.5}
-"""
+PLANT = (EXAMPLES / "plant_top_drive.yaml").read_text(encoding="utf-8")
+RIG = (EXAMPLES / "rig_top_drive.yaml").read_text(encoding="utf-8")
 
 
 def interval(value, low, high):
@@ -86,15 +81,16 @@ def test_a_soft_controller_does_on_the_drive_what_tune_says_and_its_log_says_the
     assert shaft.speed_rad_s.min() > -0.1      # a heavy shaft swings in behind the drive's own stop
     again = tdhil("replay", files / "run.mcap", "--json")
     assert (again.code, again.document) == (0, document)
-    assert "as predicted" in tdhil("replay", files / "run.mcap").out
+    page = files / "page.html"
+    assert "as predicted" in tdhil("replay", files / "run.mcap", "--report", page).out
+    assert page.read_text(encoding="utf-8").count("<svg") == 3
 
 
 @pytest.mark.heavy
 def test_the_drives_own_loop_does_what_tune_says_of_its_gains(files):
     """The string through 60B2h; the gains are the plant's."""
-    gains = "speed_gain_nm_s_rad: 1186, speed_integral_gain_nm_rad: 1000"
-    text = PLANT.replace("speed_gain_nm_s_rad: 6000,\n        speed_integral_gain_nm_rad: 4000", gains)
-    assert gains in text
+    text = PLANT.replace("_nm_s_rad: 6000.0", "_nm_s_rad: 1186").replace("_nm_rad: 4000.0", "_nm_rad: 1000")
+    assert "gain_nm_s_rad: 1186\n" in text and "gain_nm_rad: 1000\n" in text
     (files / "plant.yaml").write_text(text)
     done = evaluate(files, "--own-loop")
     document = done.document
@@ -147,6 +143,37 @@ def test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_dr
     replayed = tdhil("replay", "--json", done.log)
     assert replayed.code == 9, replayed.err
     assert replayed.document["verdict"] == "not_found" and replayed.document["complete"] is False
+
+
+def test_the_shipped_example_has_room_for_the_string(files):
+    """Laid dry: the files of the page, as they are."""
+    done = evaluate(files, "--dry-run")
+    assert done.code == 0, done.err
+    assert done.document["set_speed_rad_s"]["min"] * 30.0 / np.pi == pytest.approx(44.0, abs=0.1)
+    assert done.document["moving_torque_nm"] < 0.95 * done.document["limits"]["torque_nm"]
+    assert done.document["duration_s"] < done.document["limits"]["time_s"]
+    assert not (files / "run.mcap").exists()
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    (("inertia_kg_m2", interval(104.0, 100.0, 108.0)), "a top drive of 104 kg·m² at the main shaft is so light"),
+    (("speed_min_rad_s", 4.0), "Set it to"),
+    (("load", "string"), "load is string"),
+])
+def test_a_dry_run_names_what_keeps_the_string_from_being_turned(files, change, said):
+    key, value = change
+    if key == "inertia_kg_m2":
+        document = json.loads((files / "tune.json").read_text())
+        document["main_shaft"][key] = document["identified"][key] = value
+        document["controllers"][0]["at_main_shaft"]["gain_nm_s_rad"] = 459.0
+        (files / "tune.json").write_text(json.dumps(document))
+    elif key == "speed_min_rad_s":
+        (files / "rig.yaml").write_text(RIG.replace("speed_min_rad_s: 0.5", f"speed_min_rad_s: {value}"))
+    else:
+        hangs = "load: {kind: string}\nmake_up_torque_nm: 20000\ntorque_ramp_nm_s: 100\n"
+        (files / "rig.yaml").write_text(RIG + hangs)
+    done = evaluate(files, "--dry-run")
+    assert done.code == 4 and said in " ".join(done.err.split()), done.err
 
 
 @pytest.mark.parametrize(("more", "rate", "code", "said"), [

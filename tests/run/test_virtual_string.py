@@ -35,7 +35,7 @@ class RowsLog(FakeLog):
 def course(monkeypatch):
     """Already laid: what lays it simulates for a second."""
     laid = Program(45.0 * RPM, 79.0 * RPM, peak_nm=7000.0)
-    monkeypatch.setattr("tdhil.run.runner.program_for", lambda case, window: laid)
+    monkeypatch.setattr("tdhil.run.stages.virtual_string.program_for", lambda case, window: laid)
 
 
 def runner(here, case=BENCH, limits=ROOM):

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tdhil.run.stages.speed import Course as Course, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.run.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
     from tdhil.run.stages.virtual_string import (
-        go_to as go_to, refuse_longer as refuse_longer, refuse_other_rig as refuse_other_rig,
+        course_of as course_of, go_to as go_to, refuse_other_rig as refuse_other_rig,
         run_virtual_string as run_virtual_string,
     )
 else:

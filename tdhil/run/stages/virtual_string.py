@@ -18,7 +18,16 @@ from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import MachineLimits
 from tdhil.run.stages.steady import wait_until_steady
-from tdhil.soft_torque import RPM, EvaluationCase, HostLoop, Phase, Program
+from tdhil.soft_torque import (
+    RPM,
+    EvaluationCase,
+    HostLoop,
+    Phase,
+    Program,
+    Window,
+    program_for,
+    refuse_untrue,
+)
 
 STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
 """Of the speed limit, counts of the reported speed, and standard deviations of its noise: by the most of these the
@@ -46,14 +55,23 @@ _TOLD = {
 Keep = Callable[[Sequence[float]], None]
 
 
-def refuse_longer(program: Program, limits: MachineLimits) -> None:
-    """PreflightRefused where the time limit has no room for the course."""
+def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, foresight_s: float) -> Program:
+    """The virtual string's course within the limits. Raises PreflightRefused or EvaluationRefused, and says why."""
+    if limits.load != "none":
+        raise PreflightRefused(
+            f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
+            next_step="Evaluate before the string is below the drive",
+        )
+    refuse_untrue(case, period_s)
+    window = Window(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
+    program = program_for(case, window)
     needed_s = program.longest_s + BEFORE_S + RESERVE_S
     if needed_s > limits.time_s:
         raise PreflightRefused(
             f"the virtual string takes up to {needed_s:.0f} s, and the run may take {limits.time_s:g} s",
             where="limits.time_s in rig.yaml", next_step="Raise it",
         )
+    return program
 
 
 def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
