@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from profiles import STAGE_NUMBERS, TdhilError
 
@@ -85,12 +85,14 @@ class Schedule:
         return inf if began is None else began + round(1e6 * fault.at.after_s)
 
 
-class Passing(Protocol):
-    """A fault that starts and is over."""
+class Passing:
+    """A fault that starts and is over; what either does is its own."""
 
-    def begin(self) -> None: ...
+    def begin(self) -> None:
+        """It starts."""
 
-    def end(self) -> None: ...
+    def end(self) -> None:
+        """It is over."""
 
 
 F = TypeVar("F", bound=Passing)

@@ -12,7 +12,6 @@ each 0.25 s of wall time, so that a reader sees a stop while it happens.
 
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from profiles import TdhilError
@@ -82,6 +81,5 @@ class Trace:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 where: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -18,7 +18,7 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_script import Cast, Kind, Kinds, Scripted, factor, plain, seconds, share
+from sim_bus.fault_script import Cast, Kind, Kinds, Passing, Scripted, factor, plain, seconds, share
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -42,16 +42,10 @@ class Scene:
         self.node.on_frame(can_id, data)
 
 
-class Misbehaviour:
+class Misbehaviour(Passing):
     """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
 
     scene: Scene
-
-    def begin(self) -> None:
-        """It starts."""
-
-    def end(self) -> None:
-        """It is over."""
 
     def outgoing(self, can_id: int, data: bytes) -> Frames:
         """What becomes of a frame that the drive sends."""

@@ -7,7 +7,6 @@ control time, until the reply is complete, and that wait is what moves the plant
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -187,8 +186,7 @@ class EmbeddedModbusDrive:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 where: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -17,7 +17,19 @@ import numpy as np
 from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
 from sim_bus.cia402 import Mode
-from sim_bus.fault_script import Cast, FaultRefused, Kind, Kinds, KnownFault, Moment, Scripted, factor, plain, share
+from sim_bus.fault_script import (
+    Cast,
+    FaultRefused,
+    Kind,
+    Kinds,
+    KnownFault,
+    Moment,
+    Passing,
+    Scripted,
+    factor,
+    plain,
+    share,
+)
 from sim_bus.modbus.codec import NONE, Reply
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong, parse
@@ -39,16 +51,10 @@ class Scene:
     rng: np.random.Generator
 
 
-class Misbehaviour:
+class Misbehaviour(Passing):
     """Nothing by itself; a fault overrides what it needs. `begin` comes before anything else."""
 
     scene: Scene
-
-    def begin(self) -> None:
-        """It starts."""
-
-    def end(self) -> None:
-        """It is over."""
 
     def asked(self, pdu: bytes, ask: Ask) -> Reply:
         """A request comes; ``ask`` is what would happen to it without this fault."""

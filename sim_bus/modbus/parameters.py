@@ -1,8 +1,9 @@
 """The simulated drive's parameters: what each counts in, and what it does. What they start with: `starting`."""
 
 
+from __future__ import annotations
+
 from math import inf, pi
-from typing import Protocol
 
 from profiles import Require, TdhilError
 from profiles.modbus import ModbusProfile, Parameter
@@ -51,15 +52,7 @@ _TIME_OUT_S = 0.5
 """Of a watchdog that the host can't set."""
 
 
-class Store(Protocol):
-    """What is filled: `sim_bus.modbus.parameters.Parameters`."""
-
-    def put(self, name: str, value: float) -> None: ...
-    def value(self, name: str) -> float: ...
-    def in_unit(self, si: float, unit: str) -> float: ...
-
-
-def start(store: Store, profile: ModbusProfile, rig: RigParams) -> float:
+def start(store: Parameters, profile: ModbusProfile, rig: RigParams) -> float:
     """Gives every parameter its first value; returns the rated speed, rpm. TdhilError where the rig doesn't fit."""
     plate = profile.name_plate
     torque_names = {name for name in (profile.rated_torque, plate and plate.torque) if name}
@@ -78,7 +71,7 @@ def start(store: Store, profile: ModbusProfile, rig: RigParams) -> float:
     return rated_rpm
 
 
-def _put_exactly(store: Store, profile: ModbusProfile, name: str, value: float) -> None:
+def _put_exactly(store: Parameters, profile: ModbusProfile, name: str, value: float) -> None:
     store.put(name, value)
     told = store.value(name)
     if abs(told - value) > _NEAR_ENOUGH * value:
@@ -104,7 +97,9 @@ def _fitting_rated_rpm(profile: ModbusProfile, rig: RigParams) -> float:
     return rpm
 
 
-def _initial(store: Store, profile: ModbusProfile, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
+def _initial(
+    store: Parameters, profile: ModbusProfile, rig: RigParams, parameter: Parameter, rated_rpm: float
+) -> float:
     lag_s = _lag_s(profile, rig, parameter.name)
     if lag_s is not None:
         wanted = lag_s if parameter.unit != "hz" else 1.0 / (2.0 * pi * lag_s) if lag_s else inf
@@ -127,7 +122,7 @@ def _lag_s(profile: ModbusProfile, rig: RigParams, name: str) -> float | None:
     return None
 
 
-def _of_rig(store: Store, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
+def _of_rig(store: Parameters, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
     drive = rig.drive
     kind = parameter.register_.type if parameter.register_ is not None else "i32"
     sign = -1.0 if kind[0] == "i" else 1.0

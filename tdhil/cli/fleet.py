@@ -19,7 +19,7 @@ from tdhil.errors import ExitCode, UsageError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tdhil.fleet import FleetRequest, FleetRow, FleetSummary, Progress
+    from tdhil.fleet import FleetRequest, FleetRow, FleetSummary
 
 _SHOWN = 10         # failures, changes: more stand in the table
 
@@ -261,8 +261,3 @@ def _result_text(row: FleetRow) -> str:
     low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
     part = "" if row.part_text is None else f", {row.part_text}"
     return f"{row.verdict}, J {row.inertia_kg_m2:.5g} ({low:.5g} to {high:.5g}) kg·m²{part}"
-
-
-if TYPE_CHECKING:
-    def _is_a_progress(bar: _Bar) -> Progress:
-        return bar

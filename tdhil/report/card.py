@@ -120,17 +120,13 @@ def impedance_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         least = min(seen, key=lambda point: float(point["reflection_total"]["value"]))
         told = dict.fromkeys([min(seen, key=lambda point: abs(float(point["hertz"]) - hertz))["hertz"]
                               for hertz in (0.1, 0.2, 0.5)])
-        parts = [f"{point['hertz']:.2g} Hz: {_short(point['reflection_total'])}" for point in seen
+        parts = [f"{point['hertz']:.2g} Hz: {_plus_minus(point['reflection_total'])}" for point in seen
                  if point["hertz"] in told]
-        yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {_short(least['reflection_total'])}"
+        yield "|r| at the string", f"least at {least['hertz']:.2g} Hz: {_plus_minus(least['reflection_total'])}"
         yield "", "   ".join(parts)
 
 
 _BY = {"offset": "torque offset", "reference": "speed reference"}
-
-
-def _short(part: Mapping[str, Any]) -> str:
-    return plus_minus(part["value"], 0.5 * (part["high"] - part["low"]))
 
 
 def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
@@ -234,9 +230,9 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
         body += [budget_table(document["budget"], inertia["value"]), Text()]
-    body.append(Text(_sentence(document["reason"])))
+    body.append(Text(sentence(document["reason"])))
     if document["advice"]:
-        body.append(Text(_sentence(document["advice"]), style="italic"))
+        body.append(Text(sentence(document["advice"]), style="italic"))
     body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
     title = "moment of inertia at the motor shaft" + (f" · {SIMULATED}" if document["simulated"] else "")
@@ -256,8 +252,9 @@ def _paper_text(paper: Mapping[str, Any], inertia: Mapping[str, Any] | None) -> 
     return f"{paper['inertia_kg_m2']:.5g} kg·m²  ({'; '.join(parts)})"
 
 
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+def sentence(text: str) -> str:
+    """With a capital and a full stop; nothing where there is nothing."""
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""
 
 
 def print_card(document: Mapping[str, Any], console: Console) -> None:

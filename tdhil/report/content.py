@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
-from tdhil.report.card import estimate_text, inertia_text, minutes, plus_minus, rounded
+from tdhil.report.card import estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import SIMULATED
 
 if TYPE_CHECKING:
@@ -153,13 +153,9 @@ def _answer(document: Part) -> Answer:
         value=value,
         lines=tuple(lines),
         verdict=_VERDICTS.get(document["verdict"], str(document["verdict"])),
-        reason=_sentence(document["reason"]),
-        advice=_sentence(document["advice"]),
+        reason=sentence(document["reason"]),
+        advice=sentence(document["advice"]),
     )
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".") if text else ""
 
 
 def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Section]:
@@ -281,6 +277,10 @@ _COMPLIANT = (
 )
 
 
+_QUANTITIES = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
+               Column("to", 0.12, True), Column("unit", 0.12))
+
+
 def _numbers(document: Part) -> Iterator[Block]:
     """Every estimate, the interval to quote first."""
     rows: list[tuple[str, ...]] = []
@@ -301,9 +301,7 @@ def _numbers(document: Part) -> Iterator[Block]:
         for title, key, unit in _COMPLIANT:
             add(title, shaft[key], unit)
     if rows:
-        columns = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
-                   Column("to", 0.12, True), Column("unit", 0.12))
-        yield Table(columns, tuple(rows))
+        yield Table(_QUANTITIES, tuple(rows))
         yield Text("Where nothing is said of the torque scale it is taken for exact: such intervals compare runs on "
                    "this drive.")
 
@@ -325,10 +323,8 @@ def _impedance(found: Part) -> Iterator[Block]:
         for title, key, unit in _LOOP if (part := found[key]) is not None
     ]
     if rows:
-        columns = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
-                   Column("to", 0.12, True), Column("unit", 0.12))
-        yield Table(columns, tuple(rows))
-    yield Text(f"{found['verdict']}: {_sentence(found['reason'])} {_sentence(found['advice'])}".strip())
+        yield Table(_QUANTITIES, tuple(rows))
+    yield Text(f"{found['verdict']}: {sentence(found['reason'])} {sentence(found['advice'])}".strip())
     yield Text("Conditional on: " + "; ".join(found["conditions"]) + ".")
 
 
@@ -347,8 +343,8 @@ _LOOP = (
 def _opinions(document: Part) -> Iterator[Block]:
     words = {True: "agrees", False: "does not agree", None: "nothing to compare with"}
     for one in document["second_opinions"]:
-        yield Text(f"{_sentence(one['route'])[:-1]}: {estimate_text(one['inertia_kg_m2'], 'kg·m²')}, "
-                   f"{words[one['agrees']]}. {_sentence(one['note'])}")
+        yield Text(f"{sentence(one['route'])[:-1]}: {estimate_text(one['inertia_kg_m2'], 'kg·m²')}, "
+                   f"{words[one['agrees']]}. {sentence(one['note'])}")
 
 
 def _budget(document: Part) -> Table:

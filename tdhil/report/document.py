@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from tdhil.estimation import Identification, InertiaEstimate, LineFit
+from tdhil.estimation import Identification, InertiaEstimate
 from tdhil.recording import Recording
 from tdhil.version import __version__
 
@@ -64,7 +64,7 @@ def result_document(
         "tdhil": __version__,
     }
     if found.paper is not None:
-        document["paper"] = _line_fit(found.paper.stepped) | {"raw_rate": _line_fit(found.paper.raw_rate)}
+        document["paper"] = asdict(found.paper.stepped) | {"raw_rate": asdict(found.paper.raw_rate)}
     cleaned = _finite(document)
     assert isinstance(cleaned, dict)
     return cleaned
@@ -124,13 +124,10 @@ def _inertia(inertia: InertiaEstimate | None) -> dict[str, Any] | None:
     if inertia is None:
         return None
     found = asdict(inertia)
-    total, repeatability = (half / inertia.value for half in _halves(inertia))
+    total = 0.5 * (inertia.high_total - inertia.low_total) / inertia.value
+    repeatability = 0.5 * (inertia.high - inertia.low) / inertia.value
     first = {name: found.pop(name) for name in ("value", "low_total", "high_total")}
     return first | {"half_width_total_rel": total} | found | {"repeatability_rel": repeatability}
-
-
-def _halves(inertia: InertiaEstimate) -> tuple[float, float]:
-    return 0.5 * (inertia.high_total - inertia.low_total), 0.5 * (inertia.high - inertia.low)
 
 
 def _at_main_shaft(inertia: InertiaEstimate | None, gear_ratio: float) -> dict[str, float] | None:
@@ -163,10 +160,6 @@ def _compliant(found: Identification) -> dict[str, Any] | None:
 
 def _estimate(estimate: Any) -> dict[str, float] | None:
     return None if estimate is None else asdict(estimate)
-
-
-def _line_fit(fit: LineFit) -> dict[str, float]:
-    return asdict(fit)
 
 
 def _finite(value: Any) -> Any:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import Event
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 from drivers import Command, Drive, DriveFault, KeptAlive, Mode, ModeNotConfirmed, PowerState, Sample, Telling
+from tdhil.recording import RunLog
 from tdhil.run.background import Background, Reckoner
 from tdhil.run.guard import Guard
 from tdhil.run.settings import StopRequest
@@ -22,16 +23,6 @@ SWITCH_CYCLES = 10
 
 NO_RECKONER = "arithmetic goes on in a thread beside the control loop, not in a process of its own"
 """Said in the log, with the reason. Cycles may be late meanwhile, and it is no more than that."""
-
-
-class RunLog(Protocol):
-    """Where a run is written as it goes (record room); `cycle` is called once per exchange."""
-
-    def cycle(self, command: Command, sample: Sample) -> None: ...
-
-    def event(self, time_s: float, kind: str, text: str) -> None: ...
-
-    def configure(self, **run: Any) -> None: ...
 
 
 Watcher = Callable[[Command, Sample], None]

@@ -57,6 +57,32 @@ class StringReleaseLimits:
         return max(RESIDUAL_SHARE * self.torque_nm, RESIDUAL_QUANTA * self.torque_resolution_nm)
 
 
+class _Impedance:
+    """Z, N·m·s/rad: the torque limit over half the speed limit, doubled when the torque swings faster than a string.
+
+    An oscillation whose half swing is shorter than ``fastest_s`` is the loop's own.
+    """
+
+    def __init__(self, torque_limit_nm: float, speed_limit_rad_s: float, residual_nm: float, fastest_s: float) -> None:
+        self.nm_s_rad = torque_limit_nm / (IMPEDANCE_SPEED_SHARE * speed_limit_rad_s)
+        self._stiffest = STIFFEST * self.nm_s_rad
+        self._residual_nm = residual_nm
+        self._fastest_s = fastest_s
+        self._side = 0.0               # of zero, on which the torque was last seen clear of it
+        self._since_side_s = 0.0
+
+    def watch(self, torque_nm: float, period_s: float) -> None:
+        """One cycle's torque."""
+        self._since_side_s += period_s
+        if abs(torque_nm) <= self._residual_nm:
+            return
+        side = math.copysign(1.0, torque_nm)
+        if side != self._side:
+            if self._side and self._since_side_s < self._fastest_s:
+                self.nm_s_rad = min(2.0 * self.nm_s_rad, self._stiffest)
+            self._side, self._since_side_s = side, 0.0
+
+
 class StringRelease:
     """Fed with every fresh sample; says how fast to yield, and when nothing is left."""
 
@@ -65,12 +91,9 @@ class StringRelease:
         self._at_rest_rad_s = at_rest_rad_s
         self._period_s = period_s
         self._fastest_rad_s = SPEED_SHARE * limits.speed_rad_s
-        self._impedance = limits.torque_nm / (IMPEDANCE_SPEED_SHARE * limits.speed_rad_s)
-        self._stiffest = STIFFEST * self._impedance
+        self._impedance = _Impedance(limits.torque_nm, limits.speed_rad_s, limits.residual_nm, FASTEST_SWING_S)
         self._recent: deque[float] = deque(maxlen=max(1, round(MEAN_S / period_s)))
         self._reference_nm: float | None = None
-        self._side = 0.0               # of zero, on which the torque was last seen clear of it
-        self._since_side_s = 0.0
         self._quiet_s = 0.0
         self._time_s = 0.0
         self.trapped_nm = 0.0
@@ -112,7 +135,7 @@ class StringRelease:
         self._reference_nm = max(0.0, self._reference_nm - self._limits.ramp_nm_s * self._period_s)
         calm = abs(held_nm) <= self._limits.residual_nm and abs(speed_rad_s) <= self._at_rest_rad_s
         self._quiet_s = self._quiet_s + self._period_s if calm else 0.0
-        self._watch_sign(held_nm)
+        self._impedance.watch(held_nm, self._period_s)
         speed = self._yielding(torque_nm)
         self.travel_rad += speed * self._period_s
         return speed
@@ -122,17 +145,7 @@ class StringRelease:
         # The ramp belongs to the side on which the torque was trapped; what swings to the other is let go at once.
         same_side = torque_nm * self.trapped_nm > 0.0
         excess_nm = max(0.0, abs(torque_nm) - (self._reference_nm if same_side else 0.0))
-        return -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance), torque_nm)
-
-    def _watch_sign(self, held_nm: float) -> None:
-        self._since_side_s += self._period_s
-        if abs(held_nm) <= self._limits.residual_nm:
-            return
-        side = math.copysign(1.0, held_nm)
-        if side != self._side:
-            if self._side and self._since_side_s < FASTEST_SWING_S:
-                self._impedance = min(2.0 * self._impedance, self._stiffest)
-            self._side, self._since_side_s = side, 0.0
+        return -math.copysign(min(self._fastest_rad_s, excess_nm / self._impedance.nm_s_rad), torque_nm)
 
 
 MEAN_TORQUE_S = 8.0
@@ -153,12 +166,11 @@ class SwingDamper:
         self._target_rad_s = target_rad_s
         self._most_rad_s = SPEED_SHARE * speed_limit_rad_s
         self._highest_rad_s = (1.0 - 0.5 * SPEED_SHARE) * speed_limit_rad_s
-        self._impedance = torque_limit_nm / (IMPEDANCE_SPEED_SHARE * speed_limit_rad_s)
-        self._stiffest = STIFFEST * self._impedance
-        self._residual_nm = RESIDUAL_SHARE * torque_limit_nm
+        residual_nm = RESIDUAL_SHARE * torque_limit_nm
+        self._impedance = _Impedance(torque_limit_nm, speed_limit_rad_s, residual_nm, LOOP_SWING_S)
         self._period_s = period_s
         self._seen = 0
-        self._mean_nm = self._smooth_nm = self._side = self._since_side_s = 0.0
+        self._mean_nm = self._smooth_nm = 0.0
 
     def step(self, torque_nm: float) -> float:
         """The speed, rad/s; anything not finite counts as unheard."""
@@ -170,23 +182,12 @@ class SwingDamper:
         self._mean_nm += max(1.0 / self._seen, self._period_s / MEAN_TORQUE_S) * (torque_nm - self._mean_nm)
         self._smooth_nm += self._period_s / (self._period_s + SMOOTH_S) * (torque_nm - self._smooth_nm)
         swing_nm = self._smooth_nm - self._mean_nm
-        self._watch_sign(swing_nm)
-        return self._bounded(-swing_nm / self._impedance)
+        self._impedance.watch(swing_nm, self._period_s)
+        return self._bounded(-swing_nm / self._impedance.nm_s_rad)
 
     def _bounded(self, deviation_rad_s: float) -> float:
         speed = self._target_rad_s + max(-self._most_rad_s, min(self._most_rad_s, deviation_rad_s))
         return max(0.0, min(max(self._target_rad_s, self._highest_rad_s), speed))
-
-    def _watch_sign(self, swing_nm: float) -> None:
-        """As `StringRelease`: an oscillation faster than any string's is the loop's own, and Z is doubled."""
-        self._since_side_s += self._period_s
-        if abs(swing_nm) <= self._residual_nm:
-            return
-        side = math.copysign(1.0, swing_nm)
-        if side != self._side:
-            if self._side and self._since_side_s < LOOP_SWING_S:
-                self._impedance = min(2.0 * self._impedance, self._stiffest)
-            self._side, self._since_side_s = side, 0.0
 
 
 LOOP_SWING_S = 0.5

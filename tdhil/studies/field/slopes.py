@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -296,24 +296,11 @@ def slope_of(identification: Identification, hertz: FloatArray) -> FloatArray | 
 # The picture of figure 22: left as in the paper, right what the four slopes have in common.
 
 
-class DrawnRecord(Protocol):
-    """What is drawn of one tone."""
-
-    @property
-    def hertz(self) -> float: ...
-
-    @property
-    def points(self) -> Scatter: ...
-
-    @property
-    def published(self) -> tuple[float | None, float | None]: ...
-
-
 @dataclass(frozen=True)
 class SlopePicture:
     """All that is drawn; ``true_inertia`` is the simulated rig's, kg·m²."""
 
-    records: Sequence[DrawnRecord]
+    records: Sequence[Record]
     joint: Identification
     true_inertia: float
 
