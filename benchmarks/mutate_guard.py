@@ -79,7 +79,7 @@ SUBJECTS = {
     ),
     "acquire": _run(
         "stages/acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_adaptive_duration.py",
-        within="AcquireResult Follower run_acquire _dither_of _Course",
+        within="Follower run_acquire _dither_of _Course",
     ),
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"

@@ -12,7 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from tdhil.report.console import PlainConsole
+from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -194,9 +194,7 @@ _VERDICT_STYLE = {
 
 def result_card(document: Mapping[str, Any]) -> RenderableType:
     """A panel of the result document."""
-    rows = Table.grid(padding=(0, 2))
-    rows.add_column(style="dim", no_wrap=True)
-    rows.add_column(overflow="fold")
+    rows = names_and_texts(())
     verdict = document["verdict"]
     rows.add_row("verdict", Text(verdict, style=_VERDICT_STYLE.get(verdict, "bold")))
     inertia = document["inertia_kg_m2"]

@@ -7,6 +7,7 @@ from typing import TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
 
 from profiles import visible
 
@@ -27,3 +28,13 @@ class PlainConsole(Console):
     def on_broken_pipe(self) -> None:
         """Leave it to whoever prints: rich would end the process with 1, which is a mistake of this program."""
         raise  # noqa: PLE0704 (rich calls this where it has caught the BrokenPipeError)
+
+
+def names_and_texts(rows: Iterable[tuple[str, RenderableType]], *, quiet: bool = False) -> Table:
+    """Names, dim, and beside each what it is, folded where the console ends; ``quiet``: that dim, too."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="dim", no_wrap=True)
+    grid.add_column(style="dim" if quiet else None, overflow="fold")
+    for row in rows:
+        grid.add_row(*row)
+    return grid

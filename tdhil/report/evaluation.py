@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from tdhil.recording import FloatArray, Recording
-from tdhil.report.console import PlainConsole
+from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, shown_date
 from tdhil.report.document import SIMULATED, provenance
 from tdhil.report.html import sha256_of, write_blocks
@@ -80,14 +79,9 @@ def print_evaluation(document: Mapping[str, Any], console: PlainConsole) -> None
     name = document["string"] or "a virtual string"
     where = "in the drive's own loop, " if document["controller"]["own_loop"] else ""
     console.print(Words(f"{document['controller']['kind']} controller, {where}on {name}{simulated}", style="bold"))
-    grid = Grid.grid(padding=(0, 2))
-    grid.add_column(no_wrap=True, style="dim")
-    grid.add_column(overflow="fold")
     verdict = document["verdict"]
-    grid.add_row("verdict", Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
-    for label, text in _rows(document):
-        grid.add_row(label, text)
-    console.print(grid)
+    head = ("verdict", Words(verdict.replace("_", " "), style=_STYLES.get(verdict, "bold red")))
+    console.print(names_and_texts((head, *_rows(document))))
 
 
 def _rows(document: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -14,7 +14,7 @@ from rich.table import Table as Grid
 from rich.text import Text as Words
 
 from tdhil.report.card import with_interval
-from tdhil.report.console import PlainConsole
+from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, Text
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
@@ -217,12 +217,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     """Gains, what they do, what they rest on. 80 columns do."""
     simulated = f" · {SIMULATED}" if document["tuned_for"]["simulated"] else ""
     console.print(Words(f"speed controller for {_string_words(document)}{simulated}", style="bold"))
-    facts = Grid.grid(padding=(0, 2))
-    facts.add_column(no_wrap=True, style="dim")
-    facts.add_column(overflow="fold")
-    for name, text in _rests_on(document):
-        facts.add_row(name, text)
-    console.print(facts)
+    console.print(names_and_texts(_rests_on(document)))
     console.print()
     grid = Grid(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     grid.add_column("")
@@ -232,12 +227,7 @@ def print_tuning(document: Part, console: PlainConsole) -> None:
     for name, cells in _rows(document):
         grid.add_row(name, *cells)
     console.print(grid)
-    legend = Grid.grid(padding=(0, 2))
-    legend.add_column(no_wrap=True, style="dim")
-    legend.add_column(overflow="fold", style="dim")
-    for name, text in _legend(document):
-        legend.add_row(name, text)
-    console.print(legend)
+    console.print(names_and_texts(_legend(document), quiet=True))
     for one in document["controllers"]:
         if one["refused"]:
             console.print(Words(f"{one['kind']} refused: {one['refused']}", style="yellow"))

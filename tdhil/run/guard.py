@@ -37,7 +37,7 @@ from drivers import (
     PowerState,
     Sample,
 )
-from tdhil.run.excitation import RigGuess
+from tdhil.run.excitation import MotionLimits, RigGuess
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
 LONGEST_AGE_S = 0.25
@@ -238,6 +238,12 @@ class Guard:
     def foresight_s(assumptions: ControlAssumptions) -> float:
         """What a plan must keep free: the guard adds this times the acceleration to the speed."""
         return (assumptions.reaction_s + assumptions.largest_speed_lag_s) / assumptions.smallest_inertia_share
+
+    @staticmethod
+    def room(limits: MachineLimits, assumptions: ControlAssumptions, free_rad_s: float = 0.0) -> MotionLimits:
+        """What a plan may use of the limits; ``free_rad_s`` stays free at either end of the speed window."""
+        low, high = limits.speed_min_rad_s + free_rad_s, limits.speed_max_rad_s - free_rad_s
+        return MotionLimits(low, high, limits.torque_nm, Guard.foresight_s(assumptions))
 
     def predicted_speed(self, model: RigGuess, torque_nm: float, speed_rad_s: float) -> float:
         """Where the shaft may be, rad/s, before the host can act on what it now sees."""

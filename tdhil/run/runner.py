@@ -15,7 +15,7 @@ from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Ramp, RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
 from tdhil.run.control_loop import ControlLoop
-from tdhil.run.excitation import MotionLimits, RigGuess
+from tdhil.run.excitation import RigGuess
 from tdhil.run.guard import Guard
 from tdhil.run.planning import wish_of
 from tdhil.run.preconditions import (
@@ -248,9 +248,7 @@ class Runner:
     ) -> None:
         """Stages 4 and 5 of a run that measures the drive's own impedance by its torque offset."""
         limits, assumptions = task.limits, task.assumptions
-        room = MotionLimits(
-            limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
-        )
+        room = Guard.room(limits, assumptions)
         with self._book.stage("hold", 60.0):
             found = run_pilot(
                 loop, limits, room, speed.model, assumptions, wish_of(task.request, Mode.SPEED.value),

@@ -9,11 +9,10 @@ from typing import Any
 from drivers import Command, LimitHit, Mode, PreflightRefused
 from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
-from tdhil.run import excitation
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
-from tdhil.run.excitation import Plan, PlanRefused, RigGuess, SwingPlan
+from tdhil.run.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.run.guard import LIGHTEN, Guard
 from tdhil.run.planning import Planned, as_followed, plan_acquisition
 from tdhil.run.settings import ExcitationRequest
@@ -53,10 +52,7 @@ class StagePlanner:
                 where="plan of stage 5",
                 next_step=f"The shaft was stopped. {LIGHTEN}",
             )
-        room = excitation.MotionLimits(
-            limits.speed_min_rad_s + free, limits.speed_max_rad_s - free, limits.torque_nm,
-            Guard.foresight_s(task.assumptions),
-        )
+        room = Guard.room(limits, task.assumptions, free)
         course = speed.course if mode is Mode.SPEED else None
         last = loop.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
@@ -133,7 +129,7 @@ class StagePlanner:
 def _reckon(
     request: ExcitationRequest,
     mode: Mode,
-    room: excitation.MotionLimits,
+    room: MotionLimits,
     model: RigGuess,
     prior: LagPrior,
     assumed: Noise,

@@ -126,14 +126,12 @@ def _mode(options: RunOptions, can_torque: bool) -> str:
 
 def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits:
     """What a plan may use of the limits at the rate that was asked for."""
-    from tdhil.run import ControlAssumptions, Guard, excitation
+    from tdhil.run import ControlAssumptions, Guard
 
     assumptions = ControlAssumptions()
     if options.rate_hz:
         assumptions = assumptions.at_period(1.0 / options.rate_hz)
-    return excitation.MotionLimits(
-        limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, Guard.foresight_s(assumptions)
-    )
+    return Guard.room(limits, assumptions)
 
 
 def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tuple[Figure, ...]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from drivers import Command, Mode, Sample
 from tdhil.recording import Excitation, Segment
@@ -50,13 +50,6 @@ def dither(time_s: float, period_s: float, peak_rad_s: float) -> float:
 
 Reference = Callable[[float], tuple[float, float]]
 Announce = Callable[[Excitation], None]
-
-
-@dataclass(frozen=True)
-class AcquireResult:
-    """What was run, as the recording keeps it."""
-
-    excitation: Excitation
 
 
 class Follower:
@@ -119,7 +112,7 @@ def run_acquire(
     announce: Announce,
     enough: Enough | None = None,
     speed_resolution_rad_s: float = 0.0,
-) -> AcquireResult:
+) -> None:
     """Every segment of the plan, with its transitions. ``announce`` is told the excitation as it grows.
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
@@ -140,7 +133,6 @@ def run_acquire(
         for index in course.others():
             course.go_to(index, more)
     announce(course.excitation)
-    return AcquireResult(course.excitation)
 
 
 def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
@@ -221,10 +213,9 @@ def run_swings(
     control: MeanSpeedControl | None,
     assumptions: ControlAssumptions,
     announce: Announce,
-) -> AcquireResult:
+) -> None:
     """All of it. Raises what the bench raises. The slow loop stands still while the shaft coasts."""
-    excitation = Excitation(plan.kind, plan.mode)
-    announce(excitation)
+    announce(Excitation(plan.kind, plan.mode))
     follower = Follower(loop, limits, Mode(plan.mode), control)
     follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
     for way in plan.ways:
@@ -233,7 +224,6 @@ def run_swings(
             follower.follow(_calm(way.to_rad_s, plan.guess), CALM_S)
         else:
             follower.follow(way.reference, way.duration_s + CALM_S)
-    return AcquireResult(excitation)
 
 
 def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float, float]]:
@@ -266,8 +256,9 @@ def run_plan(
     announce: Announce,
     enough: Enough | None,
     speed_resolution_rad_s: float,
-) -> AcquireResult:
+) -> None:
     """Run a plan of either family, whatever the excitation. Raises what the bench raises."""
     if isinstance(plan, SwingPlan):
-        return run_swings(loop, limits, plan, control, assumptions, announce)
-    return run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s)
+        run_swings(loop, limits, plan, control, assumptions, announce)
+    else:
+        run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s)
