@@ -7,8 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-from tdhil.errors import UsageError
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """`new` is the one thing to be done so far."""
@@ -27,23 +25,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(namespace: argparse.Namespace) -> int:
     """Write it, and say what is left to be filled in. UsageError where it can't be written."""
     from profiles import load_profile
-    from tdhil.cli.scan import blank_rig, to_fill_in
+    from tdhil.cli.scan import blank_rig, to_fill_in, write_new
 
     path: Path = namespace.file
     profile = load_profile(namespace.profile)
     named = namespace.profile
     if named.endswith((".yaml", ".yml")):
         named = Path(os.path.relpath(named, path.parent)).as_posix()      # rig.yaml looks for it beside itself
-    text = blank_rig(profile, named, namespace.load)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise UsageError("is there already, and is not written over", where=str(path),
-                         next_step="Name another file") from None
-    except OSError as error:
-        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path),
-                         next_step="Name a file in a folder that you may write to") from error
+    write_new(path, blank_rig(profile, named, namespace.load))
     print(f"{path}: written. To be filled in, before that nothing real moves:", file=sys.stderr)  # noqa: T201
     for line in to_fill_in(profile, namespace.load):
         print(f"  {line}", file=sys.stderr)  # noqa: T201

@@ -194,8 +194,8 @@ def run(namespace: argparse.Namespace) -> int:
     """0 if anybody answered. Raises CommunicationLost (exit 5) if nobody did, with the likely causes."""
     from tdhil.session import connection_of, plan_peer
 
-    if namespace.write is not None:
-        _check_free(namespace.write)
+    if namespace.write is not None and namespace.write.exists():
+        raise _there_already(namespace.write)
     rig = load_rig(namespace.rig) if namespace.rig else None
     options, connection = connection_of(vars(namespace), rig, resolve(vars(namespace), rig))
     if not (options.simulate or connection.configured):
@@ -229,9 +229,20 @@ def _print(found: tuple[FoundDrive, ...], remarks: list[str], as_json: bool) -> 
         print(visible(remark, keep="\n"))  # noqa: T201
 
 
-def _check_free(path: Path) -> None:
-    if path.exists():
-        raise UsageError("is there already, and is not written over", where=str(path), next_step="Name another file")
+def write_new(path: Path, text: str) -> None:
+    """A file that isn't there yet. UsageError where it is, or can't be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise _there_already(path) from None
+    except OSError as error:
+        step = "Name a file in a folder that you may write to"
+        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path), next_step=step) from error
+
+
+def _there_already(path: Path) -> UsageError:
+    return UsageError("is there already, and is not written over", where=str(path), next_step="Name another file")
 
 
 def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, options: RunOptions) -> None:
@@ -240,15 +251,7 @@ def _write(path: Path, found: tuple[FoundDrive, ...], connection: Connection, op
     if options.given("profile"):
         one = replace(one, profile=options.profile, why=f"as named: {options.source('profile')}")
     profile = load_profile(one.profile) if one.profile is not None else None
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(starter(one, bus_commands(one.bus).section(one, connection), profile))
-    except FileExistsError:
-        _check_free(path)
-        raise
-    except OSError as error:
-        step = "Name a file in a folder that you may write to"
-        raise UsageError(f"can't be written ({error.strerror or error})", where=str(path), next_step=step) from error
+    write_new(path, starter(one, bus_commands(one.bus).section(one, connection), profile))
     print(f"{path}: written. Fill in its limits: before that nothing real moves", file=sys.stderr)  # noqa: T201
 
 

@@ -52,14 +52,13 @@ class Resolution:
 
 @dataclass(frozen=True)
 class MomentumFit:
-    """J kg·m², its half-width at the confidence asked for, and of what it is made (kg·m², one standard deviation).
+    """J kg·m², its half-width at the confidence asked for, and the delay's part in it (kg·m², one standard deviation).
 
     ``rows`` is how many changes of speed it rests on; ``density`` is pooled.
     """
 
     inertia: float
     half_width: float
-    scatter_sd: float
     delay_sd: float
     viscous: float
     rows: int
@@ -115,7 +114,7 @@ def fit_momentum(
         student_quantile(confidence, density.dof) * scatter,
         student_quantile(confidence, 1e6) * math.hypot(shifted, rounding),
     )
-    return MomentumFit(float(x[0]), half, scatter, shifted, float(x[1]), count, density)
+    return MomentumFit(float(x[0]), half, shifted, float(x[1]), count, density)
 
 
 def _covariance(rows: list[Row]) -> FloatArray:

@@ -289,7 +289,7 @@ def _left_out(reader: RowReader, layout: Layout, file: str) -> list[str]:
         )
     causes = ((ragged, "cells missing or too many"), (reader.missing, "no value"), (odd, "no readable number"))
     return [
-        f"{file}:{tally.first}: {tally.count} {'row was' if tally.count == 1 else 'rows were'} dropped: {cause}"
+        f"{file}:{tally.first}: {_row_list(tally.count)} dropped: {cause}"
         for tally, cause in causes if tally.count
     ]
 
@@ -305,8 +305,7 @@ def _possible(
         raise CsvUnusable("no row has a time, a speed and a torque", where=file, next_step="Look at it in an editor")
     lost = np.flatnonzero(~good)
     if len(lost):
-        many = "1 row was" if len(lost) == 1 else f"{len(lost)} rows were"
-        warnings.append(f"{file}:{lines[lost[0]]}: {many} dropped: a number beyond every machine")
+        warnings.append(f"{file}:{lines[lost[0]]}: {_row_list(len(lost))} dropped: a number beyond every machine")
         columns, lines = [column[good] for column in columns], lines[good]
     return columns, lines
 
