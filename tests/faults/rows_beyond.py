@@ -219,4 +219,48 @@ LOG: dict[int, Row] = {
              "the same result"),
 }
 
-BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG
+VIRTUAL, IMPEDANCE = "tests/run/test_virtual_string.py::", "tests/run/test_impedance_run.py::"
+SOFT_TORQUE: dict[int, Row] = {
+    96: Row("virtual string: Ctrl-C while the bit sticks", "QS; the string's torque goes first", "130",
+            (f"{VIRTUAL}test_ctrl_c_while_the_bit_sticks_takes_the_string_away_first",),
+            "no torque is commanded from the stop's first cycle on; the shaft never turns back"),
+    97: Row("virtual string: feedback frozen or lost, torque lost or limited, load lost, drive fault",
+            "QS; the string's torque goes first", "5, 6, 7, 8",
+            ("tests/path/test_virtual_string.py::"
+             "test_a_fault_while_the_bit_sticks_and_slips_ends_with_a_shaft_at_rest",
+             f"{VIRTUAL}test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest"),
+            "at rest; the drive is never let go while it turns, and nothing but braking comes after the stop began"),
+    98: Row("virtual string: SIGKILL of the host while the bit sticks and slips", "WD", "-",
+            ("tests/path/test_virtual_string.py::"
+             "test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_drive_s_watchdog",),
+            "the last torque stands for the watchdog's time, then the drive brakes; the log is replayed as cut short"),
+    99: Row("virtual string: the loop puts energy into the shaft, or swings more than string and bit could", "QS", "7",
+            (f"{VIRTUAL}test_energy_that_the_loop_puts_in_and_a_swing_beyond_string_and_bit_end_it",),
+            "energy beyond 5 % of what the wound-up string holds; 5 s of torque beyond what was simulated"),
+    100: Row("virtual string: the torque limit acts", "the string is faded out; no result", "9",
+             (f"{VIRTUAL}test_a_torque_limit_that_acts_fades_the_string_out_and_leaves_no_result",),
+             "share of the string's torque falls to none, verdict invalid"),
+    101: Row("virtual string: cycle, lag, mud, window, torque or time that don't let it be true; a real string; "
+             "another rig than the result's", "R; another rig: after stage 2", "4",
+             ("tests/soft_torque/test_evaluation.py::test_what_can_not_be_true_is_refused",
+              "tests/soft_torque/test_evaluation.py::test_a_window_without_room_is_refused",
+              f"{VIRTUAL}test_what_can_not_be_is_refused_before_anything_moves",
+              f"{VIRTUAL}test_a_result_of_another_rig_is_refused"),
+             "named with the limit, and with what it would have to be"),
+    102: Row("impedance by the torque offset: any fault of its stage, or Ctrl-C", "QS; the offset goes first",
+             "5, 6, 7, 8, 130",
+             ("tests/path/test_impedance.py::"
+              "test_whatever_fails_in_it_the_shaft_comes_to_rest_and_the_offset_goes_first",
+              f"{IMPEDANCE}test_whatever_ends_it_the_offset_goes_with_the_first_cycle_of_the_stop",
+              f"{IMPEDANCE}test_an_interrupt_takes_it_away_as_well"),
+             "60B2h is zero with the stop's first cycle"),
+    103: Row("impedance: a torque offset that a dead host left in the drive", "WD; cleared before anything else moves",
+             "-", ("tests/drivers/test_torque_offset.py::"
+                   "test_what_a_dead_host_left_is_gone_with_the_next_run_and_with_a_stop_from_outside",),
+             "cleared by the next run, and by tdhil stop"),
+    104: Row("impedance by the reference: a filter of it that nobody declared", "no result", "9",
+             ("tests/estimation/test_impedance.py::test_a_reference_filter_that_nobody_declared_is_refused",),
+             "model_rejected, with its time constant"),
+}
+
+BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE

@@ -13,7 +13,7 @@ from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRef
 from tdhil.run.runner import Runner
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.task import Task
-from tdhil.soft_torque import COLUMNS, RPM, EvaluationRefused, Outcome, Phase, Program, Rig, evaluate
+from tdhil.soft_torque import COLUMNS, RPM, EvaluationRefused, HostLoop, Outcome, Phase, Program, Rig, evaluate
 from tests.run.fake_drive import LIMITS, FakeDrive, FakeLog
 from tests.run.run_outcomes import assert_at_rest, outcomes, up_to
 from tests.soft_torque.test_evaluation import CASE
@@ -133,6 +133,19 @@ def test_what_befalls_the_drive_ends_the_stage_and_the_shaft_comes_to_rest(world
         assert here.drive.speed == pytest.approx(0.0, abs=1e-6)
     assert result.stop.confirmed is (name in ("powerless", "off"))
     assert outcomes(result) == up_to("acquire")
+
+
+@pytest.mark.parametrize(("figure", "said"), [
+    ("put_in_j", "the loop's errors have put 1000000 J"), ("net_nm", "the loop swings by"),
+])
+def test_energy_that_the_loop_puts_in_and_a_swing_beyond_string_and_bit_end_it(
+    world, course, monkeypatch, figure, said
+):
+    here = world(FakeDrive(), ROOM)
+    until(here, 900, lambda: monkeypatch.setattr(HostLoop, figure, property(lambda loop: 1e6)))
+    result = runner(here).run()
+    assert isinstance(result.cause, LimitHit) and re.search(said, str(result.cause))
+    stopped(here, result)
 
 
 @pytest.mark.parametrize(("case", "limits", "cause", "said"), [
