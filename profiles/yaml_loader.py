@@ -73,6 +73,7 @@ def messages_of(error: ValidationError, data: Any, model: type[BaseModel]) -> li
 
 def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> list[tuple[KeyPath, int, str]]:
     items = [dict(item) for item in error.errors(include_url=False)]
+    items = [item for item in items if not _long_enough(item, _value(tree.data, path_in_file(item, tree)))]
     listed: set[KeyPath] = set()          # sections whose known keys were told: once is enough
     found = [
         explained for item in items if item["type"] not in _WANTED
@@ -87,6 +88,11 @@ def _explained(error: ValidationError, tree: Tree, model: type[BaseModel]) -> li
     told = {(path, message) for path, _, message in found}
     across = [finding for finding in _contradictions(model, tree.data, (), wrong) if finding not in told]
     return found + [(path, tree.line(path), message) for path, message in across]
+
+
+def _long_enough(item: dict[str, Any], value: Any) -> bool:
+    """A list that is too short for pydantic alone, which counts the entries that are right."""
+    return item["type"] == "too_short" and isinstance(value, list) and len(value) >= item["ctx"]["min_length"]
 
 
 def _contradictions(
@@ -195,7 +201,10 @@ def _unit_advice(text: str, path: KeyPath) -> str:
     parts = quantities.split(text)
     if parts is None or not parts[1]:
         return ""
-    unit = quantities.unit_of_key(next((part for part in reversed(path) if isinstance(part, str)), ""))
+    key = next((part for part in reversed(path) if isinstance(part, str)), "")
+    unit = quantities.unit_of_key(key)
+    if unit is None and key.endswith(("length_m", "diameter_m")):
+        return "; a number alone, of metres"
     if unit is None:
         return "; a number alone: this key has no unit"
     try:

@@ -53,11 +53,20 @@ def test_a_file_is_read_from_the_top_down(tmp_path):
     ("  coulomb_nm: 2500\n", "", 5, "friction: stribeck needs it"),
     ("coulomb_nm: 2500", "coulomb_nm: 5500", 9, "must not be below coulomb_nm"),
     ("friction: stribeck", "friction: coulomb", 9, "belongs to friction: stribeck"),
+    ("length_m: 200,", "length_m: 200 m,", 4, "a number alone, of metres"),
 ])
 def test_mistakes_are_named_with_their_line(tmp_path, old, new, line, words):
     with pytest.raises(DataFileError) as caught:
         load_string(written(tmp_path, GOOD.replace(old, new)))
     assert any(problem.line == line and words in str(problem) for problem in caught.value.problems), caught.value
+
+
+def test_an_entry_that_is_wrong_is_not_called_missing(tmp_path):
+    one = "sections:\n  - {length_m: 9 km, outer_diameter_m: 0.1, inner_diameter_m: 0}\nbottom: {inertia_kg_m2: 9}\n"
+    for text, short in ((one, False), ("sections: []\nbottom: {inertia_kg_m2: 9}\n", True)):
+        with pytest.raises(DataFileError) as caught:
+            load_string(written(tmp_path, text))
+        assert ("at least 1 entries" in str(caught.value)) is short
 
 
 def test_nothing_at_the_bottom_is_refused(tmp_path):
