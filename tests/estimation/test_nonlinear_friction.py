@@ -133,6 +133,16 @@ def test_without_noise_the_inertia_is_the_true_one(friction):
 
 
 @pytest.mark.heavy
+def test_a_bend_that_straight_friction_hardly_hides_is_seen():
+    """Windage behind a lag: its curve had leaked into the lines, p = 0.006, and was left there."""
+    said = identify(bent(closed_form(noise=1.0, seed=6), lambda w: 0.02 * w**2), Options(model="rigid"))
+    assert said.model == MODEL, said.reason
+    assert "speak against straight friction (p = 0.006)" in said.reason
+    assert said.residual.p_value > 0.1
+    assert said.inertia.low <= 104.0 <= said.inertia.high
+
+
+@pytest.mark.heavy
 def test_a_bend_is_seen_behind_short_lags():
     """Reports of 5 and 3 ms: descents that leave a lag in common on the way had ended there, and at p = 1e-158."""
     recording = bent(closed_form(speed_lag=0.005, torque_lag=0.003, noise=0.05),

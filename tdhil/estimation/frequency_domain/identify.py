@@ -17,7 +17,7 @@ from tdhil.estimation.excitation_checks import check_lines, hints
 from tdhil.estimation.frequency_domain.before_echo import identify_before_echo, refuse_stick_slip
 from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
-from tdhil.estimation.frequency_domain.inference import contradicted
+from tdhil.estimation.frequency_domain.inference import contradicted, doubtful
 from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent
 from tdhil.estimation.frequency_domain.rigid import (
     RigidResult,
@@ -92,7 +92,10 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
 
 
 def identify_lines(case: PeriodicCase) -> Finding:
-    """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J."""
+    """The simplest shaft that was asked for and that the data do not contradict. Raises Refused where none tells J.
+
+    Straight friction that they hardly allow gives way to one that bends, where that says clearly more.
+    """
     if _before_echo(case):
         return identify_before_echo(case)
     asked = shaft_model(case.options.model)
@@ -110,7 +113,8 @@ def identify_lines(case: PeriodicCase) -> Finding:
         finding = identify_compliant(_settled(case), finding) if doubted else finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, finding.advice)
-    if finding.rejected and rigid is not None and asked.lags:
+    hardly = finding.rejected or (finding.compliant is None and doubtful(finding.residual))
+    if hardly and rigid is not None and asked.lags:
         return identify_bent(case, rigid) or finding
     return finding
 

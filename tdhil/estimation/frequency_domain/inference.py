@@ -33,12 +33,18 @@ from tdhil.recording import FloatArray
 
 
 REJECT_P = 0.001
+_DOUBT_P = 0.01
 _AT_BOUND = 1e-6      # of the natural scale
 
 
 def rejects(test: ResidualTest | None) -> bool:
     """Do the data contradict the model? Also where the statistic is no number."""
     return test is not None and not test.p_value >= REJECT_P
+
+
+def doubtful(test: ResidualTest | None) -> bool:
+    """Do the data only just allow the model, if at all?"""
+    return test is not None and not test.p_value >= _DOUBT_P
 
 
 def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:

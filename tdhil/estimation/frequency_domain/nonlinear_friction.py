@@ -1,7 +1,7 @@
 """The verdict on a shaft whose friction bends over speed.
 
 Its two parameters more, c and the bell's width, must lower −2 ln L by more than Schwarz's 2 ln n, as with the lags
-(`lines/structure.py`): a rigid shaft that is rejected by chance doesn't bend.
+(`filter_order`): a rigid shaft that is rejected, or doubted, by chance doesn't bend.
 """
 
 import math
@@ -330,7 +330,7 @@ _MORE = 2      # parameters than with straight friction
 
 
 def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
-    """``rigid``: the rigid shaft with straight friction, which the data contradict.
+    """``rigid``: the rigid shaft with straight friction, which the data contradict or hardly allow.
 
     None where this one does no better, or leaves the inertia open.
     """
@@ -355,11 +355,12 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
     if isinstance(finding, Refusal):
         return None
     against = rigid.residual.p_value if rigid.residual is not None else 0.0
+    speak = "contradict" if rejects(rigid.residual) else "speak against"
     return replace(
         finding,
         model=MODEL,
         bent=True,
-        preface=f"the residuals contradict straight friction (p = {against:.1g}); ",
+        preface=f"the residuals {speak} straight friction (p = {against:.1g}); ",
         warnings=(*finding.warnings, _told(found[0], motion)),
     )
 

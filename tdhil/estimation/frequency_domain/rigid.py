@@ -10,8 +10,8 @@ from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
 from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
-    REJECT_P,
     budget_of,
+    doubtful,
     estimate,
     first_order_estimate,
     rejects,
@@ -346,6 +346,6 @@ def _caveats(result: RigidResult, as_paper: bool) -> tuple[str, ...]:
         found.append("only one mean speed: viscous friction rests on the lines, not on levels")
     if not as_paper and not result.first_order:
         found.append("first-order lags do not explain the reports; filters of two poles and moving averages do")
-    if result.residual is not None and REJECT_P <= result.residual.p_value < 0.01:
+    if result.residual is not None and doubtful(result.residual) and not rejects(result.residual):
         found.append(f"the residuals are only just consistent with the model (p = {result.residual.p_value:.2g})")
     return tuple(found)
