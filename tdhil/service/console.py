@@ -41,8 +41,9 @@ class Console:
                 self._shown[run] = code
                 text = status.confirmation.text if status.confirmation is not None else ""
                 by = visible(self._store.request(run).asked_by)
-                self._say(f"{text}\nAsked for by {by}, run {run}. To let it move, type this code into the page within"
-                          f" {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
+                rig = f"{status.rig}, SIMULATED" if status.simulated else status.rig
+                self._say(f"{text}\nRig {rig}. Asked for by {by}, run {run}. To let it move, type this code into the"
+                          f" page within {found['left_s']:.0f} s:   {code[:3]} {code[3:]}\n")
 
     def forget(self, run: str) -> bool:
         """Was its code shown?"""

@@ -142,9 +142,11 @@ class RunProcess:
         if asked.peer.stepped:
             with suppress(OSError):
                 os.nice(NICE)
-        if not asked.peer.embedded:
+        if self.watched or not asked.peer.embedded:        # who confirms is told what is planned, and confirms that
             self._plan = plan_of(rig, self.request.options)
             write_json(self.folder / "plan.json", self._plan)
+            self.board.know(expected_half_width=self._plan["expected_half_width"],
+                            expected_s={**EXPECTED_S, "acquire": self._plan["duration_s"] + 5.0})
         report = has_extra()
         self.stop.check(next_step="Nothing has moved")
         session = RunSession(asked, self.attendant, report=report)

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 from drivers import PreflightRefused
 from tdhil.service.attending import Board, Confirming, Lease
-from tdhil.service.states import Confirmation, State, Stop, now, way_to
+from tdhil.service.states import Check, Confirmation, State, Stop, now, way_to
 from tdhil.service.store import Store, read_json, write_json
 from tdhil.service.wire import STOP_FILE, Listener
 
@@ -64,7 +64,9 @@ def main(folder: Path) -> None:
         if what == "deaf":
             (folder / "control.sock").unlink()
         if what == "ask":
-            board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()))
+            board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()),
+                     preflight=(Check("watchdog", "500 ms", "500 ms", "ok", "1016h:1"),), expected_half_width=0.013,
+                     expected_s={"setup": 10.0, "acquire": 120.0}, safe_action="quick stop", identity="A drive")
             while not stop.asked and confirming.confirmed_by is None:
                 if confirming.void is not None:
                     end(board, State.REFUSED, 4)

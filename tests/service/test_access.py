@@ -415,7 +415,8 @@ def test_two_who_ask_at_once_are_one_run(guarded):
 
 def test_who_confirms_is_told_from_who_asked(guarded):
     run = guarded.run("ask", "real", "operator")
-    wait_for("the code", lambda: any(f"Asked for by operator, run {run}" in one for one in guarded.service.said))
+    said = f"Rig real. Asked for by operator, run {run}."
+    wait_for("the code", lambda: any(said in one for one in guarded.service.said))
     code = {"json": {"code": "123456"}}
     assert guarded("POST", f"/runs/{run}/confirm", guarded.sessions["viewer"], **code).status_code == 403
     assert guarded("POST", f"/runs/{run}/confirm", guarded.of_token("engineer"), **code).status_code == 200

@@ -135,6 +135,8 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
         (code,) = wait_for("the code", lambda: [one for text in shown for one in re.findall(r"(\d{3} \d{3})\n", text)])
         wait_for("the same on the other terminal", lambda: code in server.said())
         assert "somebody watches the page" in shown[-1]
+        assert "Rig rig, SIMULATED. Asked for by local" in shown[-1]
+        assert 0.0 < Store(data).status(run).expected_half_width < 0.1
         key, post = "k" * 16, server.client._object
         binding = server.client.run(run)["confirmation"]["binding"]
         post("POST", f"/runs/{run}/confirm", {"code": code.replace(" ", ""), "binding": binding, "lease": key})

@@ -253,7 +253,7 @@
         width: where.clientWidth || 320, height: 190, legend: { show: false }, cursor: { show: false },
         scales: { x: { time: false }, y: { range: (self, low, high) => {
           const all = [low, high, ...(limits ? limitsOf(limits).filter((one) => one !== null) : [])].filter((one) => Number.isFinite(one));
-          const from = Math.min(0, ...all), to = Math.max(...all, from + 1e-3), pad = 0.06 * (to - from);
+          const from = Math.min(0, ...all), to = all.length ? Math.max(...all, from + 1e-3) : from + 1, pad = 0.06 * (to - from);
           return [from - pad, to + pad];
         } } },
         axes: [{ ...axis, size: 34, values: (self, ticks) => ticks.map((one) => `${one} s`) }, { ...axis, size: 52 }],
@@ -305,7 +305,7 @@
     function event(one) {
       const list = byId("events");
       if (one.kind === "preflight") return;
-      list.prepend(el("li", {}, `${one.time_s === null ? "" : one.time_s.toFixed(1) + " s "}${one.kind}: ${one.text}`));
+      list.prepend(el("li", {}, `${one.time_s === null ? "" : one.time_s.toFixed(1) + " s "}${one.text.startsWith(`${one.kind}:`) ? "" : `${one.kind}: `}${one.text}`));
       while (list.children.length > 200) list.lastElementChild.remove();
     }
 
@@ -340,7 +340,12 @@
       byId("stop").disabled = over;
       const confirm = status.state === "awaiting_confirmation" && status.confirmation;
       byId("confirm").hidden = !confirm;
-      if (confirm) byId("confirm-text").textContent = status.confirmation.text;
+      if (confirm) {
+        byId("confirm-text").textContent = status.confirmation.text;
+        const marks = { ok: "✓", note: "i" }, half = status.expected_half_width;
+        byId("confirm-expected").textContent = `Expected: ${half ? `J to ${percent(half)}, ` : ""}about ${span(Object.values(status.expected_s).reduce((sum, one) => sum + one, 0))}. ${status.identity}; if the host falls silent: ${status.safe_action}.`;
+        show(byId("confirm-checks"), ...status.preflight.map((one) => el("tr", { class: one.outcome }, el("td", {}, marks[one.outcome] || "✗"), el("th", { scope: "row" }, one.name), el("td", {}, one.wanted), el("td", {}, one.found), el("td", {}, one.where))));
+      }
       stopTimes();
       watching();
     }
