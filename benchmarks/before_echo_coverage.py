@@ -4,7 +4,8 @@
 
 Strings are those of `tests/estimation/loaded_bench.py`, which shares no code with the estimator: 2300 m of pipe whose
 told resistance is wrong by 3 % (1 sd), reports through lags that nobody states (but in the case `stated`), ten minutes
-of torque of ±1 kN·m.
+of torque of ±1 kN·m. The torque follows its setpoint with a lag of 10 ms (`slow torque`: 30 ms), of which the drive's
+report tells how it filters torque (but in the case `no answer`, as in logs of before).
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ CASES = {
     "heavy motor": replace(NOISY, motor=4000.0),
     "heavy bit": Loaded(bottom=1000.0),
     "stated": NOISY,
+    "slow torque": replace(NOISY, own_lag_s=0.03),
+    "no answer": replace(NOISY, answered=False),
 }
 STATED = LagPrior(0.40, 0.02, 0.15, 0.01, "the manual")       # of the case `stated`
 GROUP = 25

@@ -1,5 +1,6 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
+from tdhil.estimation.frequency_domain import torque_answer as torque_answer
 from tdhil.estimation.identification import identify as identify
 from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
 from tdhil.estimation.result import (

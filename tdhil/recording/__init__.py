@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
         LagPrior as LagPrior, Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment,
-        Stage as Stage, SteppedSetpoint as SteppedSetpoint, ABORTED as ABORTED, aborted_stage as aborted_stage,
+        Stage as Stage, SteppedSetpoint as SteppedSetpoint,
+        TorqueAnswer as TorqueAnswer, ABORTED as ABORTED, aborted_stage as aborted_stage,
         before_abort as before_abort,
     )
     from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended

@@ -116,6 +116,16 @@ class SteppedSetpoint:
 
 
 @dataclass(frozen=True)
+class TorqueAnswer:
+    """How the reported torque followed the commanded one: 1/(1 + lag·s + shape·(lag·s)²), and a delay, which is left
+    out.
+    """
+
+    lag_s: float
+    shape: float
+
+
+@dataclass(frozen=True)
 class ImpedanceInput:
     """What was commanded to measure the drive's own impedance with: a torque offset or the speed reference.
 
@@ -169,6 +179,7 @@ class Recording:
     timing_half_width_s: float = 0.0       # usual half-width of a transaction: when in it a sample was taken is open
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
     impedance: ImpedanceInput | None = None             # where the drive's own impedance was measured
+    torque_answer: TorqueAnswer | None = None           # in torque mode, where it was looked at
     pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did

@@ -94,6 +94,7 @@ class RunLog:
         self._run = dict(run)
         self._dropped = 0
         self._virtual = array("d")
+        self._commanded = array("d")
         writer.configuration(self._run, {})
 
     @property
@@ -108,8 +109,14 @@ class RunLog:
     def cycle(self, command: Command, sample: Sample) -> None:
         """One exchange."""
         self._builder.add(sample)
+        self._commanded.append(command.torque_nm)
         self._writer.command(sample.time_s, command)
         self._writer.sample(sample)
+
+    @property
+    def commanded_nm(self) -> FloatArray:
+        """The torque that was commanded in each cycle, (N,), N·m."""
+        return np.array(self._commanded)
 
     def virtual(self, row: Sequence[float]) -> None:
         """One cycle of a virtual string (`log_format.VIRTUAL_COLUMNS`)."""

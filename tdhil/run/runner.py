@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from functools import partial
 
 from drivers import Command, Drive, DriveLimits, Mode, Outcome, Paced, Preflight, PreflightRefused, Sample, Timed
+from tdhil.config import told_before_echo
+from tdhil.estimation import torque_answer
 from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Ramp, RunLog
 from tdhil.run import preconditions, stage_log
 from tdhil.run.background import Reckoner, begin
@@ -90,6 +92,7 @@ class Runner:
         self._book = StageBook(drive, log, display, say)
         self._stop: StopSequence | None = None
         self._prior = LagPrior()
+        self._before_echo = False
         self._reckoner: Reckoner | None = None
 
     def run(self) -> RunOutcome:
@@ -127,6 +130,9 @@ class Runner:
                         self._log.event(self._drive.clock.now_s(), "left", f"not given back: {line}")
             if self._reckoner is not None:
                 self._reckoner.close()
+            if cause is None:
+                with suppress(Exception):
+                    self._learn_torque_answer()
         return RunOutcome(tuple(self._book.stages), cause, report, self._book.preflight)
 
     # -- the stages ------------------------------------------------------------------------------------------
@@ -136,6 +142,7 @@ class Runner:
             task, loop, preflight = self._prepare()
             limits, assumptions = task.limits, task.assumptions
             mode = choose_mode(task.request, limits, preflight)
+            self._before_echo = told_before_echo(task.request.kind)
             _, torque_offset = measure_offsets(loop, limits)
             program = None if task.evaluation is None else self._program(task, task.evaluation, loop, preflight)
             self._log.learn(torque_offset_nm=torque_offset)
@@ -383,6 +390,13 @@ class Runner:
             self._log.learn(timing_half_width_s=half_s, lag_prior=self._prior)
             text = f"a sample's time is known to ±{1e3 * half_s:.3g} ms, the half of a transaction"
             self._log.event(loop.now_s, "rate", text)
+
+    def _learn_torque_answer(self) -> None:
+        """How the reported torque followed the commanded one: what is told before an echo needs it."""
+        if self._before_echo:
+            answer = torque_answer(self._log.recording(complete=True), self._log.commanded_nm)
+            if answer is not None:
+                self._log.learn(torque_answer=answer)
 
     def _note_rough(self, loop: ControlLoop, speed: SpeedResult) -> None:
         model = speed.model

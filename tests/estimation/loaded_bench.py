@@ -5,11 +5,12 @@ mud drags with d: ω = (a + b)/(ζ₁ + ζ₂ + d), up goes 2ζ₁ω − a, down
 + b; the bit: J_b dΩ/dt = a − ζΩ − T_bit − noise.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import lfilter
 
+from tdhil.estimation import torque_answer
 from tdhil.recording import Excitation, LagPrior, Pipe, Recording, Segment
 
 STEP_S = 0.02
@@ -35,6 +36,8 @@ class Loaded:
     torque_lags_s: tuple[float, ...] = (0.15,)
     hold: float = 750.0               # of the host's slow control of the mean speed, N·m·s/rad
     mean_rad_s: float = 20.0
+    own_lag_s: float = 0.01           # of the torque behind its setpoint
+    answered: bool = True             # is the torque's answer to its setpoint looked at?
     speed_noise_rad_s: float = 0.003
     torque_noise_nm: float = 5.0
 
@@ -98,13 +101,14 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
     white = np.stack([stream.standard_normal(len(time)) for stream in streams], axis=1)
     noise = plant.bit_noise_nm * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)
     speeds, acted = turned(plant, drive, noise)
+    commanded = acted + plant.own_lag_s / STEP_S * np.diff(acted, axis=0, append=acted[-1:])
     for lag_s in plant.speed_lags_s:
         speeds = late(speeds, lag_s)
     for lag_s in plant.torque_lags_s:
         acted = late(acted, lag_s)
     segment = Segment(0.0, (settle + periods) * period_s, period_s, settle, plant.mean_rad_s, tuple(lines_hz), (), ())
     every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
-    return [
+    found = [
         Recording(
             time_s=time, fresh=every, limited=none,
             speed_rad_s=speeds[:, run] + plant.speed_noise_rad_s * stream.standard_normal(len(time)),
@@ -114,6 +118,9 @@ def records(plant: Loaded, seeds, lines_hz, torques, period_s, periods, settle=2
         )
         for run, stream in enumerate(streams)
     ]
+    if not plant.answered:
+        return found
+    return [replace(one, torque_answer=torque_answer(one, commanded[:, run])) for run, one in enumerate(found)]
 
 
 def late(signal, lag_s):

@@ -4,15 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from tdhil.estimation import Verdict, identify
+from tdhil.estimation import Verdict, identify, torque_answer
 from tdhil.estimation.frequency_domain.before_echo import ECHO, EchoShaft, problem_of, unleaked
 from tdhil.estimation.frequency_domain.inference import standard_deviation
 from tdhil.estimation.frequency_domain.optimiser import box, minimise
 from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, pooled_lines
 from tdhil.estimation.result import Refused
-from tdhil.recording import LagPrior
-from tests.estimation.loaded_bench import STEP_S, Loaded, records, turned
+from tdhil.recording import Excitation, LagPrior, Recording, Segment
+from tests.estimation.loaded_bench import STEP_S, Loaded, late, records, turned
 
 PLANT = Loaded(bit_noise_nm=200.0)
 PERIOD_S, COUNT = 20.0, 20
@@ -130,6 +131,43 @@ def test_a_swing_that_goes_on_is_no_scatter(swing):
     assert found == pytest.approx(2.0, rel=0.15)
     assert np.mean([line.s_tt for line in plain]) > 2.0 * (1.0 + 0.5 * swing**2) * 0.5
     assert unleaked(plain[::2], fits) == plain[::2]
+
+
+def answering(filtered, own_lag_s=0.01, length=None):
+    """A recording whose torque is commanded at random and reported through ``filtered``, and its answer."""
+    time = STEP_S * np.arange(round(6 * PERIOD_S / STEP_S))
+    commanded = (np.exp(2j * np.pi * np.outer(time, LINES_HZ)) @ TORQUES).real
+    commanded += 100.0 * lfilter([0.1], [1.0, -0.9], np.random.default_rng(4).standard_normal(len(time)))
+    every, none = np.ones(len(time), dtype=bool), np.zeros(len(time), dtype=bool)
+    segment = Segment(0.0, 6 * PERIOD_S, PERIOD_S, 2, 20.0, LINES_HZ, (), ())
+    one = Recording(time, 20.0 + 0.0 * time, filtered(late(commanded, own_lag_s)), every, none,
+                    excitation=Excitation("prbs", "torque", (segment,)))
+    return torque_answer(one, commanded[:length])
+
+
+def test_what_reports_the_torque_shows_in_its_answer_to_the_command():
+    one = answering(lambda torque: np.roll(late(torque, 0.15), 3))
+    assert one.lag_s == pytest.approx(0.16, abs=0.01) and one.shape == pytest.approx(0.06, abs=0.03)
+    two = answering(lambda torque: late(late(torque, 0.1), 0.1))
+    assert two.lag_s == pytest.approx(0.21, abs=0.012) and two.shape == pytest.approx(0.27, abs=0.03)
+
+
+def test_an_answer_that_is_no_filter_of_two_poles_tells_nothing():
+    average = np.ones(35) / 35.0
+    assert answering(lambda torque: np.convolve(torque, average)[: len(torque)]) is None
+    assert answering(lambda torque: np.random.default_rng(1).standard_normal(len(torque))) is None
+    assert answering(lambda torque: late(torque, 0.15), length=100) is None
+
+
+def test_the_torques_answer_closes_what_its_filter_left_open(record):
+    """With nothing known of the filters, long ones before a lighter motor look alike."""
+    found, blind = identify(record).inertia, identify(replace(record, torque_answer=None)).inertia
+    assert found.low <= PLANT.motor <= found.high and blind.low <= PLANT.motor <= blind.high
+    assert found.high - found.low < 0.7 * (blind.high - blind.low)
+    assert any("follows its setpoint" in one for one in found.conditional_on)
+    assert not any("follows its setpoint" in one for one in blind.conditional_on)
+    stated = replace(record, lag_prior=LagPrior(None, 0.0, 0.15, 0.01, "the manual"))
+    assert not any("follows its setpoint" in one for one in identify(stated).inertia.conditional_on)
 
 
 def test_lines_that_the_string_drowns_name_it(record):

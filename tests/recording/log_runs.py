@@ -11,7 +11,16 @@ from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import Event
 from tdhil.recording.log_reader import LoggedRun
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.recording import Excitation, LagPrior, Level, Ramp, Recording, Segment, Stage
+from tdhil.recording.recording import (
+    Excitation,
+    LagPrior,
+    Level,
+    Ramp,
+    Recording,
+    Segment,
+    Stage,
+    TorqueAnswer,
+)
 
 PERIOD_S = 0.004
 SEGMENT = Segment(1.0, 3.0, 0.5, 1, 3.0, (2.0, 4.0), (0.1, 0.05), (0.0, 1.5))
@@ -27,6 +36,7 @@ FACTS = {
     "torque_offset_nm": -0.3,
     "torque_scale_rel_sd": 0.02,
     "gear_ratio": 10.5,
+    "torque_answer": TorqueAnswer(0.15, 0.1 / 3),
     "simulated": True,
 }
 CONFIGURATION = {"drive": "canopen", "rate_hz": 250.0, "ids": [1, 2], "nothing": None}

@@ -11,6 +11,7 @@ import pytest
 from drivers.drive import Command, Mode, PowerState, Sample
 from drivers.errors import LimitHit, PreflightRefused
 from tdhil.recording import LagPrior
+from tdhil.recording.builder import RecordingBuilder
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.run.stage_planner import StagePlanner
@@ -19,7 +20,7 @@ from tdhil.run.stages.speed import SpeedResult
 from tdhil.run.stages.steady import Swing, calm_string, swing_of
 from tdhil.run.string_release import SwingDamper
 from tdhil.run.task import Task
-from tests.run.fake_drive import PERIOD_S, FakeDrive, World
+from tests.run.fake_drive import PERIOD_S, FakeDrive, FakeLog, World
 
 LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=4000.0, time_s=1800.0, quick_stop_rad_s2=1.0,
@@ -115,6 +116,7 @@ def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
     assert run.cause is None, run.cause
     assert any("the shaft slowed down" in text for _, text in here.log.events)
     assert run.stop.confirmed
+    assert "torque_answer" not in here.log.facts
 
 
 def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
@@ -218,3 +220,32 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
         planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
     assert "off bottom" in hit.value.next_step
     assert "speed loop" not in str(hit.value)
+
+
+class KeepingLog(FakeLog):
+    """Keeps what a recording is made of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.builder, self.commanded = RecordingBuilder(), []
+
+    def cycle(self, command, sample) -> None:
+        super().cycle(command, sample)
+        self.builder.add(sample)
+        self.commanded.append(command.torque_nm)
+
+    @property
+    def commanded_nm(self):
+        return np.array(self.commanded)
+
+    def recording(self, *, complete):
+        self.builder.excitation(*self.motions[-1])
+        return self.builder.recording(complete=complete)
+
+
+def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
+    here = World(RingingDrive(), replace(LIMITS, wave_impedance_nm_s_rad=486.0, echo_s=2.0))
+    here.log = KeepingLog()
+    run = here.runner(ExcitationRequest(kind="prbs", periods=3)).run()
+    assert run.cause is None, run.cause
+    assert here.log.facts["torque_answer"].lag_s < 0.01

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from tdhil.estimation.frequency_domain.before_echo import torque_answer as torque_answer
     from tdhil.estimation.frequency_domain.friction_levels import (
         Levels as Levels, ViscousConstraint as ViscousConstraint, measure_levels as measure_levels,
         tie_viscous as tie_viscous, warming_warning as warming_warning,

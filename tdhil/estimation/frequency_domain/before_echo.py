@@ -36,13 +36,13 @@ from tdhil.estimation.frequency_domain.inference import (
     torque_scale_line,
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.model import Model
+from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structure, lag_priors, lags_of, of_reports
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines, pooled_lines
 from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest
 from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
-from tdhil.recording import FloatArray, LagPrior, Pipe
+from tdhil.recording import FloatArray, LagPrior, Pipe, Recording, TorqueAnswer
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The shaft.
@@ -181,7 +181,8 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
             "state load.length_m and both diameters in rig.yaml, or use --excitation multisine",
         )
     lines = unleaked(pooled_lines(case.fits, 0.0), case.fits)
-    problem = problem_of(lines, pipe, case.recording.lag_prior)
+    answer = case.recording.torque_answer if case.recording.lag_prior.torque_lag_s is None else None
+    problem = problem_of(lines, pipe, case.recording.lag_prior, answer)
     fitted = fit_before_echo(problem, case.recording.lag_prior)
     residual = residual_of(fitted)
     shaft = echo_shaft(problem)
@@ -204,6 +205,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
             f"next to nothing comes back from below within {shaft.echo_s:.2f} s, and what does dies away within"
             f" {_LASTS_S:g} s",
             f"the pipe's resistance to waves is {pipe.impedance_nm_s_rad:.4g} N·m·s/rad {told}",
+            *(() if answer is None else (_FOLLOWS,)),
             *of_reports(case.recording.lag_prior),
         ),
         speed_lag_s=speed_lag,
@@ -213,8 +215,13 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
     )
 
 
-def problem_of(lines: tuple[Line, ...], pipe: Pipe, prior: LagPrior) -> Likelihood:
-    """Raises Refused where the lines are too few or too far apart to see an echo apart from what was before it."""
+def problem_of(
+    lines: tuple[Line, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
+) -> Likelihood:
+    """``answer``: of the torque, where nobody states its lag.
+
+    Raises Refused where the lines are too few or too far apart to see an echo apart from what was before it.
+    """
     hertz = [line.hertz for line in lines]
     apart = float(np.max(np.diff(hertz))) if len(hertz) > 1 else math.inf
     shaft = EchoShaft(pipe, max(hertz, default=1.0))
@@ -232,8 +239,68 @@ def problem_of(lines: tuple[Line, ...], pipe: Pipe, prior: LagPrior) -> Likeliho
         )
     model = Model(shaft)
     lags = (model.at(signal_filters.SPEED_LAG), model.at(signal_filters.TORQUE_LAG))
-    return Likelihood(lines, model, None, lag_priors(prior, *lags))
+    known = lag_priors(prior, *lags)
+    if answer is not None:
+        shape = model.at(signal_filters.TORQUE_SHAPE)
+        known += (
+            GaussianPrior(lags[1], max(answer.lag_s - _OWN_LAG_S, 0.0), _OWN_LAG_SD_S),
+            GaussianPrior(shape, answer.shape, _SHAPE_SD),
+        )
+    return Likelihood(lines, model, None, known)
 
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What the torque's report does, from the torque that was commanded.
+#
+# Before an echo comes back, J is told by lines at which the reports' filters matter as much as it does: long lags on
+# both reports and a lighter motor look alike, and with nothing known of the filters the interval reaches down to half
+# of J. But what reports the torque can be seen apart from all mechanics. In torque mode the torque is commanded, and a
+# drive's torque loop follows within some milliseconds: how much later and smoother the reported torque is than the
+# commanded one is the report's filter, and the little that drive and bus take (`_OWN_LAG_S`). Its delay says nothing:
+# the bus's is in it.
+
+
+_OWN_LAG_S, _OWN_LAG_SD_S = 0.01, 0.015      # of the torque behind its setpoint: from none to some 40 ms
+_SHAPE_SD = 0.1
+_ANSWER_MISFIT = 0.01       # of the lines, rms: what is no filter of two poles is left unknown
+_LEAST_ANSWER = 0.1         # of the strongest line
+_FOLLOWS = "the drive's torque follows its setpoint within some 40 ms: what its report is late by beyond is its filter"
+
+
+def torque_answer(recording: Recording, commanded_nm: FloatArray) -> TorqueAnswer | None:
+    """Of a motion that `identify_before_echo` is for; ``commanded_nm`` (N,). None where it is no filter of two poles.
+
+    A command stood from its cycle on, and a report answers it a cycle later or so: all of that is delay.
+    """
+    from scipy.optimize import least_squares
+
+    excitation = recording.excitation
+    if excitation is None or not excitation.segments or excitation.mode != "torque":
+        return None
+    segment = excitation.segments[-1]
+    begin_s = segment.start_s + segment.settle_periods * segment.period_s
+    counts = (recording.time_s >= begin_s) & (recording.time_s < segment.end_s) & recording.fresh
+    if len(commanded_nm) != len(recording.time_s) or np.count_nonzero(counts) < 4 * len(segment.lines_hz):
+        return None
+    time, both = recording.time_s[counts] - begin_s, np.stack([commanded_nm[counts], recording.torque_nm[counts]])
+    both = both - both.mean(axis=1, keepdims=True)
+    asked, seen = np.array([both @ np.exp(-2j * np.pi * hertz * time) for hertz in segment.lines_hz]).T
+    clear = np.abs(asked) > _LEAST_ANSWER * np.max(np.abs(asked))
+    ratio, s = seen[clear] / asked[clear], 2j * np.pi * np.array(segment.lines_hz)[clear]
+
+    def off(x: FloatArray) -> FloatArray:
+        lag, shape, delay = x
+        error = ratio * (1.0 + lag * s + shape * (lag * s) ** 2) * np.exp(delay * s) - 1.0
+        return np.concatenate([error.real, error.imag])
+
+    bounds = ([0.0, 0.0, -0.1], [signal_filters.LAG_BOUND_S, signal_filters.SHAPE_BOUND, signal_filters.SKEW_BOUND_S])
+    best = min((least_squares(off, (lag, 0.1, 0.01), bounds=bounds) for lag in (0.02, 0.3)), key=lambda fit: fit.cost)
+    if not math.sqrt(2.0 * best.cost / max(len(s), 1)) <= _ANSWER_MISFIT:
+        return None
+    return TorqueAnswer(float(best.x[0]), float(best.x[1]))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 
 def echo_shaft(problem: Likelihood) -> EchoShaft:
     """The shaft of a problem of `problem_of`."""

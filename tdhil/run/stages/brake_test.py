@@ -20,6 +20,7 @@ import numpy as np
 from drivers import Command, Mode, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
+from tdhil.run.guard import LIGHTEN
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.speed import SpeedResult, mean_speeds
 from tdhil.run.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady
@@ -79,6 +80,11 @@ CLEAR, WANTED_CLEAR = 2.0, 6.0
 STRING_CLEAR = 4.0
 """The change of torque must be so many times what the string swings by: until the answer is heard, it pushes for about
 twice as long as the pulse."""
+
+
+CLEAR_WANDER, WANTED_WANDER = 1.25, 2.0
+"""As `CLEAR` and `WANTED_CLEAR`, of what a restless string takes the shaft from its mean by while nobody holds it:
+noise of the report is gone in a cycle, and this goes on until the answer is heard."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +164,10 @@ def plan_pulse(
             f"friction and {braking_nm:.3g} N·m would take the shaft out of its window within {2.0 * period_s:.2g} s",
             "Use --mode speed",
         )
-    wanted_rad_s = max(SEEN_SHARE * limits.speed_max_rad_s, WANTED_CLEAR * before.speed_noise_rad_s)
+    wanted_rad_s = max(
+        SEEN_SHARE * limits.speed_max_rad_s, WANTED_CLEAR * before.speed_noise_rad_s,
+        WANTED_WANDER * before.wander_rad_s,
+    )
     wanted_s = wanted_rad_s * model.inertia_kg_m2 / change_nm
     longest_s = min(max(wanted_s, period_s), LONGEST_S, up_s, down_s)
     edge = _edge_cycles(limits, change_nm, min(up_s, down_s), period_s)
@@ -175,6 +184,12 @@ def plan_pulse(
         return NoPulse(
             f"the string swings by ±{before.swing_nm:.3g} N·m, which would hide what {change_nm:.3g} N·m do to it",
             "Use --mode speed, or let the string come to rest: lift the bit off bottom, or take weight off it",
+        )
+    if slowing < CLEAR_WANDER * before.wander_rad_s:
+        return NoPulse(
+            f"the string takes the shaft ±{before.wander_rad_s:.2g} rad/s from its mean, which would hide the"
+            f" {slowing:.2g} rad/s that {braking_nm:.3g} N·m would slow it by",
+            f"{LIGHTEN}; or use --mode speed",
         )
     highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
     return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)
