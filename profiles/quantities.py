@@ -149,6 +149,10 @@ def split(text: str) -> tuple[float, str] | None:
     return (value, (found[2] or "").strip()) if math.isfinite(value) else None
 
 
+def _a(noun: str) -> str:
+    return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
+
+
 def read(text: str, unit: Unit) -> float:
     """``text`` in ``unit``; a number without one is in ``unit``. ValueError, in words for the user, names no number."""
     parts = split(text)
@@ -157,9 +161,9 @@ def read(text: str, unit: Unit) -> float:
     value, word = parts
     given = unit_of(word) if word else unit
     if given is None:
-        raise ValueError(f"'{word}' is no unit of a {unit.dimension} that is known; known: {', '.join(known(unit))}")
+        raise ValueError(f"'{word}' is no unit of {_a(unit.dimension)} that is known; known: {', '.join(known(unit))}")
     if given.dimension != unit.dimension:
-        raise ValueError(f"{given.symbol} is a unit of {given.dimension}, but a {unit.dimension} is wanted; "
+        raise ValueError(f"{given.symbol} is a unit of {given.dimension}, but {_a(unit.dimension)} is wanted; "
                          f"known: {', '.join(known(unit))}")
     converted = value if given == unit else unit.of_si(given.si(value))
     if not math.isfinite(converted):

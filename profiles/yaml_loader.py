@@ -189,9 +189,10 @@ def _advice(kind: str, value: Any, path: KeyPath) -> str:
         return "; put it in quotes"
     if kind.startswith("int") and isinstance(value, float) and value.is_integer():
         return f"; write {int(value)}"
-    if isinstance(value, str) and hint(value):
+    number = kind.startswith(("int", "float"))
+    if isinstance(value, str) and hint(value) and not (number and hint(value) in ("write true", "write false")):
         return f"; {hint(value)}"
-    if kind.startswith(("int", "float")) and isinstance(value, str):
+    if number and isinstance(value, str):
         return _unit_advice(value, path)
     return ""
 

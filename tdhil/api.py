@@ -137,6 +137,14 @@ class Result:
         check_report_path(Path(path), Path(self.record.log), "save_report")
         return write_report(self.document, self.record.recording, Path(path))
 
+    def __repr__(self) -> str:
+        from tdhil.report import inertia_text
+
+        said = self.document["inertia_kg_m2"]
+        simulated = "SIMULATED " if self.document["simulated"] else ""
+        return f"<{simulated}{self.verdict.value}" + (f": {inertia_text(said, '_total')}" if said else "") + (
+            f", {self.document['log']}>")
+
     def __str__(self) -> str:
         from tdhil.report import card_text
 

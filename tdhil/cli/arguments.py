@@ -33,6 +33,8 @@ def amount(unit: Unit) -> Callable[[str], float]:
 share = amount(SHARE)
 """``1%`` or ``0.01``."""
 
+TOLERANCE = "a share between 0 and 1, such as 1% or 0.01"
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,8 @@ def run(namespace: argparse.Namespace) -> int:
     """The folder, and a line for each file in it."""
     folder = docs_folder()
     print(folder)  # noqa: T201
-    found = (folder / "README.md", *sorted(folder.glob("docs/*.md")), *sorted(folder.glob("examples/*.yaml")))
+    found = (folder / "README.md", *sorted(folder.glob("docs/*.md")), *sorted(folder.glob("examples/*.yaml")),
+             *sorted(folder.glob("examples/*.py")))
     names = [path.relative_to(folder).as_posix() for path in found]
     width = max(map(len, names))
     for name, path in zip(names, found, strict=True):
@@ -39,4 +40,4 @@ def docs_folder() -> Path:
 
 def _title(path: Path) -> str:
     with path.open(encoding="utf-8") as file:
-        return next((line.strip("# \n") for line in file if line.strip("# \n")), "")
+        return next((line.strip('#" \n') for line in file if line.strip('#" \n')), "")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from tdhil.run import MachineLimits, Planned
+    from tdhil.session import Connection
     from tdhil.soft_torque import EvaluationCase
 
 
@@ -79,6 +80,29 @@ def dry_run_course(
                   f"{limits.time_s:g}")
     console.print(table)
     return 0
+
+
+def say_unreachable(options: RunOptions, rig: Rig | None, connection: Connection, simulated: bool) -> str | None:
+    """Before anything moves: that --tolerance is not to be expected, and the least that is; None where it may be.
+
+    On the rig as rig.yaml expects it, or as it suits its drive: what the run measures decides in the end.
+    """
+    from drivers import PreflightRefused
+
+    if not options.given("tolerance"):
+        return None
+    try:
+        planned, figures, _ = plan_dry(
+            options, rig, simulated, connection.profile.can_torque, connection.profile.quick_stop.ends == "off"
+        )
+    except PreflightRefused:
+        return None         # a rig that is only assumed refuses nothing
+    if planned.stopping is None or planned.stopping.reachable:
+        return None
+    assumed = " (a rig that is assumed; `expected:` in rig.yaml says more)"
+    return (f"--tolerance: {_conclusions(planned)[1]}. The least to be expected is "
+            f"±{100.0 * planned.half_width:.2g} % after {planned.duration_s:.0f} s"
+            f"{assumed if any(figure.source == 'assumed' for figure in figures) else ''}")
 
 
 def show(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits, console: Console) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import csv
+import shutil
 from collections.abc import Iterator
-from importlib.util import find_spec
+from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
 from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
@@ -22,7 +24,6 @@ COLUMNS: Final = (
 )
 """Of a table; the first three are what `tdhil replay` reads of a CSV."""
 
-_ROWS: Final = 65_536         # of a parquet file that are laid out at once
 _CAN_ONLY: Final = ("candump", "asc")
 _LARGEST_STANDARD: Final = 0x7FF
 
@@ -47,9 +48,8 @@ def run(namespace: argparse.Namespace) -> int:
         raise UsageError("there is no such log", where=str(path), next_step="Name a run.mcap of this tool")
     if target.exists():
         raise UsageError("is there already, and is left as it is", where=str(target), next_step="Name another with -o")
-    if namespace.to == "parquet" and find_spec("pyarrow") is None:
-        raise UsageError("parquet needs pyarrow, not installed here", where="--to parquet",
-                         next_step="Install it into this environment: pip install pyarrow. Or take --to csv")
+    if namespace.to == "parquet":
+        _duckdb()
     try:
         found = read_run(path)
         if namespace.to in _CAN_ONLY:
@@ -128,27 +128,23 @@ def _write_csv(path: Path, target: Path, simulated: int) -> int:
 
 
 def _write_parquet(path: Path, target: Path, simulated: int) -> int:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    """The same table, typed; DuckDB reads its numbers to their last bit."""
     texts, counts = {"mode", "state"}, {"status", "fresh", "limit_active", "standstill", "simulated"}
-    schema = pa.schema([
-        (name, pa.string() if name in texts else pa.int64() if name in counts else pa.float64()) for name in COLUMNS
-    ])
-    count = 0
-    with target.open("xb") as file, pq.ParquetWriter(file, schema) as writer:
-        rows: list[tuple[Any, ...]] = []
-
-        def flush() -> None:
-            columns = zip(*rows, strict=True) if rows else ((),) * len(COLUMNS)
-            arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=schema))
-            rows.clear()
-
-        for row in _rows(path, simulated):
-            rows.append(row)
-            count += 1
-            if len(rows) >= _ROWS:
-                flush()
-        flush()
+    typed = ", ".join(
+        f"{name}: '{'VARCHAR' if name in texts else 'BIGINT' if name in counts else 'DOUBLE'}'" for name in COLUMNS
+    )
+    with TemporaryDirectory(prefix="tdhil-export-") as folder, closing(_duckdb().connect()) as base:
+        table = Path(folder) / "samples.csv"
+        count = _write_csv(path, table, simulated)
+        whole, quoted = Path(folder) / "samples.parquet", folder.replace("'", "''")
+        base.execute(f"COPY (SELECT * FROM read_csv('{quoted}/samples.csv', header=true, columns={{{typed}}})) "
+                     f"TO '{quoted}/samples.parquet' (FORMAT parquet)")
+        with whole.open("rb") as source, target.open("xb") as file:
+            shutil.copyfileobj(source, file)
     return count
+
+
+def _duckdb() -> Any:
+    from tdhil.fleet import load_duckdb
+
+    return load_duckdb("--to parquet", "take --to csv")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import amount, share
+from tdhil.cli.arguments import TOLERANCE, amount, share
 from tdhil.cli.results import print_json
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
@@ -146,8 +146,8 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
         raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
     if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
         raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
-    if namespace.tolerance is not None and not namespace.tolerance > 0.0:
-        raise UsageError(f"{namespace.tolerance:g}: must be a positive share", where="--tolerance")
+    if namespace.tolerance is not None and not 0.0 < namespace.tolerance < 1.0:
+        raise UsageError(f"{namespace.tolerance:g}: must be {TOLERANCE}", where="--tolerance")
     if not namespace.time_limit > 0.0:
         raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit")
     if not namespace.memory_limit >= 100:

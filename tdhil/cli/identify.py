@@ -133,7 +133,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
 
     Raises TdhilError before the drive is touched; afterwards everything ends in an exit code.
     """
-    from tdhil.cli.dry_run import dry_run, dry_run_course
+    from tdhil.cli.dry_run import dry_run, dry_run_course, say_unreachable
     from tdhil.report import stderr_console
     from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, suited, with_faults
 
@@ -151,8 +151,8 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
 
         check_report_path(namespace.report, Path(options.log))
     _check_files(namespace, options)
+    simulated = options.simulate or not connection.configured
     if namespace.dry_run:
-        simulated = options.simulate or not connection.configured
         if evaluation is not None:
             bench = suited(rig, plan_peer(options, connection).plant)
             profile = connection.profile
@@ -174,6 +174,8 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
         options, connection, peer, rig, consent=consent, operator=namespace.operator, note=namespace.note,
         real_time_priority=namespace.real_time_priority, evaluation=evaluation,
     )
+    if evaluation is None and (said := say_unreachable(options, rig, connection, simulated)) is not None:
+        console.print(said, style="yellow", markup=False)
     return _run(request, console, namespace.report)
 
 

@@ -73,9 +73,16 @@ def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
     return int(namespace.run(namespace))
 
 
+class _Parser(argparse.ArgumentParser):
+    """Its errors are a line, as all others: two dozen lines of usage above them would hide what is wrong."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog.replace(' ', ': ', 1)}: {message}. See {self.prog} --help\n")
+
+
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
     """The parser; only the chosen command's options are built, since python-can's alone cost 150 ms to import."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="tdhil",
         description="Identifies the moment of inertia of a top drive, or of any inverter-driven machine, "
         "with an interval that holds.",

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 # `tdhil profiles show`: all that a person at the drive needs of a profile, on the terminal.
 
 
+_NARROW = 72          # columns; a table of five would lose whole columns below
+_SHOW = "tdhil profiles show NAME tells what to set at the drive and what to look up in its manual."
 _MARKS = {"verified": "", "likely": "likely", "unverified": "UNVERIFIED"}
 
 
@@ -221,6 +223,14 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
         return 0
     from rich.table import Table
 
+    console = _console()
+    if console.width < _NARROW:
+        for profile in profiles:
+            said = row(profile)
+            sure = sure_text(profile) + (", experimental" if said["experimental"] else "")
+            console.print(f"{said['name']}: {said['bus']}; {said['modes']}; {said['watchdog']}; {sure}")
+        console.print(_SHOW)
+        return 0
     table = Table(expand=False)
     for heading in ("profile", "bus", "modes"):
         table.add_column(heading, no_wrap=True)
@@ -230,9 +240,8 @@ def _list(as_json: bool, names: tuple[str, ...] = ()) -> int:
         said = row(profile)
         sure = sure_text(profile) + (", experimental" if said["experimental"] else "")
         table.add_row(said["name"], said["bus"], said["modes"], said["watchdog"], sure)
-    console = _console()
     console.print(table)
-    console.print("tdhil profiles show NAME tells what to set at the drive and what to look up in its manual.")
+    console.print(_SHOW)
     return 0
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
-from tdhil.cli.arguments import amount, share
+from tdhil.cli.arguments import TOLERANCE, amount, share
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
@@ -146,7 +145,7 @@ def _check(namespace: argparse.Namespace) -> None:
     """Numbers that no trace could make sense of. UsageError names the option."""
     for name, low, high, wanted in (
         ("confidence", 0.5, 1.0, "at least 0.5 and below 1"),
-        ("tolerance", 1e-9, math.inf, "a positive share"),
+        ("tolerance", 1e-9, 1.0, TOLERANCE),
         ("rated_torque", 1e-9, 1e9, "a positive number of N·m"),
         ("torque_limit", 1e-9, 1e9, "a positive number of N·m"),
         ("gear", 1e-6, 1e6, "a positive number"),

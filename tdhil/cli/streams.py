@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -37,7 +38,7 @@ class Watched:
 
     def write(self, text: str) -> int:
         if not self._lost:
-            self._try(lambda: self._stream.write(text))
+            self._try(lambda: self._stream.write(_in_columns(text, self._stream.encoding)))
         return len(text)
 
     def flush(self) -> None:
@@ -107,6 +108,27 @@ def _fill_descriptors() -> None:
         except OSError:
             with suppress(OSError):
                 os.open(os.devnull, os.O_RDWR)      # the lowest free one: this
+
+
+def _in_columns(text: str, encoding: str | None) -> str:
+    """``text`` with signs that ``encoding`` has, each line as wide as before where it has spaces to give for that.
+
+    '+-' for '±' would push a table's right edge out of line.
+    """
+    try:
+        text.encode(encoding or "utf-8")
+        return text
+    except (UnicodeEncodeError, LookupError):
+        pass
+    lines = []
+    for line in text.split("\n"):
+        plain = line.encode(encoding or "ascii", _HANDLER).decode(encoding or "ascii")
+        more = len(plain) - len(line)
+        gaps = [gap for gap in re.finditer(" {2,}", plain) if len(gap[0]) > more]
+        if more > 0 and gaps:
+            plain = plain[:gaps[-1].start()] + plain[gaps[-1].start() + more:]
+        lines.append(plain)
+    return "\n".join(lines)
 
 
 def _resembling(error: UnicodeError) -> tuple[str, int]:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
         run_fleet as run_fleet,
     )
     from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings, counted as counted, row_of as row_of
-    from tdhil.fleet.table import read_table as read_table
+    from tdhil.fleet.table import load_duckdb as load_duckdb, read_table as read_table
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
     from tdhil.fleet.trend import (
         Compared as Compared, compare_document as compare_document, identified as identified,

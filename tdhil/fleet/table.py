@@ -108,7 +108,7 @@ def check_table_path(path: Path, folder: Path) -> None:
     """UsageError for an ending that isn't known, a library that is missing, or a file that isn't a fleet's."""
     _writer(path)
     if path.suffix == ".parquet":
-        _duckdb()
+        load_duckdb()
     if path.exists() and not folder.is_dir():
         raise UsageError("is a file that no fleet wrote; it is left as it is", where=f"--out {path}",
                          next_step="Name another")
@@ -160,19 +160,20 @@ def _plain(value: Any) -> Any:
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
 
 
-def _duckdb() -> Any:
+def load_duckdb(where: str = "--out", otherwise: str = "end it in .csv or .sqlite") -> Any:
+    """DuckDB, which reads and writes Parquet. Raises UsageError where it isn't installed; ``otherwise``: than that."""
     try:
         return importlib.import_module("duckdb")
     except ImportError as error:
         python = shlex.quote(sys.executable or "python")
-        raise UsageError("Parquet needs duckdb, not installed here", where="--out",
-                         next_step=f"Install: {python} -m pip install 'duckdb>=1.1,<2'; or end it in .csv or .sqlite",
+        raise UsageError("Parquet needs duckdb, not installed here", where=where,
+                         next_step=f"Install: {python} -m pip install 'duckdb>=1.1,<2'; or {otherwise}",
                          ) from error
 
 
 def _write_parquet(rows: list[dict[str, Any]], path: Path) -> None:
     columns = {name: _DUCKDB[kind] for name, kind in COLUMNS.items()}
-    with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder, closing(_duckdb().connect()) as base:
+    with tempfile.TemporaryDirectory(prefix="tdhil-fleet-") as folder, closing(load_duckdb().connect()) as base:
         lines = Path(folder) / "rows.jsonl"
         lines.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         typed = ", ".join(f"{name}: '{kind}'" for name, kind in columns.items())
@@ -183,7 +184,7 @@ def _write_parquet(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def _read_parquet(path: Path) -> list[dict[str, Any]]:
-    with closing(_duckdb().connect()) as base:
+    with closing(load_duckdb().connect()) as base:
         found = base.execute(f"SELECT * FROM read_parquet('{_quoted(path)}')")
         names = [one[0] for one in found.description]
         return [dict(zip(names, row, strict=True)) for row in found.fetchall()]

@@ -137,31 +137,32 @@ def opinion_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         yield "second opinion", Text.assemble(f"{value}  ", (word, style), f", {opinion['route']}")
 
 
-def friction_rows(document: Mapping[str, Any]) -> Iterator[Row]:
-    """Friction torque at every steady speed of the run, two to a line."""
+def friction_rows(document: Mapping[str, Any], to_a_line: int = 2) -> Iterator[Row]:
+    """Friction torque at every steady speed of the run."""
     points = [f"{p['speed_rad_s']:.2f} rad/s: {_plus_minus(p['torque_nm'])}" for p in document["friction_curve"]]
     if points:
         width = max(len(point) for point in points)
-        pairs = [points[k : k + 2] for k in range(0, len(points), 2)]
+        pairs = [points[k : k + to_a_line] for k in range(0, len(points), to_a_line)]
         yield "friction, N·m", "\n".join("   ".join(f"{point:<{width}}" for point in pair).rstrip() for pair in pairs)
 
 
-def budget_table(budget: Sequence[Mapping[str, Any]], value: float) -> Table:
-    """Where the interval comes from, line by line, largest first."""
+def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool = True) -> Table:
+    """Where the interval comes from, line by line, largest first; ``notes``: and what is meant."""
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
-    table.add_column(style="dim", overflow="fold")
+    if notes:
+        table.add_column(style="dim", overflow="fold")
     table.add_row(Text("what makes it unsure", style="italic"), Text("± kg·m²", style="dim"), Text("± %", style="dim"))
     for line in sorted(budget, key=lambda line: -(line["half_width_kg_m2"] or 0.0)):
-        half = line["half_width_kg_m2"]
+        half, note = line["half_width_kg_m2"], (line["note"],) if notes else ()
         if half is None:
-            table.add_row(line["source"], "open", "", line["note"])
+            table.add_row(line["source"], "open", "", *note)
         elif half < _NOTHING * value:
-            table.add_row(line["source"], "0", "0", line["note"])
+            table.add_row(line["source"], "0", "0", *note)
         else:
-            table.add_row(line["source"], f"{half:.2g}", percent(half, value).strip("±% "), line["note"])
+            table.add_row(line["source"], f"{half:.2g}", percent(half, value).strip("±% "), *note)
     return table
 
 
@@ -184,6 +185,8 @@ def _plus_minus(part: Mapping[str, Any]) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+_NARROW = 72          # columns; below, tables keep their numbers and lose their notes
+
 _VERDICT_STYLE = {
     "valid": "bold green",
     "valid_wide": "bold yellow",
@@ -192,8 +195,9 @@ _VERDICT_STYLE = {
 }
 
 
-def result_card(document: Mapping[str, Any]) -> RenderableType:
-    """A panel of the result document."""
+def result_card(document: Mapping[str, Any], width: int = 80) -> RenderableType:
+    """A panel of the result document; ``width``: columns that there are."""
+    narrow = width < _NARROW
     rows = names_and_texts(())
     verdict = document["verdict"]
     rows.add_row("verdict", Text(verdict, style=_VERDICT_STYLE.get(verdict, "bold")))
@@ -216,7 +220,8 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
     ):
         if (part := document[key]) is not None:
             rows.add_row(title, estimate_text(part, unit))
-    more = (*impedance_rows(document), *compliant_rows(document), *friction_rows(document), *opinion_rows(document))
+    more = (*impedance_rows(document), *compliant_rows(document), *friction_rows(document, 1 if narrow else 2),
+            *opinion_rows(document))
     for title, text in more:
         rows.add_row(title, text)
     if (paper := document["paper"]) is not None and paper["inertia_kg_m2"] is not None:
@@ -227,13 +232,14 @@ def result_card(document: Mapping[str, Any]) -> RenderableType:
     rows.add_row("model", document["model"])
     body: list[RenderableType] = [rows, Text()]
     if inertia is not None and document["budget"]:
-        body += [budget_table(document["budget"], inertia["value"]), Text()]
+        body += [budget_table(document["budget"], inertia["value"], not narrow), Text()]
     body.append(Text(sentence(document["reason"])))
     if document["advice"]:
         body.append(Text(sentence(document["advice"]), style="italic"))
     body += [Text(f"! {warning}", style="yellow") for warning in document["warnings"]]
     body.append(Text(f"log: {document['log']}", style="dim", overflow="fold"))
-    title = "moment of inertia at the motor shaft" + (f" · {SIMULATED}" if document["simulated"] else "")
+    title = "J at the motor shaft" if narrow else "moment of inertia at the motor shaft"
+    title += f" · {SIMULATED}" if document["simulated"] else ""
     return Panel(Group(*body), title=title, border_style="magenta" if document["simulated"] else "blue")
 
 
@@ -257,14 +263,14 @@ def sentence(text: str) -> str:
 
 def print_card(document: Mapping[str, Any], console: Console) -> None:
     """The card, on a console."""
-    console.print(result_card(document))
+    console.print(result_card(document, console.width))
 
 
 def card_text(document: Mapping[str, Any], width: int = 80) -> str:
     """The card as plain text."""
     console = PlainConsole(io.StringIO())
     console.width = width
-    console.print(result_card(document))
+    console.print(result_card(document, console.width))
     return console.file.getvalue()      # type: ignore[attr-defined, no-any-return]
 
 
@@ -272,7 +278,7 @@ def card_html(document: Mapping[str, Any], width: int = 100) -> str:
     """The card as a piece of HTML that brings its own colours: what a notebook shows."""
     console = PlainConsole(io.StringIO(), record=True)
     console.width = width
-    console.print(result_card(document))
+    console.print(result_card(document, console.width))
     return console.export_html(inline_styles=True, code_format=_HTML)
 
 

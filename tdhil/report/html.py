@@ -17,6 +17,7 @@ from tdhil.report.content import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
 
 PDF = ".pdf"
+_SUFFIXES = (PDF, ".html", ".htm")
 _PARTS = re.compile(
     r"<h2>(?P<heading>[^<]*)</h2>|<figure>(?P<svg><svg.*?</svg>)\s*<figcaption>(?P<caption>[^<]*)<", re.DOTALL)
 _TEMPLATE, _STYLE = (files("tdhil.report").joinpath(name).read_text("utf-8")
@@ -31,6 +32,8 @@ def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
         raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf")
     if path.is_dir():
         raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html")
+    if path.suffix.lower() not in _SUFFIXES and (path.is_file() or not path.exists()):      # else a device
+        raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}", next_step="Such as report.html")
     if path.exists() and (path.is_file() or path.is_symlink()):
         raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
                          next_step=f"Name another file, such as {fresh(path).name}, or move that one away")

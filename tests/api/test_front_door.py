@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,6 +76,10 @@ def test_a_result_shows_itself_as_the_card(record, capsys):
     assert html.startswith("<pre") and "moment of inertia at the motor shaft" in html and "SIMULATED" in html
     assert max(map(len, str(result).splitlines())) <= 80
     assert "SIMULATED" in repr(record)
+    assert repr(result) == f"<SIMULATED {result.verdict.value}, {record.log}>"
+    known = {"value": 104.0, "low_total": 100.0, "high_total": 108.0}
+    with_number = replace(result, document={**result.document, "inertia_kg_m2": known})
+    assert "104.0 (100.0 to 108.0) kg·m²" in repr(with_number)
 
 
 @pytest.mark.heavy

@@ -64,6 +64,7 @@ def test_a_key_in_the_manual_s_unit(tmp_path, ours, key, written, value):
     ({"torque_nm": "50 %"}, "", 4, "% is a unit of share, but a torque is wanted"),
     ({"torque_nm": "2 kNm", "probe_torque_nm": "3 kNm"}, "", 8, "must not be above torque_nm, which is 2000"),
     ({"speed_max_rad_s": "1e9 rpm"}, "", 3, "must be at most 100000, not 1.047e+08 (1e9 rpm)"),
+    ({"probe_travel_rad": "3 furlong"}, "", 9, "is no unit of an angle that is known"),
     ({"torque_nm": "1e308"}, "", 4, "must be at most 1e+07"),
     ({}, "run: {seed: 500k}", 10, "a number alone: this key has no unit"),
     ({}, "run: {periods: 5 periods}", 10, "a number alone: this key has no unit"),

@@ -92,6 +92,8 @@ def test_an_older_log_is_kept(tmp_path):
         (("--frequency", "nan"), "--frequency"),
         (("--amplitude", "inf"), "--amplitude"),
         (("--confidence", "95"), "--confidence"),
+        (("--tolerance", "-1%"), "--tolerance"),
+        (("--report", "report.txt"), "ends neither in .html nor in .pdf"),
         (("--real-time", "--stepped"), "exclude"),
         (("--drive", "profibus"), "--drive"),
         (("--drive", "modbus", "-i", "virtual"), "--interface: belongs to CANopen"),
@@ -112,6 +114,7 @@ def test_a_wrong_command_line_ends_with_2_and_names_what_is_wrong(tmp_path, argu
     assert done.code == 2, done.err
     assert said in done.err
     assert "Traceback" not in done.err
+    assert "usage:" not in done.err           # two dozen lines that would hide what is wrong
     assert done.out == ""
 
 

@@ -36,12 +36,13 @@ def test_it_acquires_until_the_interval_is_as_tight_as_asked(tmp_path):
 
 
 @pytest.mark.heavy
-def test_out_of_reach_is_said_before_stage_5_with_what_would_help(tmp_path):
+def test_out_of_reach_is_said_before_motion_with_what_would_help(tmp_path):
     done = identify(tmp_path, "--simulate", *QUICK, "--seed", 1, "--tolerance", "0.02%", "--max-time", "150s")
     assert done.code == 0, done.err
     assert done.document["verdict"] == "valid_wide"
     said = done.err.replace("\n", " ")
-    assert said.index("is not to be expected") < said.index("stage acquire")
+    assert said.index("is not to be expected") < said.index("least to be expected is ±") < said.index("stage setup")
+    assert said.rindex("is not to be expected") > said.index("stage setup")      # again, with what was measured
     assert done.document["advice"] == read_run(done.log).configuration["stopping"]["advice"]
     acquire = done.document["stages"][-1]
     assert acquire["duration_s"] <= 160.0

@@ -37,6 +37,10 @@ def refused(text: str) -> list[tuple[int, str]]:
     return [(problem.line, problem.message) for problem in caught.value.problems]
 
 
+def test_where_a_number_is_wanted_no_truth_value_is_advised() -> None:
+    assert refused("a: yes") == [(1, "a: a number is wanted, not the text 'yes'")]
+
+
 @pytest.mark.parametrize(
     ("text", "key", "value"),
     [

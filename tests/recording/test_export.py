@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -104,19 +105,22 @@ def test_samples_as_csv_to_the_last_bit(log, tmp_path):
 
 
 def test_samples_as_parquet(log, tmp_path):
-    pq = pytest.importorskip("pyarrow.parquet")
+    duckdb = pytest.importorskip("duckdb")
     target = tmp_path / "samples.parquet"
     assert main(["export", str(log), "--to", "parquet", "-o", str(target)]) == 0
-    table = pq.read_table(target).to_pydict()
+    found = duckdb.sql(f"SELECT * FROM read_parquet('{target}')")
+    types = dict(zip(found.columns, map(str, found.types), strict=True))
+    assert (types["torque_nm"], types["state"], types["fresh"]) == ("DOUBLE", "VARCHAR", "BIGINT")
+    table = dict(zip(found.columns, zip(*found.fetchall(), strict=True), strict=True))
     samples = list(read_samples(log))
-    assert table["torque_nm"] == [one.torque_nm for one in samples]
-    assert table["torque_demand_nm"] == [one.torque_demand_nm for one in samples]
+    for name in ("time_s", "speed_rad_s", "torque_nm", "torque_demand_nm"):
+        assert list(table[name]) == [getattr(one, name) for one in samples]
 
 
 def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch):
     there = tmp_path / "there.csv"
     there.write_text("mine")
-    monkeypatch.setattr("tdhil.cli.export.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "duckdb", None)
     modbus = tmp_path / "modbus.mcap"
     with RunWriter(modbus, epoch_ns=0, block=True, frames=MODBUS) as writer:
         writer.configuration({"drive": "modbus"}, {})
@@ -124,7 +128,7 @@ def test_what_is_missing_is_said_in_one_line(log, tmp_path, capsys, monkeypatch)
         writer.configuration({"drive": "modbus"}, {"simulated": FACTS["simulated"]})
     for arguments, said in (
         ([str(log), "--to", "csv", "-o", str(there)], "is there already"),
-        ([str(log), "--to", "parquet", "-o", str(tmp_path / "a")], "pip install pyarrow"),
+        ([str(log), "--to", "parquet", "-o", str(tmp_path / "a")], "pip install 'duckdb"),
         ([str(tmp_path / "no.mcap"), "--to", "csv"], "there is no such log"),
         ([str(modbus), "--to", "candump", "-o", str(tmp_path / "b")], "has no CAN frames in it"),
     ):

@@ -25,6 +25,15 @@ def test_no_line_is_wider_than_the_terminal(make, width):
     assert max(map(len, shown(make(), width).splitlines())) <= width
 
 
+def test_on_forty_columns_no_number_and_no_warning_is_cut_off():
+    card = shown(full(), width=40)
+    assert max(map(len, card.splitlines())) <= 40
+    assert "J at the motor shaft · SIMULATED" in card
+    assert "…" not in card
+    assert "what makes it unsure" in card
+    assert "83.1 ± 1.5" in card
+
+
 def test_every_part_is_shown():
     card = shown(full())
     for wanted in (

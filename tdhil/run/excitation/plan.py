@@ -326,7 +326,8 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
     if wish.periods is not None:
         if wish.periods < settle + 1:
             raise PlanRefused(
-                f"{wish.periods} periods are too few: {settle} go to settling", f"Give --periods {settle + 1} or more"
+                f"{wish.periods} periods are too few where {settle} of them settle",
+                f"Give --periods {settle + 1} or more",
             )
         return wish.periods
     at_one_speed_s = periodic_kind(wish.kind).at_one_speed_s
@@ -345,11 +346,11 @@ def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tupl
     offsets = wish.offsets_rad_s or _default_offsets(fit, wish)
     largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets)
     if largest <= 0.0:
-        raise PlanRefused(f"{limit} leaves no room for any excitation about {where:g} rad/s")
+        raise PlanRefused(f"{limit} leaves no room for any excitation about {where:.3g} rad/s")
     amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
     if amplitude > largest * (1.0 + 1e-9):
         raise PlanRefused(
-            f"{limit}: an amplitude of {amplitude:g} rad/s about {where:g} rad/s does not fit; "
+            f"{limit}: an amplitude of {amplitude:g} rad/s about {where:.3g} rad/s does not fit; "
             f"{largest:.3g} rad/s would"
         )
     return amplitude, tuple(offsets)
