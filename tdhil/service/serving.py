@@ -170,7 +170,7 @@ def serve(
             publisher.close()
         listening.close()
         alone.close()
-    left = supervisor.live()
+    left = sorted({*supervisor.live(), *supervisor.not_at_rest})
     if left:
         say(f"NOT at rest, as far as is known: {', '.join(left)}. Use the hard-wired stop.")
         return int(ExitCode.STOP_NOT_CONFIRMED)

@@ -67,6 +67,7 @@ class Supervisor:
         self._unindexed: set[str] = set()
         self._to_index: set[str] = set()               # those that have just ended
         self._braking = False
+        self.not_at_rest: list[str] = []               # of those that `brake` stopped
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._notes: list[threading.Thread] = []
@@ -95,15 +96,27 @@ class Supervisor:
             thread.join(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
-        """Begin no more runs, ask all to stop, and wait until they have ended; have they?"""
+        """Begin no more runs, ask all to stop, and wait until they have ended; have they?
+
+        `not_at_rest` has those of which nobody knows that they are, ended or not.
+        """
         with self._asking:             # who is about to begin one has begun it, and it is among those that are stopped
             self._braking = True
-        for run in self.live():
+        stopping = self.live()
+        for run in stopping:
             with suppress(Exception):
                 self.stop(run, who)
+        if stopping:
+            self._say(f"Braking: run {', '.join(stopping)}. It waits for rest, {within_s:.0f} s at most."
+                      " If a shaft turns on, use the hard-wired stop.")
         end_s = time.monotonic() + within_s
         while self.live() and time.monotonic() < end_s:
             time.sleep(LOOK_S)
+        for run in stopping:
+            state = self.store.status(run).state
+            self._say(f"run {run}: {state}")
+            if run in self._live or state is State.STOP_NOT_CONFIRMED:
+                self.not_at_rest.append(run)
         return not self.live()
 
     # -- what is asked for ---------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 """A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
 
-``done`` | ``hold`` (moves until it is stopped) | ``ask`` (wants the code first; where its rig is watched, it then moves
-until it is stopped, or watched no more) | ``frozen`` (hears no stop) | ``die`` (killed while it moves)
+``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``ask`` (wants
+the code first; where its rig is watched, it then moves until it is stopped, or watched no more) | ``frozen`` (hears no
+stop) | ``die`` (killed while it moves)
 """
 
 from __future__ import annotations
@@ -84,11 +85,11 @@ def main(folder: Path) -> None:
         if what == "die":
             time.sleep(0.3)
             os.kill(os.getpid(), signal.SIGKILL)
-        while what in ("hold", "deaf", "frozen") and not stop.asked:
+        while what in ("hold", "loose", "deaf", "frozen") and not stop.asked:
             time.sleep(0.01)
-        if stop.asked:
+        if stop.asked and what != "loose":
             end(board, State.STOPPED, 143)
-        elif what == "unseen":
+        elif what in ("unseen", "loose"):
             end(board, State.STOP_NOT_CONFIRMED, 8)
         else:
             write_json(folder / "result.json", RESULT)

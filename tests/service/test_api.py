@@ -560,10 +560,14 @@ def test_a_new_web_finds_the_run_of_the_old_one(call, service, tmp_path, rigs):
 
 
 def test_a_service_that_ends_begins_nothing_and_waits_for_rest(call, service):
-    run = call.start(what="hold")["id"]
-    service.wait(run, "moving")
+    run, loose = call.start(what="hold")["id"], call.start("b", what="loose")["id"]
+    for one in (run, loose):
+        service.wait(one, "moving")
     assert service.supervisor.brake("service ending")
     assert service.store.status(run).state is State.STOPPED
+    assert service.supervisor.not_at_rest == [loose]
+    assert service.said[-3].startswith(f"Braking: run {run}, {loose}. It waits for rest")
+    assert service.said[-2:] == [f"run {run}: stopped", f"run {loose}: stop_not_confirmed"]
     assert "is ending" in call.start("b", expect=409)["error"]["what"]
 
 

@@ -267,6 +267,13 @@ def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, a
     assert not (tmp_path / "d").exists()
 
 
+def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("tdhil.service.serving._uvicorn",
+                        lambda app, listening, brake, *_: brake.__self__.not_at_rest.append("R1"))
+    assert main(["serve", "--port", "0", "--data", str(tmp_path / "data")]) == ExitCode.STOP_NOT_CONFIRMED
+    assert "NOT at rest, as far as is known: R1. Use the hard-wired stop." in capsys.readouterr().err
+
+
 def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):
     for name in ("a.yaml", "rig 7.yaml", "b.yml", "notes.txt"):
         (tmp_path / name).write_text("run: {simulate: true}\n")
