@@ -80,7 +80,7 @@ def test_entry_point(wheel, names):
     (path,) = [name for name in names if name.endswith(".dist-info/entry_points.txt")]
     parser = configparser.ConfigParser()
     parser.read_string(wheel.read(path).decode())
-    assert dict(parser["console_scripts"]) == {"tdhil": "tdhil.cli.main:console"}
+    assert dict(parser["console_scripts"]) == {"tdhil": "tdhil.__main__:console"}
 
 
 def test_it_runs_from_the_wheel_alone(wheel, tmp_path):

@@ -175,3 +175,19 @@ print(sorted(set(sys.modules) - before | slow & before), file=sys.stderr)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, cwd=tmp_path,
                           env=clean_environment())
     assert done.stderr.splitlines()[-1] == "[]"
+
+
+def test_ctrl_c_while_the_command_line_is_imported(monkeypatch, capsys):
+    from tdhil.__main__ import console
+
+    class Interrupts:
+        def find_spec(self, name, *_):
+            if name == "tdhil.cli.main":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "tdhil.cli.main")
+    monkeypatch.setattr(sys, "meta_path", [Interrupts(), *sys.meta_path])
+    with pytest.raises(SystemExit) as ended:
+        console()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "tdhil: interrupted\n"
