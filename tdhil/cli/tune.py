@@ -170,16 +170,16 @@ def _string(
         why = ("leaves the spring's stiffness or its swing open" if shaft else "is of a rigid shaft")
         raise UsageError(f"--string is missing, and the result {why}", where=str(namespace.result),
                          next_step="--string string.yaml (docs/soft_torque.md) names the pipe and what hangs on it")
-    low, k, high = (ratio**2 * one for one in spring)
-    slow, hertz, fast = swing
+    loss = _three(shaft.get("damping_nm_s_rad")) or (0.0, 0.0, 0.0)
+    values = [(one[0], one[1], one[2]) for one in (spring, swing, loss)]
 
-    def string(stiffness: float, hertz: float) -> DrillString:
-        return spring_and_mass(stiffness, hertz, f"k and J_L as identified ({result.get('model')})")
+    def string(*ends: int) -> DrillString:
+        k, hertz, damping = (values[at][end] for at, end in enumerate(ends))
+        return spring_and_mass(ratio**2 * k, hertz, ratio**2 * damping,
+                               f"k and J_L as identified ({result.get('model')})")
 
-    return string(k, hertz), (
-        (Moved(string=string(low, hertz)), Moved(string=string(high, hertz))),
-        (Moved(string=string(k, slow)), Moved(string=string(k, fast))),
-    )
+    moved = ((0, 1, 1), (2, 1, 1)), ((1, 0, 1), (1, 2, 1)), ((1, 1, 0), (1, 1, 2))
+    return string(1, 1, 1), tuple((Moved(string=string(*low)), Moved(string=string(*high))) for low, high in moved)
 
 
 def _three(part: Any) -> tuple[float, float, float] | None:
@@ -334,9 +334,9 @@ def _tuned_for(
         warnings.append("the lags inside the loop are assumed; they decide how much of J can be compensated: state "
                         "them with --inner-lags")
     if namespace.string is None:
-        warnings.append("|r|, a and what swings above the lowest mode rest on a spring with a tenth of its load's "
-                        "weight, and without mud: name the pipe in a string.yaml for them, and the bit for critical "
-                        "speeds")
+        warnings.append("|r|, a and what swings above the lowest mode rest on a spring that is taken to weigh a tenth "
+                        "of its load, and to damp by 0.01 at the least: name the pipe in a string.yaml for them, and "
+                        "the bit for critical speeds")
     elif tuning.case.string.bit is None:
         warnings.append("no bit is stated in string.yaml: critical speeds need one")
     return TunedFor(str(namespace.result), bool(result.get("simulated")),

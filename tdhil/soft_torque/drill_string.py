@@ -197,6 +197,8 @@ class DrillString:
     bottom_viscous_nm_s_rad: float = 0.0
     bit: BitFriction | None = None
     name: str | None = None
+    supposed: bool = False
+    """Its waves and their losses are supposed: of a spring that was identified nobody knows them."""
 
     @property
     def impedance_nm_s_rad(self) -> float:
@@ -290,19 +292,26 @@ def load_string(path: Path) -> DrillString:
     return string_of(load_model(path, StringFile))
 
 
-SPRING_SHARE = 0.1
-"""Of its load's inertia, that a spring whose weight nobody knows is taken to have: waves need some."""
+SPRING_SHARE, SPRING_LOSS = 0.1, 0.03
+"""Of its load's inertia, that a spring whose weight nobody knows is taken to have: waves need some. And the damping
+ratio of its own first wave: with none at all the stiffest loops would swing on waves that nobody has seen."""
 
 
-def spring_and_mass(stiffness_nm_rad: float, antiresonance_hz: float, name: str | None = None) -> DrillString:
-    """A load on a spring, as identified: no mud, no bit; with its top held it swings at ``antiresonance_hz``.
+def spring_and_mass(
+    stiffness_nm_rad: float, antiresonance_hz: float, damping_nm_s_rad: float = 0.0, name: str | None = None
+) -> DrillString:
+    """A load on a spring, as identified, without a bit; with its top held it swings at ``antiresonance_hz``.
 
     One light line with K and its share of the load. A mass m on a line with inertia J_s swings as m + J_s/3 on a
-    spring does, to the second order of J_s/m (Rayleigh), and exactly as ωT tan ωT = J_s/m has it; that is used.
+    spring does, to the second order of J_s/m (Rayleigh), and exactly as ωT tan ωT = J_s/m has it; that is used. Of the
+    loss along the line a third counts at the load, where the rest of the spring's ``damping_nm_s_rad`` is put: with the
+    top held it is the same there. (The line's alone damps that swing by 0.010.)
     """
     swing = 2.0 * pi * antiresonance_hz
     load = stiffness_nm_rad / swing**2
     inertia = SPRING_SHARE * load
-    way = swing * sqrt(inertia / stiffness_nm_rad)       # ωT
-    line = Line(1.0, inertia, 1.0 / stiffness_nm_rad, 0.0)
-    return DrillString((line,), inertia / (way * tan(way)), name=name)
+    delay_s = sqrt(inertia / stiffness_nm_rad)
+    drag = 2.0 * SPRING_LOSS * inertia * pi / delay_s
+    line = Line(1.0, inertia, 1.0 / stiffness_nm_rad, drag)
+    mass = inertia / (swing * delay_s * tan(swing * delay_s))
+    return DrillString((line,), mass, max(0.0, damping_nm_s_rad - drag / 3.0), name=name, supposed=True)

@@ -64,6 +64,8 @@ NEXT_MODE_SHARE = 0.85
 """Of the second mode with the top held, that the whole's second mode stays above: there a top drive is a rotor, or a
 wall."""
 _LEAST_SOFT, _MOST_SOFT = 0.02, 2.0
+_WAVES_SUPPOSED = ("what inertia compensation does to the pipe's waves, and whether their losses keep it stable, is "
+                   "not known of a spring alone: the pipe has to be named (string.yaml)")
 
 
 class TuningRefused(TdhilError):
@@ -272,6 +274,10 @@ def _soft(case: TuneCase, held: Sequence[float]) -> Tuned:
 
 def _compensated(case: TuneCase, held: Sequence[float]) -> Tuned:
     asked = case.compensated_share
+    if case.string.supposed:
+        if asked:
+            raise TuningRefused(_WAVES_SUPPOSED, where=f"--compensate {asked:g}", next_step="--string string.yaml")
+        return Tuned("compensated", None, _WAVES_SUPPOSED)
     start = case.softness if case.softness is not None else 0.3
     largest = largest_stable_share(case, start, held)
     if asked is not None:
@@ -306,6 +312,8 @@ def _compensated(case: TuneCase, held: Sequence[float]) -> Tuned:
 
 
 def _broadband(case: TuneCase, held: Sequence[float]) -> Tuned:
+    if case.string.supposed:
+        return Tuned("broadband", None, _WAVES_SUPPOSED)
     best: tuple[float, float, float, float] | None = None
     largest = 0.0
     softness: float
