@@ -234,6 +234,11 @@ class Guard:
         if command.mode is Mode.TORQUE and self.model is not None:
             self._check_window(self.model, command, sample.speed_rad_s, where)
 
+    @property
+    def least_torque_nm(self) -> float:
+        """What a stage may command at least in torque mode: a slow loop that would ask for less asks for this."""
+        return 0.0 if self.no_braking else -self._limits.torque_nm
+
     @staticmethod
     def foresight_s(assumptions: ControlAssumptions) -> float:
         """What a plan must keep free: the guard adds this times the acceleration to the speed."""

@@ -72,6 +72,20 @@ def test_acquire_keeps_to_it_with_what_the_slow_loop_adds(world):
     assert max(torques(here)) == LIMITS.torque_nm
 
 
+def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):
+    """It would, of a shaft that is faster than it should be; the guard would end the run on it."""
+    model = RigGuess(200.0, 0.0, 50.0)
+    for stage in ("hold", "acquire"):
+        here = turning(world, FakeDrive(inertia=1e4), speed=9.0)
+        here.guard.no_braking = "the string would hide its answer"
+        control = MeanSpeedControl(model, 1000.0, ControlAssumptions())
+        with pytest.raises(Seen):
+            if stage == "hold":
+                run_hold(here.bench, LIMITS, model, control, 1.0, 0.5, 0.01)
+            Follower(here.bench, LIMITS, Mode.TORQUE, control).follow(lambda _: (1.0, 50.0), 5.0)
+        assert min(torques(here)) == 0.0
+
+
 def test_coasting_ends_where_nothing_slows_the_shaft(world):
     """Friction was taken too high by far: after twice the planned time it is held again."""
     guess = RigGuess(100.0, 2.0, 20.0)

@@ -93,6 +93,7 @@ class Follower:
         limits = self._limits
         if self._control is not None:
             torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
+            torque_nm = max(self._loop.guard.least_torque_nm, torque_nm)
         torque_nm = max(-limits.torque_nm, min(limits.torque_nm, torque_nm))
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
         setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))

@@ -189,7 +189,7 @@ def plan_pulse(
         return NoPulse(
             f"the string takes the shaft ±{before.wander_rad_s:.2g} rad/s from its mean, which would hide the"
             f" {slowing:.2g} rad/s that {braking_nm:.3g} N·m would slow it by",
-            f"{LIGHTEN}; or use --mode speed",
+            f"{LIGHTEN}; a lower limits.torque_nm would allow a longer one; or use --mode speed",
         )
     highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
     return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)

@@ -81,7 +81,7 @@ def run_hold(
         wanted += step
         correction = control.update(wanted - reported, loop.period_s)
         ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / loop.period_s
-        torque = max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))
+        torque = max(loop.guard.least_torque_nm, min(limits.torque_nm, ahead_nm + correction))
         sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
         reported = sample.speed_rad_s
         recent.append(reported)
