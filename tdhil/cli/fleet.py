@@ -129,12 +129,13 @@ def _stamp(log: str) -> tuple[int, int]:
 
 
 def _tell(row: FleetRow, as_json: bool) -> None:
-    from tdhil.report import PlainConsole
+    from tdhil.report import SIMULATED, PlainConsole
 
     if as_json:
         sys.stdout.write(json.dumps(asdict(row), ensure_ascii=False) + "\n")
     else:
-        PlainConsole().print(f"{row.log}: {_result_text(row)}", soft_wrap=True)
+        simulated = f"{SIMULATED} " if row.simulated else ""
+        PlainConsole().print(f"{simulated}{row.log}: {_result_text(row)}", soft_wrap=True)
     sys.stdout.flush()
 
 
@@ -207,7 +208,7 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
         print_json(summary.document())
         return
     from tdhil.fleet import counted
-    from tdhil.report import PlainConsole
+    from tdhil.report import SIMULATED, PlainConsole
 
     console = PlainConsole()
     found = summary.document()
@@ -216,6 +217,8 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
     logs = counted(found["logs"], "log")
     console.print(f"{logs}{before}{left} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
     console.print(_counts(found))
+    if found["simulated"]:
+        console.print(f"{found['simulated']} of them {SIMULATED}", style="magenta")
     _list(console, "failed", [f"{one['log']}: {one['text']}" for one in found["failures"]])
     _list(console, "from a part of the run", [f"{one['log']}: {one['text']}" for one in found["in_part"]])
     _list(console, "other than the result in the log", [

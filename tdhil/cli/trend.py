@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import html
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +24,7 @@ _COLOURS = ("#0b5cad", "#c2410c", "#15803d", "#7e22ce", "#525252", "#b45309", "#
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of trend."""
     parser.add_argument("table", type=Path, metavar="FILE", help="a table that `tdhil fleet` wrote")
-    parser.add_argument("--rig", required=True, metavar="NAME", help="whose results, by its name in rig.yaml")
+    parser.add_argument("--rig", metavar="NAME", help="whose results, by its name in rig.yaml (default: the only one)")
     _add_output(parser)
     parser.set_defaults(run=run)
 
@@ -53,8 +55,10 @@ def run(namespace: argparse.Namespace) -> int:
     else:
         _print_trend(document)
     if namespace.report is not None:
-        title = f"{document['rig']} over time"
+        title = f"{document['rig']} over time{_simulated(document)}"
         lines = [f"{one['name']}: {one['text']}" for one in document["quantities"]] + list(document["notes"])
+        if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
+            lines.append("hollow: a result from a part of the run")
         _write(namespace.report, title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
     return 0
 
@@ -79,7 +83,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
         _print_compared(document)
     if namespace.report is not None:
         lines = [f"{one['to']}: {one['text']}" for one in document["differences"]]
-        _write(namespace.report, "Runs compared", lines, _settings_html(document),
+        _write(namespace.report, f"Runs compared{_simulated(document)}", lines, _settings_html(document),
                lambda figure: _draw_curves(figure, document), (7.2, 3.4))
     return 0
 
@@ -94,8 +98,8 @@ def _print_trend(document: Mapping[str, Any]) -> None:
 
     console = PlainConsole()
     stand = "stands" if document["results"] == 1 else "stand"
-    console.print(f"rig {document['rig']}: {counted(document['results'], 'result')} that {stand}, of "
-                  f"{counted(document['logs'], 'log')}", soft_wrap=True)
+    results, logs = counted(document["results"], "result"), counted(document["logs"], "log")
+    console.print(f"rig {document['rig']}{_simulated(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
     for one in document["quantities"]:
         console.print(f"{one['name']}: {one['text']}", soft_wrap=True)
     for note in document["notes"]:
@@ -108,6 +112,8 @@ def _print_compared(document: Mapping[str, Any]) -> None:
     from tdhil.report import PlainConsole
 
     console = PlainConsole()
+    if document["simulated"]:
+        console.print(_simulated(document).strip(" ·"), style="magenta")
     table = Table(box=None, pad_edge=False)
     table.add_column("")
     table.add_column("setting")
@@ -127,6 +133,13 @@ def _print_compared(document: Mapping[str, Any]) -> None:
                 for other in one["quantities"] if other["column"] != "inertia_kg_m2"]
         if rest:
             console.print("  " + ", ".join(rest), soft_wrap=True)
+
+
+def _simulated(document: Mapping[str, Any]) -> str:
+    """For a title: said where any of the runs was none of a real shaft."""
+    from tdhil.report import SIMULATED
+
+    return f" · {SIMULATED}" if document["simulated"] else ""
 
 
 def _headings(logs: Sequence[str]) -> Sequence[str]:
@@ -188,23 +201,31 @@ def _write(
 
 
 def _draw_trend(figure: FigureBase, document: Mapping[str, Any]) -> None:
+    dates: Any = import_module("matplotlib.dates")
     shown = [one for one in document["quantities"] if one["points"]]
-    axes: Any = figure.subplots(max(1, len(shown)), 1, squeeze=False)[:, 0]
+    axes: Any = figure.subplots(max(1, len(shown)), 1, squeeze=False, sharex=True)[:, 0]
     for one, axis in zip(shown, axes, strict=False):
-        points = one["points"]
-        places = range(len(points))
-        values = [point["value"] for point in points]
-        axis.errorbar(
-            places, values, fmt="o", ms=3, lw=1, color=_COLOURS[0],
-            yerr=[[max(0.0, point["value"] - point["low"]) for point in points],
-                  [max(0.0, point["high"] - point["value"]) for point in points]])
-        logs = [point["log"] for point in points]
+        for in_part, face in ((False, _COLOURS[0]), (True, "white")):
+            points = [point for point in one["points"] if (point["in_part"] is not None) is in_part]
+            axis.errorbar(
+                [_moment(point["date"]) for point in points], [point["value"] for point in points],
+                fmt="o", ms=3.5, lw=1, color=_COLOURS[0], mfc=face,
+                yerr=[[max(0.0, point["value"] - point["low"]) for point in points],
+                      [max(0.0, point["high"] - point["value"]) for point in points]])
         for change in one["changes"]:
-            axis.axvline(logs.index(change["after"]) - 0.5, color=_COLOURS[1], lw=1)
+            before, after = _moment(change["before_date"]), _moment(change["after_date"])
+            axis.axvline(before + (after - before) / 2, color=_COLOURS[1], lw=1)
         axis.set_ylabel(f"{one['name']}\n{one['unit']}")
         axis.grid(alpha=0.3)
-        step = max(1, len(points) // 8)
-        axis.set_xticks([*places][::step], [str(point["date"] or "")[:10] for point in points][::step])
+    locator = dates.AutoDateLocator(minticks=3, maxticks=8)
+    axes[-1].xaxis.set_major_locator(locator)
+    axes[-1].xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
+    figure.align_ylabels(list(axes))
+
+
+def _moment(date: str) -> datetime:
+    """Of a row's date; one without a zone is taken for this computer's."""
+    return datetime.fromisoformat(date).astimezone(UTC)
 
 
 def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
@@ -216,7 +237,8 @@ def _draw_curves(figure: FigureBase, document: Mapping[str, Any]) -> None:
             [line["hertz"] for line in known], [line["value"] for line in known],
             yerr=[[max(0.0, line["value"] - line["low"]) for line in known],
                   [max(0.0, line["high"] - line["value"]) for line in known]],
-            fmt="o", ms=3, lw=1, color=_COLOURS[number % len(_COLOURS)], label=heading)
+            # rings, one around the other: runs that agree don't hide each other
+            fmt="o", ms=3 + 3 * number, mfc="none", lw=1, color=_COLOURS[number % len(_COLOURS)], label=heading)
     axis.set_xlabel("Hz")
     axis.set_ylabel("apparent inertia, kg·m²")
     axis.grid(alpha=0.3)

@@ -73,6 +73,7 @@ class FleetSummary:
             "failed": dict(sorted(Counter(row.error_kind for row in self.rows if row.failed).items(), key=str)),
             "failures": [{"log": row.log, "kind": row.error_kind, "text": row.error_text}
                          for row in self.rows if row.failed],
+            "simulated": sum(row.simulated is True for row in self.rows),
             "in_part": [
                 {"log": row.log, "aborted_stage": row.aborted_stage, "aborted_by": row.aborted_by,
                  "complete": row.complete, "text": row.part_text}

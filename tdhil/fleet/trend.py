@@ -57,16 +57,20 @@ def drive_of(row: FleetRow) -> str | None:
     return None if row.rig is None else "assumed " + "|".join(str(one) for one in named)
 
 
-def trend_document(rows: Sequence[FleetRow], rig: str) -> dict[str, Any]:
+def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str, Any]:
     """What a rig's results say over time, as ``tdhil trend --json`` prints it. Raises UsageError for an unknown rig.
+
+    None: the one rig that the table names; where it names more, a UsageError lists them.
 
     Only results that stand count. Differences have the torque scale taken out where it is one drive's.
     """
-    mine = [row for row in rows if row.rig == rig]
+    known = sorted({row.rig for row in rows if row.rig is not None})
+    if rig is None and len(known) == 1:
+        rig = known[0]
+    mine = [row for row in rows if row.rig == rig and rig is not None]
     if not mine:
-        known = sorted({row.rig for row in rows if row.rig is not None})
         shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
-        raise UsageError(f"no log is of a rig {rig!r}", where="--rig",
+        raise UsageError("which rig?" if rig is None and known else f"no log is of a rig {rig or ''!r}", where="--rig",
                          next_step=f"There are: {shown}" if known else "No log in the table names its rig: `name:` in "
                          "rig.yaml does, or `rig:` in the .yaml beside a trace")
     standing = [row for row in mine if row.verdict in _GOOD]
@@ -92,6 +96,7 @@ def trend_document(rows: Sequence[FleetRow], rig: str) -> dict[str, Any]:
         notes.append("the drive tells no serial number: runs on this rig are taken for runs on one drive")
     return {
         "rig": rig, "logs": len(mine), "results": len(kept), "notes": notes,
+        "simulated": any(row.simulated for _, row in kept),
         "quantities": [_followed(quantity, kept) for quantity in QUANTITIES],
     }
 
@@ -123,16 +128,28 @@ def _followed(quantity: Quantity, rows: Sequence[tuple[float, FleetRow]]) -> dic
 
 def _trend_text(found: History, document: Mapping[str, Any], unit: str) -> str:
     if not found.changed:
-        return f"no change is named: \"no change\" has {found.none:.0%}"
+        return f"no change is named: that there was none is {_probable(found.none)}"
     if found.drift_change is not None:
         return (f"drifts by {_change_text(found.drift_change, unit)} from first to last "
-                f"(a change {1 - found.none:.1%}, a drift {found.drift:.0%})")
+                f"(that there was a change is {_probable(1 - found.none)}, an even drift {_probable(found.drift)})")
     steps = [
-        f"changed by {_change_text(point.change, unit)} between {one['before_date'] or one['before']} and "
-        f"{one['after_date'] or one['after']} (a step {point.probability:.1%}, just there {point.here:.0%})"
+        f"changed by {_change_text(point.change, unit)} {_between(one)} "
+        f"(that there was a step is {_probable(point.probability)}, at just this place {_probable(point.here)})"
         for point, one in zip(found.changes, document["changes"], strict=True)
     ]
-    return "; ".join(steps) or f"changed ({1 - found.none:.1%}), but where isn't clear"
+    return "; ".join(steps) or f"changed ({_probable(1 - found.none)}), but where isn't clear"
+
+
+def _probable(share: float) -> str:
+    """``93 % probable``; what isn't quite certain is not rounded to 100 %."""
+    return "over 99.9 % probable" if share > 0.999 else f"{100.0 * share:.3g} % probable"
+
+
+def _between(change: Mapping[str, Any]) -> str:
+    before, after = (change[f"{end}_date"] or change[end] for end in ("before", "after"))
+    if before[:10] != after[:10]:
+        return f"between {before[:10]} and {after[:10]}"
+    return f"between {before[:16].replace('T', ' ')} and {after[:16].replace('T', ' ')}"
 
 
 def _change_text(change: Difference, unit: str) -> str:
@@ -225,6 +242,7 @@ def compare_document(runs: Sequence[Compared]) -> dict[str, Any]:
     first, *others = runs
     return {
         "logs": [run.row.log for run in runs],
+        "simulated": any(run.row.simulated for run in runs),
         "results": [asdict(run.row) for run in runs],
         "settings": [
             {"name": name, "values": [run.settings[name] for run in runs],

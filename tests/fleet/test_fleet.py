@@ -91,6 +91,7 @@ def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
     assert "from a part of the run:" in text
     assert "3.mcap: aborted in stage acquire (DriveFault)" in text
     assert "4.mcap: log cut short" in text
+    assert "5 of them SIMULATED" in text
     rows = read_table(out)
     assert [(row.aborted_stage, row.aborted_by, row.complete) for row in rows] == [
         *[(None, None, True)] * 3, ("acquire", "DriveFault", True), (None, None, False)]

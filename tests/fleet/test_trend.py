@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -43,7 +44,8 @@ def test_a_step_is_named_with_its_place_and_size():
     assert "changed by +" in inertia["text"]
     assert f"between 2026-01-{at:02d}" in inertia["text"]
     assert lag["changes"] == []
-    assert "no change is named" in lag["text"]
+    assert "no change is named: that there was none is 9" in lag["text"]
+    assert f"between 2026-01-{at:02d} and 2026-01-{at + 1:02d} (" in inertia["text"]
     assert document["quantities"][1]["text"].startswith("0 results: 4 are needed")
     assert document["notes"] == []
     json.dumps(document, allow_nan=False)
@@ -59,8 +61,35 @@ def test_what_was_left_out_and_assumed_is_said():
         "simulated runs and real ones are mixed", "the drive tells no serial number"]
     two = trend_document([*found[:12], *(replace(row, drive_serial=9) for row in found[12:])], "R7")
     assert any("2 drives" in note for note in two["notes"])
+    assert trend_document(found)["rig"] == "R7"      # the only one
+    with pytest.raises(UsageError, match=r"which rig.*There are: R7, R8"):
+        trend_document([*found, FleetRow("other.mcap", "valid", rig="R8")])
+    with pytest.raises(UsageError, match="No log in the table names its rig"):
+        trend_document([FleetRow("other.mcap", "valid")])
     with pytest.raises(UsageError, match="There are: R7"):
         trend_document(found, "R9")
+
+
+def test_dates_of_a_trend_s_picture_can_be_read(tmp_path):
+    """On an axis of time, under the last of the pictures alone, and no two over each other."""
+    from matplotlib.figure import Figure
+
+    from tdhil.cli.trend import _draw_trend
+
+    found, _ = rows("step 5 %")
+    found[3] = replace(found[3], aborted_stage="acquire", aborted_by="DriveFault", simulated=True)
+    document = trend_document(found, "R7")
+    assert document["simulated"]
+    figure = Figure((7.2, 7.5), layout="constrained")
+    _draw_trend(figure, document)
+    figure.draw_without_rendering()
+    *above, last = figure.axes
+    assert not any(label.get_visible() for axis in above for label in axis.get_xticklabels())
+    places = [label.get_window_extent() for label in last.get_xticklabels() if label.get_text()]
+    assert len(places) > 2
+    assert all(one.x1 < other.x0 for one, other in pairwise(places))
+    hollow = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "white"]
+    assert [len(line.get_xdata()) for line in hollow if line.get_marker() == "o"] == [1]
 
 
 def test_the_command_trend(table, tmp_path, capsys):
@@ -72,7 +101,7 @@ def test_the_command_trend(table, tmp_path, capsys):
     assert "changed by +" in text
     assert main(["trend", str(table), "--rig", "R7", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["results"] == 24
-    for wrong in (["--rig", "R9"], ["--rig", "R7", "--report", str(report)], ["--rig", "R7", "--report", "x.txt"]):
+    for wrong in ([], ["--rig", "R9"], ["--rig", "R7", "--report", str(report)], ["--rig", "R7", "--report", "x.txt"]):
         assert main(["trend", str(table), *wrong]) == 2
     assert main(["trend", str(tmp_path / "none.csv"), "--rig", "R7"]) == 2
 
