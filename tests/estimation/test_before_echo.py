@@ -170,10 +170,12 @@ def test_the_torques_answer_closes_what_its_filter_left_open(record):
     assert not any("follows its setpoint" in one for one in identify(stated).inertia.conditional_on)
 
 
-def test_lines_that_the_string_drowns_name_it(record):
+@pytest.mark.parametrize("strongest_nm", (5.0, 4000.0), ids=("all", "all but one"))
+def test_lines_that_the_string_drowns_name_it(strongest_nm):
     """A multisine's few lines, above a bit that scatters by far more than they move the shaft."""
     lines = LINES_HZ[1:8:2]
-    weak = records(replace(PLANT, bit_noise_nm=2000.0), [1], lines, 5.0 * np.ones(len(lines)), PERIOD_S, 8)[0]
+    torques = np.array([strongest_nm, 5.0, 5.0, 5.0]) + 0.0j
+    weak = records(replace(PLANT, bit_noise_nm=1000.0, answered=False), [1], lines, torques, PERIOD_S, 8)[0]
     found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
     assert found.verdict is Verdict.NOT_IDENTIFIABLE
     assert "the string below by ±" in found.reason and "--excitation prbs" in found.advice

@@ -84,7 +84,7 @@ def clear_lines(case: PeriodicCase) -> PeriodicCase:
         return replace(case, lines=every, usable=every, sound=True)
     lines = tuple(line for line in every if line.excited and line.nu >= _LEAST_NU)
     if not lines:
-        raise _drowned(case)
+        raise _too_few(case, "no excited line stands clear of the scatter", "excite with more amplitude, or for longer")
     warnings = case.warnings
     if len(lines) < len(every):
         warnings = (*warnings, f"{len(every) - len(lines)} of {len(every)} lines were too weak to be used")
@@ -125,17 +125,18 @@ def _before_echo(case: PeriodicCase) -> bool:
     return excitation is not None and told_before_echo(excitation.kind) and shaft_model(case.options.model).piped
 
 
-def _drowned(case: PeriodicCase) -> Refused:
-    """No line stands clear; of a drill string whose pipe is known it is said what the string does beside."""
-    what, more = "no excited line stands clear of the scatter", "excite with more amplitude, or for longer"
-    if case.recording.pipe is None:
-        return Refused(what, more)
-    best = max(case.every, key=lambda line: float(np.max(np.abs(line.speed))) / math.sqrt(max(line.s_ww, 1e-300)))
+def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
+    """Of the lines that stand clear; above a drill string whose pipe is known it is said what drowned the others."""
+    weak = [line for line in case.every if not line.excited]
+    if case.recording.pipe is None or not weak:
+        return Refused(what, advice)
+    best = max(weak, key=lambda line: float(np.max(np.abs(line.speed))) / math.sqrt(max(line.s_ww, 1e-300)))
     moved, scatter = float(np.max(np.abs(best.speed))), math.sqrt(best.s_ww)
     return Refused(
         f"{what}: at {best.hertz:.3g} Hz the excitation moves the speed by ±{moved:.2g} rad/s, and the string below by"
         f" ±{scatter:.2g} rad/s, another way in each period",
-        f"use --excitation prbs, which asks only for the time before an echo; {more}; or lift the bit off bottom",
+        "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight"
+        " off it, or excite with more amplitude or for longer",
     )
 
 
@@ -158,7 +159,7 @@ def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:
         priors, fixed = (), unfiltered()
         refusal = None if len(lines) > 1 else _ONE_LINE
     if refusal is not None:
-        raise Refused(refusal.reason, refusal.advice)
+        raise _too_few(case, refusal.reason, refusal.advice)
     try:
         return fit_rigid(lines, case.levels, case.constraint, priors, fixed, options.confidence, scale)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
