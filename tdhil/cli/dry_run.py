@@ -31,12 +31,15 @@ def dry_run(
     planned, figures, limits = plan_dry(options, rig, simulated, can_torque, lets_go)
     if options.json:
         plain = plan_document(planned, figures, limits)
+        plain["simulated"] = simulated
         plain["converted"] = [list(row) for row in rig.conversions] if rig is not None else []
         print_json(plain)
         return 0
-    from tdhil.report import PlainConsole
+    from tdhil.report import SIMULATED, PlainConsole
 
     console = PlainConsole()
+    if simulated:
+        console.print(f"{SIMULATED}: the embedded rig, its own limits where rig.yaml has none", style="magenta")
     show(planned, figures, limits, console)
     for key, text, source in rig.conversions if rig is not None else ():
         console.print(f"{key}: {text}  ({source})", markup=False)

@@ -69,6 +69,7 @@ def test_a_dry_run_touches_nothing_and_names_what_it_assumes(tmp_path, monkeypat
     assert done.code == 0, done.err
     document = done.document
     assert document["dry_run"] is True
+    assert document["simulated"] is True
     source = {figure["name"]: figure["source"] for figure in document["rests_on"]}
     assert source["moment of inertia"] == source["disturbing torque (sd)"] == "rig.yaml:1"
     assert source["viscous friction"] == source["lag of reported speed"] == "assumed"
@@ -102,6 +103,7 @@ def test_one_tone_is_known_beforehand_to_tell_nothing():
     done = tdhil("identify", "--dry-run", "--excitation", "sine")
     assert done.code == 0
     assert "no interval of J is to be expected" in done.out.replace("\n", " ")
+    assert done.out.startswith("SIMULATED: the embedded rig")      # nobody said where a drive is
 
 
 # -- quantities ----------------------------------------------------------------------------------------------

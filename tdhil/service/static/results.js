@@ -334,12 +334,18 @@
     const J = interval(row.inertia_kg_m2, row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2) ?? "–";
     const was = row.changed ? `other: ${row.stored_verdict} ${number(row.stored_inertia_kg_m2)}` : row.changed === false ? "the same" : "";
     return el("tr", row.error_kind ? { class: "refused" } : {}, el("th", { scope: "row" }, own ? el("a", { href: `/runs/${own[1]}` }, own[1]) : row.log),
-      el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : row.verdict), el("td", {}, J), el("td", {}, was));
+      el("td", {}, row.rig || "", " ", badge(row.simulated) || ""), el("td", {}, when(row.date)), el("td", {}, row.error_kind ? `${row.error_kind}: ${row.error_text}` : `${row.verdict}${inPart(row)}`), el("td", {}, J), el("td", {}, was));
+  }
+
+  // as FleetRow.part_text; rows of before know nothing of it
+  function inPart(row) {
+    if (row.aborted_stage || row.aborted_by) return `, aborted${row.aborted_stage ? ` in stage ${row.aborted_stage}` : ""}${row.aborted_by ? ` (${row.aborted_by})` : ""}`;
+    return row.complete === false ? ", log cut short" : "";
   }
 
   function fleetSummary(found) {
     const counts = [...Object.entries(found.verdicts), ...Object.entries(found.failed).map(([kind, count]) => [`failed: ${kind}`, count])];
-    const more = [["done before", found.done_before], ["other than the result in the log", found.changed.length], ["being written: left alone", found.live], ["CSV without a .yaml: left out", found.bare_traces], ["left to do", found.left]].filter(([, count]) => count);
+    const more = [["from a part of the run", (found.in_part || []).length], ["done before", found.done_before], ["other than the result in the log", found.changed.length], ["being written: left alone", found.live], ["CSV without a .yaml: left out", found.bare_traces], ["left to do", found.left]].filter(([, count]) => count);
     return [el("h2", {}, "Summary"), el("div", { class: "two" },
       region("How many", el("table", {}, el("tbody", {}, ...[...counts, ...more].map(([name, count]) => line(name, [String(count)]))))),
       el("div", {}, el("p", {}, `${found.logs} logs in ${span(found.wall_s)}, ${span(found.cpu_s)} of the processor.`),
