@@ -352,6 +352,11 @@ class CanopenProfile(DriveProfile):
         return bool(self.modes.torque) and self.modes.switch_while_enabled
 
     @property
+    def usual_rate_hz(self) -> float:
+        """Cycles a second unless told otherwise."""
+        return self.cyclic.rate_hz
+
+    @property
     def rated_torque_by_hand(self) -> bool:
         """Does rig.yaml have to say what 100 % torque is?"""
         return self.torque.rated_torque_nm_per_lsb is None

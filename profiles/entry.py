@@ -101,6 +101,11 @@ class DriveProfile(DataModel):
         raise NotImplementedError
 
     @property
+    def usual_rate_hz(self) -> float:
+        """Cycles a second unless told otherwise."""
+        raise NotImplementedError
+
+    @property
     def rated_torque_by_hand(self) -> bool:
         """Does rig.yaml have to say what 100 % torque is?"""
         raise NotImplementedError

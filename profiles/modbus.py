@@ -418,6 +418,11 @@ class ModbusProfile(DriveProfile):
         return self.modes.torque and self.modes.switch_while_enabled
 
     @property
+    def usual_rate_hz(self) -> float:
+        """Cycles a second unless told otherwise."""
+        return self.cycle.rate_hz
+
+    @property
     def rated_torque_by_hand(self) -> bool:
         """Does rig.yaml have to say what 100 % torque is?"""
         return self.rated_torque is None

@@ -155,9 +155,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     if namespace.dry_run:
         if evaluation is not None:
             bench = suited(rig, plan_peer(options, connection).plant)
-            profile = connection.profile
-            usual = profile.cycle if profile.bus == "modbus" else profile.cyclic
-            rate_hz = options.rate_hz or usual.rate_hz
+            rate_hz = options.rate_hz or connection.profile.usual_rate_hz
             return dry_run_course(options, bench, evaluation, simulated, rate_hz)
         lets_go = connection.profile.quick_stop.ends == "off"
         return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
