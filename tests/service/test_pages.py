@@ -23,6 +23,7 @@ from typing import Any
 import pytest
 
 from tdhil.service.store import write_json
+from tdhil.session import hold
 from tests.recording.test_log_tail import write
 from tests.service.conftest import Service, wait_for
 
@@ -205,6 +206,37 @@ def test_a_stop_says_when_it_was_asked_seen_and_at_rest(page, served):
     page.get_by_text("stopped, at rest").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
     assert button.is_disabled()
+
+
+def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
+    run = begin(served)
+    page.goto(f"/runs/{run}/live")
+    page.locator("#state", has_text="moving").wait_for()
+
+    def late(route: Any) -> None:
+        answer = route.fetch()
+        served.service.wait(run, "stopped")
+        page.get_by_text("stopped, at rest").wait_for()
+        route.fulfill(response=answer)
+
+    page.route("**/stop", late)
+    with page.expect_response("**/stop"):
+        page.get_by_role("button", name="Stop", exact=True).click()
+    page.wait_for_timeout(300)
+    assert page.get_by_text("stopped, at rest").is_visible()
+    assert page.get_by_role("button", name="Stop", exact=True).is_disabled()
+
+
+def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):
+    told = [(0, "tdhil stop saw the shaft at rest"), (8, "tdhil stop did NOT see the shaft at rest")]
+    monkeypatch.setattr("tdhil.service.supervisor._stop_drive", lambda path, simulated: told.pop(0))
+    with hold(served.service.supervisor.rigs.get("real").address):
+        page.goto("/")
+        stop = page.get_by_role("article", name="real", exact=True).get_by_role("button", name="Stop")
+        stop.click()
+        page.get_by_text("real: tdhil stop saw the shaft at rest").wait_for()
+        stop.click()
+        page.get_by_text("real: tdhil stop did NOT see the shaft at rest. Use the hard-wired stop").wait_for()
 
 
 @pytest.mark.parametrize("way", ["offline", "mute"])

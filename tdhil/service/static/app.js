@@ -142,7 +142,7 @@
       el("p", { class: "row" },
         mayStart ? el("a", { class: "button", href: `/start/${encodeURIComponent(rig.id)}` }, "Start") : null,
         rig.run ? el("a", { class: "button", href: `/runs/${rig.run}/live` }, "Live") : null,
-        rig.run ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
+        rig.run || rig.state === "held" || rig.state === "blocked" ? el("button", { type: "button", class: "danger", onclick: () => stopRig(rig) }, "Stop") : null,
         may("operator") && rig.simulated && rig.state === "free" ? el("a", { class: "button quiet", href: `/rehearse/${encodeURIComponent(rig.id)}` }, "Rehearse") : null,
         rig.state !== "unusable" ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}` }, "History") : null,
         may("engineer") ? el("a", { class: "button quiet", href: `/rigs/${encodeURIComponent(rig.id)}/file` }, "File") : null,
@@ -152,9 +152,10 @@
   async function stopRig(rig) {
     const late = setTimeout(() => away(`Stop of ${rig.name} ${UNDELIVERED}`), SILENT_MS);
     try {
-      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, 10000);
+      const found = await call("POST", `/rigs/${encodeURIComponent(rig.id)}/stop`, {}, {}, rig.run ? 10000 : 90000);      // without a run it is answered once rest was seen
       if (byId("away").textContent.includes(UNDELIVERED)) away("");
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
+      else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : ". Use the hard-wired stop"}`);
     } catch (error) {
       away(`Stop of ${rig.name} ${UNDELIVERED}`);
     } finally {
@@ -382,7 +383,12 @@
           clearTimeout(late);
           undelivered = false;
         }
-        if (status) { status = { ...status, stop: found.stop, state: found.state, stage: found.stage, history: found.history }; state(); }
+        if (status) {              // the socket may have told more meanwhile: an answer that was overtaken undoes nothing
+          const stop = Object.fromEntries(Object.entries(found.stop).map(([name, value]) => [name, value ?? status.stop[name]]));
+          const newer = found.history.length >= status.history.length;
+          status = { ...status, stop, ...(newer ? { state: found.state, stage: found.stage, history: found.history } : {}) };
+          state();
+        }
       } catch (error) {
         undelivered = true;
       } finally {
