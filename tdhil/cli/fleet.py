@@ -261,6 +261,9 @@ def _result_text(row: FleetRow) -> str:
         return f"failed: {row.error_text}"
     if row.inertia_kg_m2 is None:
         return f"{row.verdict}: {row.reason}"
+    from tdhil.report import inertia_text
+
     low, high = row.inertia_low_total_kg_m2, row.inertia_high_total_kg_m2
+    told = inertia_text({"value": row.inertia_kg_m2, "low": low, "high": high})
     part = "" if row.part_text is None else f", {row.part_text}"
-    return f"{row.verdict}, J {row.inertia_kg_m2:.5g} ({low:.5g} to {high:.5g}) kg·m²{part}"
+    return f"{row.verdict}, J {told}{part}"

@@ -11,7 +11,7 @@ from tdhil.cli.arguments import TOLERANCE, amount, share
 from tdhil.cli.results import print_result, save_report
 from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
-from tdhil.session import conclude_evaluation, is_evaluation, is_log, read
+from tdhil.session import conclude_evaluation, is_evaluation, is_log, read, require_file
 
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
@@ -59,9 +59,7 @@ def run(namespace: argparse.Namespace) -> int:
     """Read, identify, print."""
     path = _log(namespace)
     _check(namespace)
-    if not path.is_file():
-        raise UsageError("there is no such log", where=str(path),
-                         next_step="Name a run.mcap of this tool, or a trace in CSV")
+    require_file(path)
     if namespace.report is not None:
         from tdhil.report import check_report_path
 

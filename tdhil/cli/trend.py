@@ -125,7 +125,7 @@ def _print_compared(document: Mapping[str, Any]) -> None:
     table.add_row("", "verdict", *(one["verdict"] for one in document["results"]))
     table.add_row("", "J, kg·m²", *(_inertia_text(one) for one in document["results"]))
     for hertz, values in _by_line(document).items():
-        table.add_row("", f"apparent J, {hertz:.4g} Hz", *("–" if one is None else f"{one:.4g}" for one in values))
+        table.add_row("", f"apparent J, {hertz:.4g} Hz", *("–" if one is None else f"{one:#.4g}" for one in values))
     console.print(table)
     for one in document["differences"]:
         console.print(f"{one['from']} and {one['to']}: {one['text']}", soft_wrap=True)
@@ -149,8 +149,10 @@ def _headings(logs: Sequence[str]) -> Sequence[str]:
 
 
 def _inertia_text(row: Mapping[str, Any]) -> str:
+    from tdhil.report import rounded
+
     value, low, high = (row[f"inertia{part}_kg_m2"] for part in ("", "_low", "_high"))
-    return "–" if value is None else f"{value:.5g} ({low:.5g} to {high:.5g})"
+    return "–" if value is None else "{} ({} to {})".format(*rounded(value, low, high))
 
 
 def _by_line(document: Mapping[str, Any]) -> dict[float, list[float | None]]:

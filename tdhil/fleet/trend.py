@@ -203,7 +203,7 @@ def _settings(
     identify = run.get("identify")
     asked = identify if isinstance(identify, Mapping) else {}
     found: dict[str, Any] = {
-        "date": row.date,
+        "date": None if row.date is None else row.date.replace("T", " "),
         "rig": row.rig,
         "load": rig.get("load"),
         "drive": row.drive_name,
@@ -227,7 +227,7 @@ def _settings(
         "confidence": asked.get("confidence", 0.95),
         "tolerance": asked.get("tolerance", 0.05),
         "recorded by": row.recorded_by,
-        "simulated": row.simulated,
+        "simulated": "yes" if row.simulated else "no",
         "run": row.part_text or "whole",
     }
     return {name: "–" if value in (None, "") else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -7,7 +7,7 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.report.card import (
         card_html as card_html, card_text as card_text, inertia_text as inertia_text, minutes as minutes,
-        print_card as print_card,
+        print_card as print_card, rounded as rounded,
     )
     from tdhil.report.console import PlainConsole as PlainConsole
     from tdhil.report.document import SIMULATED as SIMULATED, result_document as result_document

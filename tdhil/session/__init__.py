@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from tdhil.session.recorded import (
         RunRecord as RunRecord, is_log as is_log, read as read,
+        require_file as require_file,
     )
     from tdhil.session.run_session import (
         Attendant as Attendant, Consent as Consent, RunRequest as RunRequest, RunSession as RunSession,

@@ -131,9 +131,7 @@ def read(
     Raises LogError (nothing of ours in the file), DataFileError (with the line) and UsageError.
     """
     path = Path(path)
-    if not path.is_file():
-        raise UsageError("there is no such log", where=str(path),
-                         next_step="Name a run.mcap of this tool, or a trace in CSV")
+    require_file(path)
     if is_log(path):
         of_trace = {
             "columns": columns, "excitation": excitation, "rated_torque_nm": rated_torque_nm, "lags": lags,
@@ -147,6 +145,16 @@ def read(
     return _read_trace(
         path, columns, excitation, rated_torque_nm, torque_limit_nm, gear_ratio, torque_scale_rel_sd, lags, skew_sd_s
     )
+
+
+def require_file(path: Path) -> None:
+    """Raise UsageError where there is no such file, or a folder in its place."""
+    if path.is_dir():
+        raise UsageError("is a folder", where=str(path),
+                         next_step=f"Name one log in it, or all of them: tdhil fleet {path} --out fleet.csv")
+    if not path.is_file():
+        raise UsageError("there is no such log", where=str(path),
+                         next_step="Name a run.mcap of this tool, or a trace in CSV")
 
 
 def is_log(path: Path) -> bool:

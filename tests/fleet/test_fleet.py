@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sys
@@ -107,8 +108,11 @@ def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
         "name": "run", "values": ["whole", "aborted in stage acquire (DriveFault)"], "differs": True}
     assert compared["differences"][0]["text"].endswith("3.mcap: aborted in stage acquire (DriveFault)")
     assert main(["watch", str(logs), "--once", "--out", str(out), "--jobs", "1"]) == 0
-    assert [line.rpartition(" kg·m²")[2] for line in capsys.readouterr().out.splitlines()] == [
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.rpartition(" %")[2] for line in lines] == [
         "", "", "", ", aborted in stage acquire (DriveFault)", ", log cut short"]
+    assert re.search(r"^SIMULATED .*0.mcap: valid\w*, J \d+\.?\d* \(", lines[0])
+    assert max(len(number) for number in re.findall(r"[\d.]+ to|to [\d.]+", lines[0])) <= len("104.5 to")
 
 
 @pytest.mark.heavy

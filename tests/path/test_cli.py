@@ -160,6 +160,9 @@ def test_a_log_that_is_not_there_is_a_wrong_command_line(tmp_path):
     done = tdhil("replay", "--json", tmp_path / "none.mcap")
     assert done.code == done.document["exit_code"] == 2
     assert "none.mcap" in done.err
+    done = tdhil("replay", tmp_path)
+    assert done.code == 2
+    assert f"is a folder. Name one log in it, or all of them: tdhil fleet {tmp_path} --out fleet.csv" in done.err
 
 
 def test_no_server_to_talk_to(tmp_path):
