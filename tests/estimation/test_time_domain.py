@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tdhil.estimation import Options, Verdict, identify
+from tdhil.estimation import Options, ResidualTest, Verdict, identify
+from tdhil.estimation.frequency_domain import Fit
 from tdhil.estimation.samples import Samples, usable_samples
+from tdhil.estimation.time_domain import solve as solving
 from tdhil.estimation.time_domain.equation import PARAMETERS, evaluate
+from tdhil.estimation.time_domain.fit import search
+from tdhil.estimation.time_domain.solve import solve
 from tdhil.estimation.time_domain.taylor import flat_top
 from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
 from tdhil.recording.recording import LagPrior
@@ -28,8 +32,11 @@ def quiet(machine):
 
 
 def bins_of(recording):
-    usable = runs(thinned(usable_samples(recording)), recording.speed_resolution_rad_s, 2.5)
-    return joined([measure(window) for window in windows(usable)])
+    return joined([measure(window) for window in windows_of(recording)])
+
+
+def windows_of(recording):
+    return windows(runs(thinned(usable_samples(recording)), recording.speed_resolution_rad_s, 2.5))
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +112,44 @@ def test_tapers_add_up_to_one():
     first, second = flat_top(time, 12.0, 2.0), flat_top(time - 10.0, 12.0, 2.0)
     assert np.allclose(first[:, 0] + second[:, 0], 1.0, atol=1e-12)
     assert np.allclose(first[:, 1:] + second[:, 1:], 0.0, atol=1e-9)
+
+
+# -- the band ------------------------------------------------------------------------------------------------
+
+
+def test_what_stands_clear_beyond_the_lags_counts():
+    """Up to a radian of the longer lag stands half of what tells the lags: ±1.8 kg·m² had come of it."""
+    inertia = found(simulate(FIELD, "torque pulses", [3])[0]).inertia
+    assert inertia.low <= 104.0 <= inertia.high
+    assert inertia.high - inertia.low < 0.025 * 104.0
+
+
+@pytest.mark.parametrize("said", [0.5, 0.005, None])
+def test_the_wide_band_is_left_where_the_model_is_doubtful_in_it_or_untested(monkeypatch, said):
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    bins, placed = bins_of(recording), windows_of(recording)
+    wide, narrow = search(bins, (), float(np.ptp(recording.torque_nm)))
+    assert len(wide.problem.bins) > 1.5 * len(narrow.problem.bins)
+
+    def tested(problem, theta, factor):
+        p_value = said if len(problem.bins) == len(wide.problem.bins) else 0.3
+        return None if p_value is None else ResidualTest(1.0, 10.0, p_value)
+
+    monkeypatch.setattr(solving, "local_test", tested)
+    solved = solve(bins, placed, (), float(np.ptp(recording.torque_nm)), 0.95)
+    assert solved.bins == len((wide if said == 0.5 else narrow).problem.bins)
+
+
+@pytest.mark.parametrize(("gain", "followed"), [(0.0, (0.0, 0.1)), (5.0, (0.0, 0.2)), (40.0, (0.95, 1.0))])
+def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkeypatch, gain, followed):
+    """Two shapes more that lower −2 ln L by 5 are nothing: the value had gone over to theirs from 4 on."""
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    bins, placed = bins_of(recording), windows_of(recording)
+    monkeypatch.setattr(solving, "best_shapes", lambda problem, near: Fit(
+        near.theta * np.where(np.arange(PARAMETERS) == 0, 1.01, 1.0), near.objective - gain))
+    plain = search(bins, (), float(np.ptp(recording.torque_nm)))[0].fit.theta[0]
+    value = solve(bins, placed, (), float(np.ptp(recording.torque_nm)), 0.95).inertia.value
+    assert followed[0] <= (value / plain - 1.0) / 0.01 <= followed[1]
 
 
 # -- coverage, a few seeds of many (the rest: benchmarks/record_route_coverage.py) ----------------------------

@@ -6,6 +6,7 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.estimation.frequency_domain.before_echo import torque_answer as torque_answer
+    from tdhil.estimation.frequency_domain.filter_order import simple_weight as simple_weight
     from tdhil.estimation.frequency_domain.friction_levels import (
         Levels as Levels, ViscousConstraint as ViscousConstraint, measure_levels as measure_levels,
         tie_viscous as tie_viscous, warming_warning as warming_warning,
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
         clear_lines as clear_lines, identify_lines as identify_lines, measured as measured,
     )
     from tdhil.estimation.frequency_domain.inference import (
-        fisher_tail as fisher_tail, profile_edge as profile_edge, rejects as rejects,
+        doubtful as doubtful, fisher_tail as fisher_tail, profile_edge as profile_edge, rejects as rejects,
         student_quantile as student_quantile,
         torque_scale_line as torque_scale_line, widened_most_by_scale as widened_most_by_scale,
         with_total as with_total,

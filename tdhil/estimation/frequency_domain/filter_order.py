@@ -105,9 +105,13 @@ def fit_model(
     fits.append(minimise(problem, limits, simple.theta, fixed))
     whole = lowest(fits, apart)
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(fixed))
-    excess = gain - len(open_structure) * math.log(problem.numbers)
-    weight = 1.0 / (1.0 + math.exp(min(0.5 * excess, 700.0)))
+    weight = simple_weight(gain, len(open_structure), problem.numbers)
     return Fitted(problem, limits, fixed, simple, whole, weight, others)
+
+
+def simple_weight(gain: float, more: int, numbers: int) -> float:
+    """Of the answer with as many parameters fewer as ``more``; ``gain``: by how much those lower −2 ln L."""
+    return 1.0 / (1.0 + math.exp(min(0.5 * (gain - more * math.log(numbers)), 700.0)))
 
 
 def excess_rise(problem: Likelihood, fitted: int) -> float:

@@ -222,15 +222,16 @@ def covariance(problem: Problem, theta: FloatArray, free: tuple[int, ...]) -> tu
 # A bin counts where the torque that the speed explains stands clear of the residual. Where it doesn't, the direction
 # of the regression would matter: least squares of torque on speed errs by the share of the noise in the speed, the
 # other way round by the share in the torque. And frequencies end where the longer lag turns the phase by more than
-# about a radian: beyond that the structure of the filter, which nobody knows, is no longer told by its mean and its
-# spread.
+# about a radian: up to there any filter is told by its mean and its spread. Beyond, the structure counts, which nobody
+# knows; but half of what a record says of the lags stands there, and two poles, or one, are what most filters are. So
+# from that fit the band is widened to three times as far, for whoever finds that the wider one holds (`solve`).
 
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
 _ROUNDS = 5
 _CLEAR = 20.0            # power of what is explained over the residual's
 _NARROW = 0.05           # of the frequency: where excitation is lines, what stands beside one need not stand clear
-_PHASE = 1.2             # rad
+_PHASE, _WIDE_PHASE = 1.2, 3.0     # rad
 _LEAST_BINS = 8
 _ENOUGH_BINS = 40        # that the phase rule leaves in any case, if they are clear
 _LEAST_LAG_S = 1e-3
@@ -240,18 +241,22 @@ _UNSEEN = 0.1            # standard deviations that friction as large as the who
 
 @dataclass(frozen=True)
 class Found:
-    """The problem as it stands in the end, its fit, and of all bins those that stand clear."""
+    """The problem as it stands in the end, its fit, and of all bins those that stand clear; ``keep``: what was used."""
 
     problem: Problem
     fit: Fit
     clear: int
+    keep: BoolArray
 
 
-def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> Found | None:
-    """None where too few bins stand clear of the noise. Filters are taken as one pole each."""
+def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> tuple[Found, ...]:
+    """In a wide band and in a narrow one, in this order; none where too few bins stand clear of the noise.
+
+    Filters are taken as one pole each.
+    """
     inertia = _rough(bins)
     if inertia is None:
-        return None
+        return ()
     levels = tuple(index for index, column in ((FORWARD, 0), (BACK, 1)) if np.any(bins.level[:, column]))
     free = (INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, *levels)
     limits = box(inertia, 1.0, torque_span_nm, priors)
@@ -259,6 +264,17 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
     keep = _worth_a_look(every, inertia)
     problem = _part(every, keep)
     fit = min((minimise(problem, _start(inertia, lags, priors)) for lags in _STARTS), key=lambda one: one.objective)
+    narrow = _settled(every, keep, fit, _PHASE)
+    if narrow is None:
+        return ()
+    wide = _settled(every, narrow.keep, narrow.fit, _WIDE_PHASE)
+    return (narrow,) if wide is None or len(wide.problem.bins) <= len(narrow.problem.bins) else (wide, narrow)
+
+
+def _settled(every: Problem, keep: BoolArray, fit: Fit, phase: float) -> Found | None:
+    """After some rounds from ``fit``, of the bins ``keep`` (M,); None where too few bins stand clear of the noise."""
+    bins, free = every.bins, every.free
+    problem = _part(every, keep)
     clear = len(bins)
     for _ in range(_ROUNDS):
         _, leverage = covariance(problem, fit.theta, free)
@@ -271,13 +287,13 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
         clear = int(np.count_nonzero(stands))
         if clear < _LEAST_BINS:
             return None
-        keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands]))
+        keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands], phase))
         problem = _part(every, keep)
         fit = minimise(problem, fit.theta)
     if unseen := _unseen_levels(problem, fit.theta):
         problem = replace(problem, free=tuple(index for index in problem.free if index not in unseen))
         fit = minimise(problem, _levelled(every, fit.theta, unseen))
-    return Found(problem, fit, clear)
+    return Found(problem, fit, clear, keep)
 
 
 def _unseen_levels(problem: Problem, theta: FloatArray) -> tuple[int, ...]:
@@ -329,10 +345,10 @@ def _worth_a_look(every: Problem, inertia: float) -> BoolArray:
     return keep if np.count_nonzero(keep) >= _ENOUGH_BINS else np.ones(len(bins), dtype=np.bool_)
 
 
-def _highest(theta: FloatArray, clear_hz: FloatArray) -> float:
+def _highest(theta: FloatArray, clear_hz: FloatArray, phase: float) -> float:
     lag = max(float(theta[SPEED_LAG]), float(theta[TORQUE_LAG]), _LEAST_LAG_S)
     enough = float(np.sort(clear_hz)[min(_ENOUGH_BINS, len(clear_hz)) - 1])
-    return max(_PHASE / (2.0 * math.pi * lag), enough)
+    return max(phase / (2.0 * math.pi * lag), enough)
 
 
 def _start(inertia: float, lags: tuple[float, float, float], priors: tuple[GaussianPrior, ...]) -> FloatArray:

@@ -5,7 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain import Fit, GaussianPrior, fisher_tail, profile_edge, student_quantile
+from tdhil.estimation.frequency_domain import (
+    Fit,
+    GaussianPrior,
+    doubtful,
+    fisher_tail,
+    profile_edge,
+    simple_weight,
+    student_quantile,
+)
 from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest
 from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
@@ -21,7 +29,7 @@ from tdhil.estimation.time_domain.equation import (
     VISCOUS,
     evaluate,
 )
-from tdhil.estimation.time_domain.fit import Problem, covariance, minimise, search
+from tdhil.estimation.time_domain.fit import Found, Problem, covariance, minimise, search
 from tdhil.estimation.time_domain.taylor import flat_top, times
 from tdhil.estimation.time_domain.windows import Bins, Window, seen_through
 from tdhil.recording import FloatArray
@@ -286,11 +294,26 @@ class ShaftEquation:
 def solve(
     bins: Bins, placed: tuple[Window, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float, confidence: float
 ) -> Solved | None:
-    """None where too few bins stand clear of the noise."""
-    found = search(bins, priors, torque_span_nm)
-    if found is None:
-        return None
-    stated = tuple(prior.index for prior in priors)
+    """In the wide band where it can be tested and the model holds, else in the narrow one.
+
+    None where too few bins stand clear of the noise.
+    """
+    solved = None
+    bands = search(bins, priors, torque_span_nm)
+    for number, found in enumerate(bands):
+        solved = _solve(found, placed, tuple(prior.index for prior in priors), confidence, bands[number + 1 :])
+        if solved.residual is not None and not doubtful(solved.residual):
+            break
+    return solved
+
+
+def _solve(
+    found: Found, placed: tuple[Window, ...], stated: tuple[int, ...], confidence: float, narrower: tuple[Found, ...]
+) -> Solved:
+    """What lies within a standard deviation of a narrower band's answer is part of the interval.
+
+    There a filter of any structure is right, if less sharp; where the bands are of one mind that changes nothing.
+    """
     straight = _shaft(found.problem, found.fit, placed, stated, confidence)
     bent_problem = replace(found.problem, free=(*found.problem.free, BEND))
     bent_fit = minimise(bent_problem, found.fit.theta)
@@ -304,6 +327,10 @@ def solve(
             chosen, value = curved, other
         else:
             value = Estimate(value.value, min(value.low, other.low), max(value.high, other.high))
+    for band in narrower:
+        middle = float(band.fit.theta[INERTIA])
+        near = min(_deviation(band), 0.5 * (value.high - value.low))
+        value = Estimate(value.value, min(value.low, middle - near), max(value.high, middle + near))
     problem = chosen.problem
     residual = local_test(problem, chosen.fit.theta, chosen.spread.factor)
     shift = float(bent_fit.theta[INERTIA]) - float(found.fit.theta[INERTIA])
@@ -330,17 +357,26 @@ def solve(
 def _shaft(
     problem: Problem, fit: Fit, placed: tuple[Window, ...], stated: tuple[int, ...], confidence: float
 ) -> ShaftEquation:
-    """J's interval over every structure of the filters; its value with one pole each, unless that is contradicted."""
+    """J's interval over every structure of the filters; its value of one pole each and of any, as each weighs."""
     scores = block_scores(problem, placed, fit.theta)
     own = spread(problem, fit, scores, INERTIA, confidence)
     reach, scale = own.factor * own.quantile, float(problem.box.scale[INERTIA])
     open_problem = with_shapes(problem, stated)
     best = best_shapes(open_problem, fit)
-    shaped = fit.objective - best.objective > reach**2
+    gain, more = (fit.objective - best.objective) / own.factor**2, len(open_problem.free) - len(problem.free)
+    weight = simple_weight(gain, more, problem.equations())
+    shaped = weight < 0.5
     wide = profile(open_problem, best, INERTIA, reach, min(max(reach * own.sd, 1e-7 * scale), 0.5 * scale))
-    value = float((best if shaped else fit).theta[INERTIA])
+    value = float(weight * fit.theta[INERTIA] + (1.0 - weight) * best.theta[INERTIA])
     inertia = Estimate(value, min(wide.low, value) + min(own.lean, 0.0), max(wide.high, value) + max(own.lean, 0.0))
     return ShaftEquation(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
+
+
+def _deviation(found: Found) -> float:
+    """Standard deviation of J, with one pole each."""
+    spread_of, _ = covariance(found.problem, found.fit.theta, found.problem.free)
+    at = found.problem.free.index(INERTIA)
+    return math.sqrt(max(float(spread_of[at, at]), 0.0))
 
 
 def _estimate(shaft: ShaftEquation, index: int, confidence: float) -> Estimate:
