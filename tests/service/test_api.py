@@ -108,6 +108,10 @@ def test_downloads_come_in_pieces(client, call, service):
         assert answer.status_code == status
         call.check("GET", f"{API}/runs/{run}/log.mcap", answer)
     call("GET", f"/runs/{run}/report.html", 404)
+    assert client.head(f"{API}/runs/{run}/result.json").status_code == 200             # looked at, and not downloaded
+    call("GET", f"/runs/{run}/log.mcap", 200)
+    wait_for("the audit", lambda: sum(one.what == "downloaded run.mcap" for one in service.audit.entries()) == 5)
+    assert not [one for one in service.audit.entries() if one.what == "downloaded result.json"]
 
 
 def test_a_log_that_grows_comes_in_pieces_too(client, call, service):
