@@ -139,8 +139,11 @@ def case_of(result: Mapping[str, Any], namespace: argparse.Namespace) -> tuple[T
     inertia = result["inertia_kg_m2"]
     stands = result["verdict"] in ("valid", "valid_wide") and isinstance(inertia, dict)
     if not stands or not all(_is_number(inertia.get(key)) for key in ("value", "low_total", "high_total")):
-        raise TuningRefused(f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
-                            next_step="Identify again with a motion that tells it")
+        raise TuningRefused(
+            f"the result has no J to tune for ({result['verdict']})", where=str(namespace.result),
+            next_step="Identify again with a motion that tells it" if not result.get("impedance") else
+            "It is of a run that measured the drive's own impedance: name the result of one that tells J, and this "
+            f"one as --impedance {namespace.result}")
     square = _positive(result, "gear_ratio", namespace) ** 2
     low, value, high = (square * float(inertia[key]) for key in ("low_total", "value", "high_total"))
     if not 0.0 < low <= value <= high:

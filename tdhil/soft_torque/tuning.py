@@ -293,19 +293,23 @@ def _compensated(case: TuneCase, held: Sequence[float]) -> Tuned:
         if largest < 0.05:
             return Tuned("compensated", None, f"not even 5 % of J can be compensated over J's interval behind "
                                               f"{_lag_ms(case)} of lag", largest_share=largest)
-    best: tuple[float, float, float] | None = None
+    best: tuple[float, float, float, float] | None = None
     for share in shares:
         softest = LAG_RESERVE * softest_allowed(case.string, case.drive, held[0], share)
         softness = case.softness if case.softness is not None else _best_softness(case, held, share, softest)
-        if softness is None or softness > softest or not _stable_everywhere(case, softness, share, held):
+        if softness is None or softness > softest:
+            continue
+        # a softer one bears less than `start` does: what is chosen keeps its reserve at its own a
+        here = largest_stable_share(case, softness, held)
+        if share > (here if asked is not None else RESERVE * here):
             continue
         law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
         damping = min(least_damping(case, drive, law, held) for drive in case.at_inertias[:: STEPS // 2])
         if best is None or damping > best[0]:
-            best = damping, share, softness
+            best = damping, share, softness, here
     if best is None:
-        return Tuned("compensated", None, "no a is stable beside it", largest_share=largest)
-    _, share, softness = best
+        return Tuned("compensated", None, "no a is stable beside it, with a reserve", largest_share=largest)
+    _, share, softness, largest = best
     law = tuned_controller(case.string, case.drive.inertia_kg_m2, softness, held[0], share)
     softest = softest_allowed(case.string, case.drive, held[0], share)
     return Tuned("compensated", law, softness=softness, softest=softest, compensated_share=share, largest_share=largest)

@@ -84,6 +84,8 @@ def test_the_terminal_says_what_it_rests_on_and_what_to_type(tuned):
     (("--compensate", "80%"), {}, 11, "swings by itself"),
     (("--loop", "bus", "--a", "1.5"), {}, 11, "is beyond ζ/(ω² J Στ)"),
     ((), {"inertia_kg_m2": None, "verdict": "not_identifiable"}, 11, "no J to tune for (not_identifiable)"),
+    ((), {"inertia_kg_m2": None, "verdict": "not_identifiable", "impedance": {"verdict": "valid"}}, 11,
+     "as --impedance"),
     ((), {"verdict": "model_rejected"}, 11, "no J to tune for (model_rejected)"),
     (("--loop", "bus"), {"speed_lag_s": None}, 2, "how late the reported speed is"),
     (("--a", "20"), {}, 2, "--a: 20: must be from 0.01 to 10"),

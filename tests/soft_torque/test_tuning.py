@@ -70,6 +70,16 @@ def test_the_compensated_one_is_stable_over_the_whole_interval_and_keeps_a_reser
         assert ClosedSystem(STRING, DRIVE.with_inertia(float(inertia)), one.controller).is_stable()
 
 
+def test_the_reserve_is_kept_at_the_softness_that_is_chosen():
+    """On a light rotor the softest is the best damped, and bears least."""
+    light = TuneCase(STRING, TopDrive(104.126, 8.1, 60.0, DRIVE.inner_lags_s), Interval(104.126, 99.857, 108.242))
+    one = next(found for found in tune(light, search=None).tuned if found.kind == "compensated")
+    assert one.controller is not None
+    assert one.compensated_share <= 0.8 * (largest_stable_share(light, one.softness, HELD) + 0.01)
+    assert one.wrong[0].stable
+    assert one.lag_reserve_s is None or one.lag_reserve_s > 0.01
+
+
 def test_a_wider_interval_leaves_less_to_compensate():
     shares = [largest_stable_share(case(Interval(1500.0, 1500.0 * (1 - e), 1500.0 * (1 + e))), 0.3, HELD)
               for e in (0.0, 0.1, 0.3)]
