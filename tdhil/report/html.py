@@ -32,11 +32,11 @@ def check_report_path(path: Path, log: Path, where: str = "--report") -> None:
         raise UsageError("is the log itself", where=f"{where} {path}", next_step="Such as report.html or report.pdf")
     if path.is_dir():
         raise UsageError("is a folder; a report is a file", where=f"{where} {path}", next_step="Such as report.html")
-    if path.suffix.lower() not in _SUFFIXES and (path.is_file() or not path.exists()):      # else a device
-        raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}", next_step="Such as report.html")
     if path.exists() and (path.is_file() or path.is_symlink()):
         raise UsageError("is there already, and is left as it is", where=f"{where} {path}",
                          next_step=f"Name another file, such as {fresh(path).name}, or move that one away")
+    if path.suffix.lower() not in _SUFFIXES and not path.exists():      # what exists here is a device
+        raise UsageError("ends neither in .html nor in .pdf", where=f"{where} {path}", next_step="Such as report.html")
     if not path.parent.is_dir():
         raise UsageError("there is no such folder", where=f"{where} {path}", next_step=f"Make {path.parent} first")
 
