@@ -152,6 +152,23 @@ def test_the_value_follows_a_structure_of_the_filters_as_far_as_it_weighs(monkey
     assert followed[0] <= (value / plain - 1.0) / 0.01 <= followed[1]
 
 
+def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monkeypatch):
+    """A load that is slow and strong: one start with coasting of seventy had been refused."""
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    bins, placed = bins_of(recording), windows_of(recording)
+    wide, narrow = search(bins, (), float(np.ptp(recording.torque_nm)))
+    profile = solving.profile
+
+    def open_if_wide(problem, best, index, reach, step):
+        told = profile(problem, best, index, reach, step)
+        return replace(told, high=np.inf) if len(problem.bins) == len(wide.problem.bins) else told
+
+    monkeypatch.setattr(solving, "profile", open_if_wide)
+    solved = solve(bins, placed, (), float(np.ptp(recording.torque_nm)), 0.95)
+    assert solved.bins == len(narrow.problem.bins)
+    assert solved.inertia.bounded
+
+
 # -- coverage, a few seeds of many (the rest: benchmarks/record_route_coverage.py) ----------------------------
 
 ROWS = [(FIELD, "foreign"), (SERVO, "up-down ramps"), (HEAVY, "ramp + coast"),

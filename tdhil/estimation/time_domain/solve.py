@@ -294,7 +294,7 @@ class ShaftEquation:
 def solve(
     bins: Bins, placed: tuple[Window, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float, confidence: float
 ) -> Solved | None:
-    """In the wide band where it can be tested and the model holds, else in the narrow one.
+    """In the wide band where it tells J, can be tested, and the model holds, else in the narrow one.
 
     None where too few bins stand clear of the noise.
     """
@@ -302,7 +302,8 @@ def solve(
     bands = search(bins, priors, torque_span_nm)
     for number, found in enumerate(bands):
         solved = _solve(found, placed, tuple(prior.index for prior in priors), confidence, bands[number + 1 :])
-        if solved.residual is not None and not doubtful(solved.residual):
+        tells = solved.inertia.bounded and solved.inertia.low > 0.0
+        if tells and solved.residual is not None and not doubtful(solved.residual):
             break
     return solved
 
