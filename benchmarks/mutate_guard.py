@@ -147,7 +147,7 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
     ("modbus/watchdog", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
     ("modbus/preflight", "            access.write(register, 0)\n", "            pass\n"),
-    ("hold", "max(-limits.torque_nm, min(limits.torque_nm, ahead_nm + correction))", "ahead_nm + correction"),
+    ("hold", "max(loop.guard.least_torque_nm, min(limits.torque_nm, ahead_nm + correction))", "ahead_nm + correction"),
     ("acquire", "max(-limits.torque_nm, min(limits.torque_nm, torque_nm))", "torque_nm"),
     ("acquire pulses", "while follower.time_s < end_s:", "while True:"),
     ("identify", "code = code or int(exit_code(error))", "pass"),

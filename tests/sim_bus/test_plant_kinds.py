@@ -21,7 +21,7 @@ from sim_bus.plant.two_mass import Bottom, TwoMassParams
 
 ROOT = Path(__file__).parents[2]
 KINDS = {"plant.yaml": Params, "plant_two_mass.yaml": TwoMassParams, "plant_string.yaml": StringParams,
-         "plant_stick_slip.yaml": StringParams}
+         "plant_stick_slip.yaml": StringParams, "plant_top_drive.yaml": Params}
 
 
 def defaults(model: type[BaseModel], prefix: str = "") -> dict[str, set[Any]]:
