@@ -377,7 +377,7 @@ def test_a_page_that_is_loaded_anew_while_a_run_brakes_shows_its_stop(page, serv
     page.goto(f"/runs/{run}/live")
     page.get_by_role("button", name="Stop", exact=True).click()
     page.reload()
-    page.get_by_text("asked ").wait_for()
+    page.locator("li", has_text="asked ").wait_for()
     page.get_by_text("seen by the drive").wait_for()
     assert not page.get_by_text("NOT DELIVERED").is_visible()
 
