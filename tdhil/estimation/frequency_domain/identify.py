@@ -113,7 +113,8 @@ def identify_lines(case: PeriodicCase) -> Finding:
         finding = identify_compliant(_settled(case), finding) if doubted else finding
     if isinstance(finding, Refusal):
         raise Refused(finding.reason, finding.advice)
-    hardly = finding.rejected or (finding.compliant is None and doubtful(finding.residual))
+    # A load that swings leaves residuals that a bend takes up, too: only where swinging was looked for it may.
+    hardly = finding.rejected or (asked.widened and finding.compliant is None and doubtful(finding.residual))
     if hardly and rigid is not None and asked.lags:
         return identify_bent(case, rigid) or finding
     return finding
