@@ -174,7 +174,7 @@ def test_the_container_s_recipe_names_what_there_is_and_nobody_s_registry():
     images = [rest.split()[0] for word, rest in steps if word == "FROM"]
     assert images
     assert not [one for one in images if re.search(r"[./].*/|@", one)]
-    assert not re.search(r"--(extra-)?index-url|https?:/{2}", text)
+    assert not re.search(r"--(extra-)?index[-]url|https?:/{2}", text)
     copied = [part for word, rest in steps if word == "COPY" and not rest.startswith("--from")
               for part in rest.split()[:-1]]
     assert [one for one in copied if not (ROOT / one).exists()] == []
