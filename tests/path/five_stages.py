@@ -9,7 +9,20 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
-from tests.path.path_runs import HANGS_S, INERTIA, QUICK, STAGES, Finished, Host, Peer, Shaft, identify, peer, tdhil
+from tests.path.path_runs import (
+    HANGS_S,
+    INERTIA,
+    QUICK,
+    STAGES,
+    SWINGS_IN_RAD_S,
+    Finished,
+    Host,
+    Peer,
+    Shaft,
+    identify,
+    peer,
+    tdhil,
+)
 
 SEED = 1
 PERIODS = 3
@@ -32,7 +45,7 @@ class FiveStages:
         assert shaft.at_rest_from() < shaft.time_s[-1] - 1.0
         assert shaft.state[-1] == "switch on disabled"
         assert shaft.speed_rad_s.max() < 10.0
-        assert shaft.speed_rad_s.min() > -0.05
+        assert shaft.speed_rad_s.min() > -SWINGS_IN_RAD_S
 
         # SIMULATED on every surface: JSON, progress, log, card
         assert document["simulated"] is True
