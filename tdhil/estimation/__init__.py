@@ -1,6 +1,9 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
 from tdhil.estimation.frequency_domain import torque_answer as torque_answer
+from tdhil.estimation.friction_levels import (
+    Levels as Levels, measure_levels as measure_levels, tie_viscous as tie_viscous,
+)
 from tdhil.estimation.identification import identify as identify
 from tdhil.estimation.paper_method import STEP_S as STEP_S, line_fit as line_fit, paper_estimate as paper_estimate
 from tdhil.estimation.result import (
@@ -18,3 +21,4 @@ from tdhil.estimation.samples import (
     Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
     usable_samples as usable_samples,
 )
+from tdhil.estimation.spectrum import Line as Line, period_lines as period_lines, pooled_lines as pooled_lines

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain import Levels, Line, PeriodLines, ViscousConstraint, rejects
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.result import (
     BudgetLine,
     Compliant,
@@ -16,8 +16,10 @@ from tdhil.estimation.result import (
     Refusal,
     ResidualTest,
     SecondOpinion,
+    rejects,
 )
 from tdhil.estimation.samples import Samples, Stretch
+from tdhil.estimation.spectrum import Line, PeriodLines
 from tdhil.recording import Recording, Stage
 
 

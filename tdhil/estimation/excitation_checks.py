@@ -6,9 +6,10 @@ The sign comes before the standstill: torque in the place of speed crosses zero 
 import numpy as np
 
 from tdhil.estimation.case import PeriodicCase
-from tdhil.estimation.frequency_domain import ComplexArray, Levels, Line, PeriodLines, warming_warning
+from tdhil.estimation.friction_levels import Levels, warming_warning
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, Stretch, excited_window, left_out_warnings
+from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -11,9 +11,9 @@ from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
 from tdhil.estimation.cross_checks import cross_checked
 from tdhil.estimation.data_checks import check_samples
-from tdhil.estimation.frequency_domain import clear_lines, identify_lines, measured
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
+from tdhil.estimation.periodic import clear_lines, identify_lines, measured
 from tdhil.estimation.result import Identification, Options, Refused
 from tdhil.estimation.samples import excited_window, usable_samples
 from tdhil.estimation.setpoint_sampling import stretched

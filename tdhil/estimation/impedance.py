@@ -37,9 +37,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.estimation.case import PeriodicCase
-from tdhil.estimation.frequency_domain import Box, ComplexArray, descend, rejects, student_quantile
-from tdhil.estimation.result import DriveImpedance, Estimate, ImpedancePoint, ResidualTest, Verdict
+from tdhil.estimation.frequency_domain import Box, descend, student_quantile
+from tdhil.estimation.result import DriveImpedance, Estimate, ImpedancePoint, ResidualTest, Verdict, rejects
 from tdhil.estimation.samples import Stretch, usual_interval
+from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import BoolArray, FloatArray, ImpedanceInput
 
 OFFSET: Final = "offset"

@@ -110,6 +110,20 @@ class ResidualTest:
     p_value: float
 
 
+REJECT_P = 0.001
+_DOUBT_P = 0.01
+
+
+def rejects(test: ResidualTest | None) -> bool:
+    """Do the data contradict the model? Also where the statistic is no number."""
+    return test is not None and not test.p_value >= REJECT_P
+
+
+def doubtful(test: ResidualTest | None) -> bool:
+    """Do the data only just allow the model, if at all?"""
+    return test is not None and not test.p_value >= _DOUBT_P
+
+
 @dataclass(frozen=True)
 class BudgetLine:
     """One source's share of J's uncertainty, kg·m²: the half-width that it alone leaves, at the result's confidence.

@@ -11,8 +11,8 @@ from functools import cache
 import numpy as np
 
 from tdhil.estimation.case import Case, PeriodicCase
-from tdhil.estimation.frequency_domain import measured
 from tdhil.estimation.impedance import measure_impedance
+from tdhil.estimation.periodic import measured
 from tdhil.estimation.result import Options
 from tdhil.estimation.samples import usable_samples
 from tdhil.recording import Excitation, ImpedanceInput, LagPrior, Level, Recording, Segment

@@ -10,8 +10,8 @@ from tdhil.estimation import Verdict, identify, torque_answer
 from tdhil.estimation.frequency_domain.before_echo import ECHO, EchoShaft, problem_of, unleaked
 from tdhil.estimation.frequency_domain.inference import standard_deviation
 from tdhil.estimation.frequency_domain.optimiser import box, minimise
-from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, pooled_lines
 from tdhil.estimation.result import Refused
+from tdhil.estimation.spectrum import Line, PeriodLines, pooled_lines
 from tdhil.recording import Excitation, LagPrior, Recording, Segment
 from tests.estimation.loaded_bench import STEP_S, Loaded, late, records, turned
 

@@ -8,9 +8,9 @@ import pytest
 from tdhil.estimation import Options, identify
 from tdhil.estimation.data_checks import flat_share
 from tdhil.estimation.excitation_checks import undeclared_warning, wrong_period
-from tdhil.estimation.frequency_domain.friction_levels import warming_of
-from tdhil.estimation.frequency_domain.spectrum import period_lines, repeating_rounding
+from tdhil.estimation.friction_levels import warming_of
 from tdhil.estimation.samples import frozen, spikes, stretches, usable_samples
+from tdhil.estimation.spectrum import period_lines, repeating_rounding
 from tdhil.estimation.time_domain.identify import cut_off
 from tests.estimation.analytic import closed_form
 

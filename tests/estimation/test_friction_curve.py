@@ -10,9 +10,9 @@ from sim_bus.plant.rigid import Params
 from tdhil.estimation import Options
 from tdhil.estimation.cross_checks.friction_by_speed import FrictionCurve, Inertia, friction_curve
 from tdhil.estimation.cross_checks.momentum_fit import Delay
-from tdhil.estimation.frequency_domain.friction_levels import Levels, measure_levels
-from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.friction_levels import Levels, measure_levels
 from tdhil.estimation.samples import stretches, usable_samples
+from tdhil.estimation.spectrum import period_lines
 from tdhil.recording.recording import Recording
 from tests.estimation.stages_bench import usual_runs
 

@@ -8,8 +8,8 @@ import pytest
 
 from tdhil.estimation import Options, Verdict, identify, usable_samples
 from tdhil.estimation.case import Case
-from tdhil.estimation.frequency_domain import measured
 from tdhil.estimation.impedance import lines_of
+from tdhil.estimation.periodic import measured
 from tdhil.recording import LagPrior
 from tdhil.recording.builder import RecordingBuilder
 from tests.estimation import impedance_bench

@@ -21,8 +21,8 @@ from tdhil.estimation.frequency_domain.nonlinear_friction import (
     bends,
     starts_of,
 )
-from tdhil.estimation.frequency_domain.spectrum import Line
 from tdhil.estimation.result import Verdict
+from tdhil.estimation.spectrum import Line
 from tests.estimation.analytic import LINES, closed_form
 from tests.estimation.shaft_bench import Rig
 from tests.estimation.stages_bench import Stages, run_stages

@@ -135,10 +135,10 @@ def test_an_average_is_one_of_the_family(over):
 
 @pytest.mark.parametrize("stated", [True, False])
 def test_likelihood_jacobian_is_the_derivative(stated):
-    from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
     from tdhil.estimation.frequency_domain.likelihood import Likelihood
     from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
-    from tdhil.estimation.frequency_domain.spectrum import Line
+    from tdhil.estimation.friction_levels import ViscousConstraint
+    from tdhil.estimation.spectrum import Line
 
     rng = np.random.default_rng(3)
 

@@ -13,9 +13,9 @@ from tdhil.estimation import Compliant, Estimate, Options
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.momentum import through
 from tdhil.estimation.cross_checks.second_opinion import disagreements, second_opinions
-from tdhil.estimation.frequency_domain.friction_levels import measure_levels
-from tdhil.estimation.frequency_domain.spectrum import period_lines
+from tdhil.estimation.friction_levels import measure_levels
 from tdhil.estimation.samples import Samples, stretches, usable_samples
+from tdhil.estimation.spectrum import period_lines
 from tdhil.recording.recording import Recording
 from tdhil.run.excitation import ExcitationWish
 from tests.estimation.planned_motions import planned

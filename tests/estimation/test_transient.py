@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from tdhil.estimation.frequency_domain.spectrum import PeriodLines, period_lines, pooled_lines
 from tdhil.estimation.frequency_domain.transient import settled_lines
 from tdhil.estimation.samples import Samples, Stretch
+from tdhil.estimation.spectrum import PeriodLines, period_lines, pooled_lines
 from tdhil.recording import Segment
 
 LINES = (0.1, 0.2, 0.3, 0.4, 0.6)

@@ -17,7 +17,6 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     fit_compliant,
     inertias,
 )
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.frequency_domain.rigid import fit_rigid
 from tdhil.estimation.frequency_domain.shafts import (
     KnownStringShaft,
@@ -26,8 +25,9 @@ from tdhil.estimation.frequency_domain.shafts import (
     resonances,
     stiffness,
 )
-from tdhil.estimation.frequency_domain.spectrum import Line
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.result import Refusal
+from tdhil.estimation.spectrum import Line
 from tdhil.recording.recording import LagPrior, Pipe
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
 

@@ -31,7 +31,8 @@ from tdhil.estimation.cross_checks.momentum import (
     through,
 )
 from tdhil.estimation.cross_checks.momentum_fit import UNKNOWN_DELAY, Delay, Density, Resolution, fit_momentum
-from tdhil.estimation.frequency_domain import Levels, fisher_tail, student_quantile
+from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
+from tdhil.estimation.friction_levels import Levels
 from tdhil.estimation.result import Estimate, FrictionPoint, Options
 from tdhil.estimation.samples import Samples, excited_window
 from tdhil.recording import FloatArray, Recording

@@ -32,16 +32,15 @@ from tdhil.estimation.frequency_domain.inference import (
     estimate,
     grown_lines,
     half_width_first_order,
-    rejects,
     torque_scale_line,
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structure, lag_priors, lags_of, of_reports
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines, pooled_lines
-from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest
+from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest, rejects
 from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
+from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines, pooled_lines
 from tdhil.recording import FloatArray, LagPrior, Pipe, Recording, TorqueAnswer
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -17,12 +17,9 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
     intervals,
 )
 from tdhil.estimation.frequency_domain.filter_order import excess_rise
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
-    REJECT_P,
     grown_lines,
     half_width_first_order,
-    rejects,
     standard_deviation,
     student_quantile,
     torque_scale_line,
@@ -47,8 +44,9 @@ from tdhil.estimation.frequency_domain.shafts import (
     TwoMassShaft,
     shaft_model,
 )
-from tdhil.estimation.frequency_domain.spectrum import Line
-from tdhil.estimation.result import BudgetLine, Compliant, Estimate, Refusal
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
+from tdhil.estimation.result import REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
+from tdhil.estimation.spectrum import Line
 from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -8,8 +8,7 @@ import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
-from tdhil.estimation.frequency_domain.inference import REJECT_P, estimate, residual_of
+from tdhil.estimation.frequency_domain.inference import estimate, residual_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Apart, Fit, Fixed, box, minimise, rough_inertia_of
@@ -25,8 +24,9 @@ from tdhil.estimation.frequency_domain.shafts import (
     Shaft,
     string_resonances,
 )
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
-from tdhil.estimation.result import Estimate, ResidualTest
+from tdhil.estimation.friction_levels import ViscousConstraint
+from tdhil.estimation.result import REJECT_P, Estimate, ResidualTest
+from tdhil.estimation.spectrum import ComplexArray, Line
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------

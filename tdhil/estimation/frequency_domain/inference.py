@@ -15,8 +15,8 @@ from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, 
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, minimise
 from tdhil.estimation.frequency_domain.shafts import INERTIA
-from tdhil.estimation.frequency_domain.spectrum import Line
-from tdhil.estimation.result import BudgetLine, Estimate, InertiaEstimate, ResidualTest
+from tdhil.estimation.result import REJECT_P, BudgetLine, Estimate, InertiaEstimate, ResidualTest
+from tdhil.estimation.spectrum import Line
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -32,19 +32,7 @@ from tdhil.recording import FloatArray
 # to each parameter that was free to follow the data: those at a bound were not.
 
 
-REJECT_P = 0.001
-_DOUBT_P = 0.01
 _AT_BOUND = 1e-6      # of the natural scale
-
-
-def rejects(test: ResidualTest | None) -> bool:
-    """Do the data contradict the model? Also where the statistic is no number."""
-    return test is not None and not test.p_value >= REJECT_P
-
-
-def doubtful(test: ResidualTest | None) -> bool:
-    """Do the data only just allow the model, if at all?"""
-    return test is not None and not test.p_value >= _DOUBT_P
 
 
 def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:

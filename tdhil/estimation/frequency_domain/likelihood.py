@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.friction_levels import ViscousConstraint
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.shafts import Believing
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
+from tdhil.estimation.friction_levels import ViscousConstraint
+from tdhil.estimation.spectrum import ComplexArray, Line
 from tdhil.recording import FloatArray
 
 _SERIES = 1e-4          # of q/ν

@@ -7,7 +7,7 @@ import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.shafts import RigidShaft, Shaft
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray
 
 

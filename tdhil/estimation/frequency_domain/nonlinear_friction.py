@@ -14,12 +14,10 @@ import numpy as np
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, slope_over_speed, tie_viscous
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
     estimate,
     quantile_of,
-    rejects,
     residual_of,
     student_quantile,
 )
@@ -28,8 +26,9 @@ from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Fit, Fixed, box, minimise, rigid_rivals, rough_inertia_of
 from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of, rigid_finding
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines
-from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint, slope_over_speed, tie_viscous
+from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest, rejects
+from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines
 from tdhil.recording import FloatArray, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -8,13 +8,10 @@ import numpy as np
 from tdhil.estimation.case import Case, Finding, Words
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
-    doubtful,
     estimate,
     first_order_estimate,
-    rejects,
     residual_of,
     standard_deviation,
     student_quantile,
@@ -31,8 +28,9 @@ from tdhil.estimation.frequency_domain.signal_filters import (
     TORQUE_LAG,
     TORQUE_SHAPE,
 )
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line
-from tdhil.estimation.result import BudgetLine, Estimate, LinePoint, Refusal, ResidualTest
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
+from tdhil.estimation.result import BudgetLine, Estimate, LinePoint, Refusal, ResidualTest, doubtful, rejects
+from tdhil.estimation.spectrum import ComplexArray, Line
 from tdhil.recording import LagPrior
 
 # ---------------------------------------------------------------------------------------------------------------------

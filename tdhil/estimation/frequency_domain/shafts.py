@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from tdhil.config import MODELS, load
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray, Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------

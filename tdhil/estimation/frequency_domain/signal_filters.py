@@ -29,7 +29,7 @@ from typing import Final
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray
+from tdhil.estimation.spectrum import ComplexArray
 from tdhil.recording import FloatArray
 
 SPEED_LAG, SPEED_SHAPE, TORQUE_LAG, TORQUE_SHAPE, AVERAGE, SKEW = range(6)

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.spectrum import ComplexArray, Line, PeriodLines, pooled_lines, torque_lines
+from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines, pooled_lines, torque_lines
 from tdhil.recording import FloatArray
 
 MOST_MODES = 2

@@ -8,13 +8,12 @@ import numpy as np
 from tdhil.estimation.frequency_domain import (
     Fit,
     GaussianPrior,
-    doubtful,
     fisher_tail,
     profile_edge,
     simple_weight,
     student_quantile,
 )
-from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest
+from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest, doubtful
 from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
     BACK,

@@ -16,18 +16,14 @@ from typing import Literal
 
 import numpy as np
 
-from tdhil.estimation import Samples, Stretch
+from tdhil.estimation import Levels, Line, Samples, Stretch, period_lines, tie_viscous
 from tdhil.estimation.frequency_domain import (
     SPEED_LAG,
     TORQUE_LAG,
-    Levels,
-    Line,
     Model,
     fit_inertia,
     known_of,
-    period_lines,
     refuse_count,
-    tie_viscous,
 )
 from tdhil.recording import FloatArray, LagPrior, Segment
 from tdhil.run.excitation import Plan

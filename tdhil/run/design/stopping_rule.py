@@ -34,8 +34,16 @@ from typing import Any
 
 import numpy as np
 
-from tdhil.estimation import Options, identify, stretches, usable_samples
-from tdhil.estimation.frequency_domain import measure_levels, period_lines, pooled_lines, tie_viscous
+from tdhil.estimation import (
+    Options,
+    identify,
+    measure_levels,
+    period_lines,
+    pooled_lines,
+    stretches,
+    tie_viscous,
+    usable_samples,
+)
 from tdhil.recording import FloatArray, Recording
 from tdhil.run.design.prediction import LEAST_NU, Evidence, Fitted, fit, half_width, longer, noise_free, whole_periods
 

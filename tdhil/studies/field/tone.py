@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tdhil.estimation import STEP_S, LineFit, Samples, excited_window, paper_estimate, stretches, usable_samples
-from tdhil.estimation.frequency_domain import period_lines
+from tdhil.estimation import (
+    STEP_S,
+    LineFit,
+    Samples,
+    excited_window,
+    paper_estimate,
+    period_lines,
+    stretches,
+    usable_samples,
+)
 from tdhil.recording import FloatArray, Recording
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.settings import AmplitudeSettings, ScatterSettings

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tdhil.estimation.frequency_domain.spectrum import PeriodLines
 from tdhil.estimation.samples import Samples, Stretch
+from tdhil.estimation.spectrum import PeriodLines
 from tdhil.recording import FloatArray, Level
 
 # ---------------------------------------------------------------------------------------------------------------------

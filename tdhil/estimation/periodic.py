@@ -14,24 +14,27 @@ from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.cross_checks import Inertia, friction_curve
 from tdhil.estimation.data_checks import check_motion
 from tdhil.estimation.excitation_checks import check_lines, hints
-from tdhil.estimation.frequency_domain.before_echo import identify_before_echo, refuse_stick_slip
-from tdhil.estimation.frequency_domain.compliant import identify_compliant, may_swing, usable_lines
-from tdhil.estimation.frequency_domain.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
-from tdhil.estimation.frequency_domain.inference import contradicted, doubtful
-from tdhil.estimation.frequency_domain.nonlinear_friction import identify_bent
-from tdhil.estimation.frequency_domain.rigid import (
+from tdhil.estimation.frequency_domain import (
     RigidResult,
+    contradicted,
     fit_rigid,
+    identify_before_echo,
+    identify_bent,
+    identify_compliant,
     known_of,
+    may_swing,
     refuse_count,
+    refuse_stick_slip,
     rigid_finding,
+    settled_lines,
+    shaft_model,
     unfiltered,
+    usable_lines,
 )
-from tdhil.estimation.frequency_domain.shafts import shaft_model
-from tdhil.estimation.frequency_domain.spectrum import Line, PeriodLines, period_lines, pooled_lines
-from tdhil.estimation.frequency_domain.transient import settled_lines
-from tdhil.estimation.result import Refusal, Refused
+from tdhil.estimation.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
+from tdhil.estimation.result import Refusal, Refused, doubtful
 from tdhil.estimation.samples import Stretch, log_warnings, stretches
+from tdhil.estimation.spectrum import Line, PeriodLines, period_lines, pooled_lines
 from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1
