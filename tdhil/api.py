@@ -14,10 +14,12 @@ Everything here raises `tdhil.TdhilError` and its kind, each with what happened,
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import UsageError
@@ -283,6 +285,15 @@ def run(
     if cause is not None:
         raise cause
     return RunRecord(recording, configuration, str(session.path))
+
+
+class _CallableRoom(ModuleType):
+    """``tdhil.run`` is this function and a room: once the room is loaded, Python makes the attribute the room."""
+
+    __call__ = staticmethod(run)
+
+
+sys.modules["tdhil.run"].__class__ = _CallableRoom
 
 
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:

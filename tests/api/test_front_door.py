@@ -51,6 +51,14 @@ def test_every_name_that_it_promises_is_there():
         _ = tdhil.nothing
 
 
+@pytest.mark.parametrize("first", ["tdhil", "tdhil.run", "tdhil.run.guard", "tdhil.api"])
+def test_run_is_called_whatever_was_loaded_before(first):
+    code = f"import {first}, tdhil\ntry: tdhil.run(tdhil.simulate(seed=7).__enter__(), no_guard=True)\n"
+    code += "except tdhil.TdhilError as err: print(err)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "no such consent: no_guard" in done.stdout
+
+
 def test_a_run_is_read_back_as_it_was(record):
     again = tdhil.read(record.log)
     assert (again.recording.time_s == record.recording.time_s).all()
