@@ -10,7 +10,7 @@ from tdhil.estimation.result import (
     BudgetLine as BudgetLine, Compliant as Compliant, Estimate as Estimate, FrictionPoint as FrictionPoint,
     Identification as Identification, InertiaEstimate as InertiaEstimate, LineFit as LineFit, Options as Options,
     PaperEstimate as PaperEstimate, ResidualTest as ResidualTest, SecondOpinion as SecondOpinion,
-    Verdict as Verdict,
+    Verdict as Verdict, normal_quantile as normal_quantile,
 )
 from tdhil.estimation.rough_estimates import (
     RoughFriction as RoughFriction, RoughInertia as RoughInertia, rough_friction as rough_friction,

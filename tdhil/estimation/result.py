@@ -3,8 +3,15 @@
 import math
 from dataclasses import dataclass
 from enum import Enum
+from statistics import NormalDist
 
 from tdhil.config import MODELS
+
+
+def normal_quantile(confidence: float) -> float:
+    """Half the width of the two-sided interval of a normal quantity with that confidence, in standard deviations."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
+
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What may be asked of identification.

@@ -42,6 +42,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tdhil.estimation import normal_quantile
+
 FloatArray = NDArray[np.float64]
 
 ALARM: Final = 0.1
@@ -101,10 +103,7 @@ def difference(before: Measured, after: Measured, confidence: float = 0.95) -> D
     if not shared:
         variance += sum((one.scale_rel_sd * (1.0 if relative else abs(one.value))) ** 2 for one in (before, after))
     sd = math.sqrt(variance)
-    found, half = x_b - x_a, NormalDist().inv_cdf(0.5 + 0.5 * confidence) * sd
-    out = math.expm1 if relative else float
-    probability = 0.5 if sd == 0.0 and found == 0.0 else 1.0 if sd == 0.0 else NormalDist().cdf(abs(found) / sd)
-    return Difference(out(found), out(found - half), out(found + half), confidence, relative, shared, probability)
+    return _size(x_b - x_a, sd, confidence, relative, shared)
 
 
 @dataclass(frozen=True)
@@ -163,7 +162,7 @@ def _on_scale(one: Measured, relative: bool) -> tuple[float, float]:
     """Logarithm of the value with its sd, or the value itself with its."""
     if not one.low <= one.high or not 0.0 < one.confidence < 1.0:
         raise ValueError(f"no interval: {one.low:g} to {one.high:g} at {one.confidence:g}")
-    quantile = NormalDist().inv_cdf(0.5 + 0.5 * one.confidence)
+    quantile = normal_quantile(one.confidence)
     if relative:
         return math.log(one.value), (math.log(one.high) - math.log(one.low)) / (2.0 * quantile)
     return one.value, (one.high - one.low) / (2.0 * quantile)
@@ -255,8 +254,8 @@ def _steps(
     return [*before, point, *after]
 
 
-def _size(mean: float, sd: float, confidence: float, relative: bool) -> Difference:
-    half = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * sd
+def _size(mean: float, sd: float, confidence: float, relative: bool, shared: bool = True) -> Difference:
+    half = normal_quantile(confidence) * sd
     out = math.expm1 if relative else float
-    probability = NormalDist().cdf(abs(mean) / sd) if sd > 0.0 else 1.0
-    return Difference(out(mean), out(mean - half), out(mean + half), confidence, relative, True, probability)
+    probability = NormalDist().cdf(abs(mean) / sd) if sd > 0.0 else 1.0 if mean else 0.5
+    return Difference(out(mean), out(mean - half), out(mean + half), confidence, relative, shared, probability)

@@ -79,23 +79,25 @@ _NOTHING = 1e-5           # of J: a source of less than that is none
 Row = tuple[str, Text | str]
 
 
+COMPLIANT = (
+    ("J_L behind the spring", "load_inertia_kg_m2", "kg·m²"),
+    ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
+    ("spring k", "stiffness_nm_rad", "N·m/rad"),
+    ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
+    ("resonance", "resonance_hz", "Hz"),
+    ("antiresonance", "antiresonance_hz", "Hz"),
+)
+
+
 def compliant_rows(document: Mapping[str, Any]) -> Iterator[Row]:
     """What turns behind the spring; a quantity that the data leave open is said to be so."""
     shaft = document["compliant"]
     if shaft is None:
         return
     yield "shaft", "compliant: J above is the motor's side, J_r"
-    rows = (
-        ("J_L behind the spring", "load_inertia_kg_m2", "kg·m²"),
-        ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
-        ("spring k", "stiffness_nm_rad", "N·m/rad"),
-        ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
-        ("resonance", "resonance_hz", "Hz"),
-        ("antiresonance", "antiresonance_hz", "Hz"),
-    )
-    if all(shaft[key] is None for _, key, _ in rows):      # nobody looked below the motor
+    if all(shaft[key] is None for _, key, _ in COMPLIANT):      # nobody looked below the motor
         return
-    for title, key, unit in rows:
+    for title, key, unit in COMPLIANT:
         part = shaft[key]
         yield title, "left open by the data" if part is None else estimate_text(part, unit)
 

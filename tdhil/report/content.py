@@ -13,7 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from tdhil.recording import Recording
-from tdhil.report.card import estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
+from tdhil.report.card import COMPLIANT, estimate_text, inertia_text, minutes, plus_minus, rounded, sentence
 from tdhil.report.document import SIMULATED
 
 if TYPE_CHECKING:
@@ -267,14 +267,6 @@ _ESTIMATES = (
     ("lag of the reported torque", "torque_lag_s", "s"),
     ("delay of the torque report behind the speed report", "skew_s", "s"),
 )
-_COMPLIANT = (
-    ("behind the spring J_L", "load_inertia_kg_m2", "kg·m²"),
-    ("J_r + J_L", "total_inertia_kg_m2", "kg·m²"),
-    ("spring k", "stiffness_nm_rad", "N·m/rad"),
-    ("damping c", "damping_nm_s_rad", "N·m·s/rad"),
-    ("resonance", "resonance_hz", "Hz"),
-    ("antiresonance", "antiresonance_hz", "Hz"),
-)
 
 
 _QUANTITIES = (Column("quantity", 0.52), Column("value", 0.12, True), Column("from", 0.12, True),
@@ -298,7 +290,7 @@ def _numbers(document: Part) -> Iterator[Block]:
     for title, key, unit in _ESTIMATES:
         add(title, document[key], unit)
     if shaft is not None:
-        for title, key, unit in _COMPLIANT:
+        for title, key, unit in COMPLIANT:
             add(title, shaft[key], unit)
     if rows:
         yield Table(_QUANTITIES, tuple(rows))

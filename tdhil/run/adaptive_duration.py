@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from statistics import NormalDist
 from typing import Any
 
+from tdhil.estimation import normal_quantile
 from tdhil.recording import Recording
 from tdhil.run.design import LOOKS, MARGIN, Look, Stopping, interval_of, look
 from tdhil.run.excitation import Plan
@@ -120,17 +120,13 @@ def _by_interval_alone(recording: Recording, rule: Stopping, periods: float, roo
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"the interval is ±{100.0 * width:.3g} %"
     if width <= rule.tolerance:
         return Decision(0, f"{now}: as tight as {asked}", None, seen, working, width)
-    stricter = _quantile(rule.working(seen + 1)) / _quantile(working)
+    stricter = normal_quantile(rule.working(seen + 1)) / normal_quantile(working)
     wanted = math.ceil(periods * ((MARGIN * stricter * width / rule.tolerance) ** 2 - 1.0))
     more = min(room, max(LEAST_EXTENSION, wanted))
     if more < LEAST_EXTENSION:
         return Decision(0, f"{now} instead of {asked}, and no time or look is left", None, seen, working, width)
     why = f"{now} instead of {asked}: {more} more periods at each mean speed"
     return Decision(more, why, None, seen + 1, rule.working(seen + 1), width)
-
-
-def _quantile(confidence: float) -> float:
-    return NormalDist().inv_cdf(0.5 + 0.5 * confidence)
 
 
 def _counted(recording: Recording) -> int:

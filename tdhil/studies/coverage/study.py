@@ -10,13 +10,13 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from statistics import NormalDist
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from profiles import DataModel, Finding, refuse_if
+from tdhil.estimation import normal_quantile
 from tdhil.studies.coverage.bound import cramer_rao
 from tdhil.studies.coverage.plants import FLEET, CoveragePlant
 from tdhil.studies.coverage.simulate import SimulatedRun, run_all, tasks
@@ -205,7 +205,7 @@ def _ratios(axes: Axes, found: Sequence[PlantFigures]) -> None:
 
 def plant_table(found: Sequence[PlantFigures], confidence: float) -> ResultTable:
     """One row a plant. Shares in percent of the true inertia; rates in percent of the runs that gave a number."""
-    quantile = NormalDist().inv_cdf(0.5 + 0.5 * confidence)
+    quantile = normal_quantile(confidence)
     columns = (
         "plant", "inertia_kg_m2", "model_true", "runs", "refused_percent", "miss_percent", "miss_low99_percent",
         "miss_high99_percent", "bias_percent", "bias_standard_error_percent", "rmse_percent", "half_width_percent",

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tdhil.estimation import Estimate, Identification, Options, identify
+from tdhil.estimation import Estimate, Identification, Options, identify, normal_quantile
 from tdhil.recording import Excitation, FloatArray, LagPrior, Recording, Segment
 from tdhil.studies.field.bench import FieldBench, FieldRun, part_of
 from tdhil.studies.field.settings import SlopeSettings
@@ -54,7 +53,7 @@ def stated_lags(joint: Identification, confidence: float) -> LagPrior | None:
 
 
 def _sd(one: Estimate, confidence: float) -> float:
-    return 0.5 * (one.high - one.low) / NormalDist().inv_cdf(0.5 + 0.5 * confidence)
+    return 0.5 * (one.high - one.low) / normal_quantile(confidence)
 
 
 def each_alone(recordings: Sequence[Recording], joint: Identification, confidence: float) -> tuple[Alone, ...]:
