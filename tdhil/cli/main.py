@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from tdhil.cli.streams import sheltered
-from tdhil.errors import ExitCode, TdhilError, exit_code
+from tdhil.errors import ExitCode, TdhilError, UsageError, exit_code
 from tdhil.version import __version__
 
 _COMMANDS = {
@@ -46,9 +46,10 @@ _COMMANDS = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
     namespace = argparse.Namespace()
+    arguments = list(sys.argv[1:] if argv is None else argv)
     with sheltered():
         try:
-            code = _main(list(sys.argv[1:] if argv is None else argv), namespace)
+            code = _main(arguments, namespace)
             sys.stdout.flush()
         except KeyboardInterrupt:
             print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
@@ -56,7 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         except BrokenPipeError:
             return 141      # whoever read our output has gone
         except Exception as error:
-            return _report(error, getattr(namespace, "json", None) is True)
+            # What can't be understood leaves no namespace, and whoever asked for a document still waits for one.
+            return _report(error, getattr(namespace, "json", None) is True or "--json" in arguments)
     return code
 
 
@@ -77,7 +79,7 @@ class _Parser(argparse.ArgumentParser):
     """Its errors are a line, as all others: two dozen lines of usage above them would hide what is wrong."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog.replace(' ', ': ', 1)}: {message}. See {self.prog} --help\n")
+        raise UsageError(message, where=self.prog.partition(" ")[2], next_step=f"See {self.prog} --help")
 
 
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:

@@ -1,5 +1,6 @@
 """Each error ends with the exit code that the manual promises."""
 
+import json
 import signal
 
 import pytest
@@ -16,6 +17,7 @@ from drivers.errors import (
     StopNotConfirmed,
     TdhilError,
 )
+from tdhil.cli.main import main
 from tdhil.errors import ExitCode, Interrupted, UsageError, exit_code
 
 
@@ -58,6 +60,28 @@ def test_an_attribute_of_an_instance_goes_first() -> None:
     assert exit_code(error) is ExitCode.PARTIAL
     error.exit_code = 99  # type: ignore[attr-defined]
     assert exit_code(error) is ExitCode.INTERNAL
+
+
+WITH_JSON = ("identify", "replay", "fleet", "watch", "trend", "compare", "tune", "evaluate", "recover", "study",
+             "doctor", "profiles", "profiles show", "scan", "stop")
+
+
+@pytest.mark.parametrize("command", WITH_JSON)
+@pytest.mark.parametrize("wrong", ["--no-such-option", "--json=yes"])
+def test_what_cant_be_understood_is_a_document_where_one_was_asked_for(
+    command: str, wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command.split(), "--json", wrong]) == 2
+    shown = capsys.readouterr()
+    document = json.loads(shown.out)
+    assert (document["exit_code"], document["error"]["kind"]) == (2, "UsageError")
+    assert shown.err == f"tdhil: {document['error']['message']}\n"
+
+
+def test_without_json_a_wrong_value_is_a_line_on_stderr_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["identify", "--excitation", "noise"]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == "" and shown.err.startswith("tdhil: identify: argument --excitation: invalid choice")
 
 
 def test_ctrl_c_is_called_by_its_name() -> None:
