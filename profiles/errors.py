@@ -4,16 +4,25 @@ The root stands here because `profiles` lies below every other room; `drivers.er
 draws the whole tree.
 """
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
 
 from profiles.visible_text import visible
+
+_FLAG: Final = re.compile(r"(?<![\w-])--?[a-z][a-z-]*(?![\w-])")
 
 
 class TdhilError(Exception):
     """Root of every error a user can cause or meet.
 
-    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, what to do about it.
+    ``what`` happened, ``where`` (file:line, object, register, stage) and ``next_step``, what to do about it. Options
+    stand in them by their flags; ``spelling``: what whoever reads it calls those, flag by flag, where not so.
     """
+
+    spelling: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, what: str, *, where: str = "", next_step: str = "") -> None:
         super().__init__(what)
@@ -23,7 +32,8 @@ class TdhilError(Exception):
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.what}" if self.where else self.what
-        return visible(f"{text}. {self.next_step}" if self.next_step else text, keep="\n")
+        text = f"{text}. {self.next_step}" if self.next_step else text
+        return visible(_FLAG.sub(lambda found: self.spelling.get(found[0], found[0]), text), keep="\n")
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import UsageError
 from tdhil.run import StopRequest
-from tdhil.session import RunRecord, read
+from tdhil.session import ByKeyword, RunRecord, read
 
 if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
@@ -158,6 +158,7 @@ class Result:
         return card_html(self.document)
 
 
+@ByKeyword()
 def identify(
     recorded: RunRecord,
     *,
@@ -203,7 +204,8 @@ def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
     from tdhil.config import load_rig
 
     handle = DriveHandle(load_rig(Path(rig)), dict(options))
-    _peer(handle, {})
+    with ByKeyword():
+        _peer(handle, {})
     yield handle
 
 
@@ -227,10 +229,12 @@ def simulate(
     }
     given = {name: value for name, value in asked.items() if value is not None}
     handle = DriveHandle(None if rig is None else load_rig(Path(rig)), given, tuple(faults))
-    _peer(handle, {})
+    with ByKeyword():
+        _peer(handle, {})
     yield handle
 
 
+@ByKeyword()
 def run(
     drive: DriveHandle,
     motion: Motion | None = None,

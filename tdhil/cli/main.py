@@ -130,6 +130,7 @@ def _report(error: Exception, as_json: bool) -> int:
     """One message for an error of the tree; a traceback only for what is a mistake of ours."""
     code = exit_code(error)
     if isinstance(error, TdhilError):
+        error.spelling = {}
         print(f"tdhil: {error}", file=sys.stderr)  # noqa: T201
     elif isinstance(error, OSError) and error.errno in _THE_SYSTEM_S:
         print(f"tdhil: the system refused: {error.strerror or error}", file=sys.stderr)  # noqa: T201

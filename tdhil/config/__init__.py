@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
-    from tdhil.config.options import Origin as Origin, RunOptions as RunOptions, Setting as Setting, resolve as resolve
+    from tdhil.config.options import (
+        OPTIONS as OPTIONS, Origin as Origin, RunOptions as RunOptions, Setting as Setting, resolve as resolve,
+    )
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
         EXCITATIONS as EXCITATIONS, MODELS as MODELS, has_plateaus as has_plateaus, imported as imported, load as load,

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.recorded import (
-        RunRecord as RunRecord, is_log as is_log, read as read,
+        RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
         require_file as require_file,
     )
     from tdhil.session.run_session import (

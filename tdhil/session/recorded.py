@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ContextDecorator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import ExitCode, LogError, NothingRecoverable, UsageError
+from tdhil.errors import ExitCode, LogError, NothingRecoverable, TdhilError, UsageError
 
 if TYPE_CHECKING:
     import pandas
@@ -112,6 +113,32 @@ class RunRecord:
         return {name: getattr(self.recording, name) for name in _UNITS}
 
 
+_KEYWORDS = {
+    "-i": "interface", "-c": "channel", "-b": "bitrate", "--fault": "faults",
+    "--accept-no-watchdog": "no_watchdog", "--accept-shared-watchdog": "shared_watchdog",
+    "--accept-wider-limit": "wider_limits", "--accept-speed-unit": "speed_unit", "--reset-fault": "reset_fault",
+    "--columns": "columns", "--rated-torque": "rated_torque_nm", "--torque-limit": "torque_limit_nm",
+    "--gear": "gear_ratio", "--torque-scale-sd": "torque_scale_rel_sd", "--skew-sd": "skew_sd_s",
+}
+"""What a flag is called in Python, beside the options of a run and of its bus, which know their own."""
+
+
+class ByKeyword(ContextDecorator):
+    """Has errors of the tree name options by what Python calls them: around what the API offers, or on top of it."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, TdhilError):
+            from tdhil.config import OPTIONS
+            from tdhil.session.connection import bus_kinds
+
+            of_buses = {flag: name for kind in bus_kinds() for name, flag in kind.flags.items()}
+            error.spelling = {**of_buses, **{option.flag: option.name for option in OPTIONS}, **_KEYWORDS}
+
+
+@ByKeyword()
 def read(
     path: str | Path,
     *,

@@ -127,6 +127,35 @@ def test_what_can_t_be_is_said_when_the_drive_is_named(wrong, said):
         pass
 
 
+@pytest.mark.parametrize(("wrong", "said"), [
+    ({"rate_hz": -1.0}, "rate_hz: "),
+    ({"node": 300}, "node: "),
+    ({"real_time": True, "stepped": True}, "stepped"),
+])
+def test_an_option_is_named_as_python_calls_it(tmp_path, wrong, said):
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("run: {seed: 7}\n")
+    with pytest.raises(UsageError) as caught, tdhil.open_drive(rig, **wrong):
+        pass
+    assert said in str(caught.value) and f"--{said[:4]}" not in str(caught.value)
+
+
+def test_values_that_can_t_be_are_named_as_python_calls_them(record, tmp_path, capsys):
+    with pytest.raises(UsageError, match="confidence") as caught:
+        tdhil.identify(record, confidence=7.0)
+    assert "--confidence" not in str(caught.value)
+    with pytest.raises(UsageError, match="tolerance: ") as caught, tdhil.simulate(seed=7) as drive:
+        tdhil.run(drive, tolerance=-1.0, log=tmp_path / "none.mcap")
+    assert "--tolerance" not in str(caught.value)
+    with pytest.raises(tdhil.TdhilError, match="columns") as caught:
+        trace = tmp_path / "trace.csv"
+        trace.write_text("a,b,c\n1,2,3\n2,2,3\n")
+        tdhil.read(trace)
+    assert "--columns" not in str(caught.value)
+    assert main(["replay", str(trace), "--json"]) == 2             # the same error, on the command line
+    assert "--columns" in capsys.readouterr().err
+
+
 def test_a_drive_is_named_without_a_motion_being_planned(tmp_path):
     rig = tmp_path / "rig.yaml"
     rig.write_text("run: {amplitude_rad_s: 50.0}\n")             # no motion of this bench fits its limits

@@ -446,7 +446,7 @@ def test_a_wrong_name_on_the_way_in_lists_what_there_is(tmp_path, capsys):
     with pytest.raises(DataFileError, match=r"rig.yaml:2: run.excitation: 'multisine', .* or '[a-z-]+' is wanted, "
                                             r"not the text 'multisin'; did you mean 'multisine'\?"):
         load_rig(rig)
-    wanted = r"--excitation: 'multisine', .* or '[a-z-]+' is wanted"
+    wanted = r"^excitation: 'multisine', .* or '[a-z-]+' is wanted"
     with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match=wanted):
         tdhil.run(drive, tdhil.Motion("noise"), log=tmp_path / "run.mcap")
     assert main(["identify", "--excitation", "noise"]) == 2
