@@ -71,6 +71,7 @@ DRIVE_SILENT_S = 0.5
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
 """A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
 _NO_WORD = b""
+_DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
 _REPEAT_MODE_CYCLES = 25
 """A mode that isn't displayed yet is asked for again after so many cycles: one lost frame must not end a run."""
@@ -141,6 +142,7 @@ class Cia402Drive:
         self._shown_s = clock.now_s()  # when the mode was last displayed
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
+        self._ever_asked = False       # to be enabled
         self._reported = Reported()
         self._sent_code = 0
         self._since_mode_sent = 0
@@ -341,7 +343,7 @@ class Cia402Drive:
         if mode not in self._codes:
             raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
         self._strangers.refuse_shared()
-        self._wish, self._in_operation = Wish.ENABLED, False
+        self._wish, self._in_operation, self._ever_asked = Wish.ENABLED, False, True
 
     def quick_stop(self) -> None:
         """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling.
@@ -586,13 +588,16 @@ class Cia402Drive:
     def close(self) -> tuple[str, ...]:
         """Give the drive its former settings back and let go of the bus; targets stay at zero.
 
-        Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that
-        follows makes it act. What could not be given back is returned.
+        Only of a drive that is known to be disabled, which one that was enabled and shows no state since isn't:
+        otherwise its watchdog stays armed and the silence that follows makes it act. What could not be given back is
+        returned.
         """
         self._watch.stop()
         left: tuple[str, ...] = ()
+        state = self._reported.state
+        disabled = state in _DISABLED or (state is State.NOT_READY and not self._ever_asked)
         try:
-            if self._taken and self._reported.state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+            if self._taken and disabled:
                 self._link.send(NMT, bytes((ENTER_PRE_OPERATIONAL, self._node)))
                 left = self._objects.restore()
         except CommunicationLost as error:

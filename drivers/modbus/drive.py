@@ -79,7 +79,7 @@ PRESS_EVERY_S = 0.1
 _NO_SETPOINTS = Setpoints(0, 0, False)
 _NOTHING_YET = Feedback(0, 0.0, 0.0, None, None)
 _DRIVEN = (PowerState.ENABLED, PowerState.QUICK_STOP)
-_NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT, PowerState.NOT_READY)
+_NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT)
 
 
 class ModbusDrive:
@@ -121,6 +121,7 @@ class ModbusDrive:
         self._angle: Angle | None = None
         self._wish = Wish.OFF
         self._was_enabled = self._told_fault = self._reverse = self._at_rest = False
+        self._ever_asked = False       # to be enabled
         self._state: StatusState | None = None
         self._feedback = _NOTHING_YET
         self._shown: Mode | None = None
@@ -248,6 +249,7 @@ class ModbusDrive:
                 next_step="Use --mode speed",
             )
         self._wish, self._was_enabled, self._told_fault = Wish.ENABLED, False, False
+        self._ever_asked = True
 
     def quick_stop(self) -> None:
         """From the next cycle on the profile's quick-stop word; it isn't ended by enabling."""
@@ -543,10 +545,8 @@ class ModbusDrive:
         elif self._wish is Wish.ENABLED:
             if power is PowerState.ENABLED:
                 self._was_enabled, self._out_of_operation = True, 0
-            elif power is PowerState.QUICK_STOP:
-                self._wish = Wish.QUICK_STOP
-            elif self._was_enabled:
-                self._wish = Wish.OFF
+            elif self._was_enabled or power is PowerState.QUICK_STOP:
+                self._wish = Wish.QUICK_STOP       # it may be in operation after all: one word can be wrong
 
     def _sample(self, time_s: float, age_s: float, half_width_s: float, *, fresh: bool) -> Sample:
         feedback, control = self._feedback, self._profile.control
@@ -570,12 +570,14 @@ class ModbusDrive:
     def close(self) -> tuple[str, ...]:
         """Give the drive its former settings back and let go of the line; setpoints stay at zero.
 
-        Only of a drive that is known to be disabled: otherwise its watchdog stays armed and the silence that follows
-        makes it act. What could not be given back is returned.
+        Only of a drive that is known to be disabled, which one that was enabled and shows no state since isn't:
+        otherwise its watchdog stays armed and the silence that follows makes it act. What could not be given back is
+        returned.
         """
         left: tuple[str, ...] = ()
+        power = power_state(self._state)
         try:
-            if power_state(self._state) in _NOT_DRIVEN:
+            if power in _NOT_DRIVEN or (power is PowerState.NOT_READY and not self._ever_asked):
                 if self._modes:
                     clear_setpoints(Table(), self._access, self._profile, self._off_word())
                 left = self._access.restore()

@@ -47,8 +47,8 @@ class ModbusTarget:
         control = self._profile.control
         state = decode(control, self._access.read(self._profile.cycle.status.register_) & 0xFFFF)
         power = power_state(state)
-        if power not in _POWERED:
-            return
+        if state is not None and power not in _POWERED:
+            return                     # but one that shows what the profile doesn't know may be under power
         if power is PowerState.ENABLED and state is not None and not self._stop_would_brake():
             self._ask_for_speed_mode(state)
             if not self._stop_would_brake():

@@ -92,10 +92,11 @@ def controlword_towards(
     """The control word that brings the drive one step nearer to the wish.
 
     A fault is never reset here, a quick stop never ended by enabling again, and a shaft that turns under power is
-    never disabled: it is braked instead.
+    never disabled: it is braked instead. So is one whose drive shows no state at all, or none yet: the zeros of a
+    gateway, or a pattern that the profile doesn't know, are no proof that it is off.
     """
     power = power_state(state)
-    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP)
+    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY)
     if wish is Wish.ENABLED:
         if power is PowerState.QUICK_STOP:
             word = control.quick_stop

@@ -6,6 +6,7 @@ from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY
+from tests.drivers.scripted_drive import TPDO1
 
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
 TURN = Command(Mode.SPEED, 1.0, 0.0)
@@ -45,3 +46,14 @@ def test_it_comes_back_when_asked_in_again(drive, wire, peer):
     drive.enable(Mode.SPEED)
     assert cycles(drive, wire) is PowerState.ENABLED
     assert peer.machine.state == ENABLED
+
+
+def test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog(drive, wire, peer):
+    """A statusword of zero, whoever made it one, is no proof that the drive is off."""
+    armed = peer.value(0x1016, 1)
+    peer.tpdo = lambda cycle: TPDO1.pack(0, 0, 50_000)
+    assert cycles(drive, wire) is PowerState.NOT_READY
+    written = len(peer.writes)
+    drive.close()
+    assert peer.value(0x1016, 1) == armed != 0
+    assert len(peer.writes) == written

@@ -13,7 +13,7 @@ from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.pdu import CycleRefused, LinkLost, NoisyReply
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
-from tests.drivers.modbus_bank import CONTROL, MODE, Bank, high_and_low
+from tests.drivers.modbus_bank import CONTROL, MODE, SPEED, STATUS, Bank, high_and_low
 from tests.drivers.power_machine import OFF, STOPPING
 
 LIMITS = DriveLimits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
@@ -216,6 +216,36 @@ def test_a_drive_that_fell_out_is_not_enabled_again():
         sample = run.cycle()
     assert sample.state is PowerState.OFF
     assert run.controlwords()[-8:] == [0] * 8
+
+
+@pytest.mark.parametrize(("status", "speed"), [(0x0000, 0), (0x0000, 3000), (0xFFF7, 3000), (0x0223, 3000)])
+def test_one_status_word_that_makes_no_sense_lets_no_shaft_go(status, speed):
+    """A gateway shows zeros for a cycle, or another state than the drive is in: it is in operation all the same."""
+    run = Run().enabled()
+    run.bank.feedback = lambda: (3000, 0)
+    run.cycle()
+    run.bank.on_show = lambda words: words.update({STATUS: status, SPEED: 0, SPEED + 1: speed})
+    assert run.cycle().state in (PowerState.NOT_READY, PowerState.READY)
+    run.cycle()
+    run.drive.quick_stop()
+    run.cycle()
+    run.bank.on_show = lambda words: None
+    states = set()
+    for _ in range(5):
+        run.cycle()
+        states.add(run.bank.machine.state)
+    assert states == {STOPPING}
+
+
+def test_a_drive_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog():
+    run = Run().enabled()
+    run.bank.on_show = lambda words: words.update({STATUS: 0, SPEED + 1: 3000})
+    run.cycle()
+    run.drive.quick_stop()
+    run.cycle()
+    run.bank.writes.clear()
+    assert any("not known to be disabled" in line for line in run.drive.close())
+    assert run.bank.writes == []
 
 
 def test_a_turning_shaft_is_braked_before_it_is_disabled():

@@ -14,6 +14,8 @@ from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
+from tests.drivers.modbus_bank import STATUS, Bank
+from tests.drivers.power_machine import ENABLED, STOPPING
 
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
 MODBUS = [profile for name in profile_names() if isinstance(profile := load_profile(name), ModbusProfile)]
@@ -77,3 +79,13 @@ def test_a_drive_that_stays_in_torque_mode_gets_its_quick_stop_and_that_is_said(
     report = bare_stop(ModbusTarget(left.link, profile, unit=1), left.clock)
     assert any("did not change to speed mode" in remark for remark in report.remarks)
     assert report.first is not None and abs(left.rows()[-1][1]) < 1.0
+
+
+def test_a_drive_that_shows_a_state_nobody_knows_is_asked_all_the_same():
+    bank, clock = Bank(), SteppedClock()
+    bank.machine.state = ENABLED
+    bank.feedback = lambda: (0 if bank.machine.state == STOPPING else 3000, 0)
+    bank.on_show = lambda words: words.update({STATUS: 0xFFF7})
+    target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
+    assert bare_stop(target, clock).ended is Ended.AT_REST
+    assert bank.machine.state == STOPPING
