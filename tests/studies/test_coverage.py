@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tdhil.studies.coverage.bound import Watched, bound_of, cramer_rao, density, information
+from tdhil.studies.coverage.bound import Bounds, Watched, bound_of, cramer_rao, density, information, slopes_of_unknown
 from tdhil.studies.coverage.plants import FLEET, Noise, Report
 from tdhil.studies.coverage.simulate import SimulatedRun
 from tdhil.studies.coverage.study import (
@@ -20,6 +20,7 @@ from tdhil.studies.coverage.study import (
 )
 
 PLANT = {plant.name: plant for plant in FLEET}
+_NO_BOUND = Bounds(None, None)
 
 
 @pytest.mark.parametrize(("hits", "tries"), [(0, 12), (3, 100), (25, 500), (12, 12)])
@@ -64,8 +65,23 @@ def test_what_cannot_be_told_apart_has_no_bound() -> None:
 def test_the_notes_design_has_about_the_notes_bound() -> None:
     """Half a percent at the notes' 240 s and lines; the default plan of 200 s is somewhat tighter."""
     bound = cramer_rao(PLANT["field"], 10)
-    assert bound is not None
-    assert 0.10 < bound < 0.50
+    assert bound.known is not None
+    assert bound.unknown is not None
+    assert 0.10 < bound.known < 0.50
+    assert 1.2 * bound.known < bound.unknown < 2.0 * bound.known     # what not knowing the filters costs anybody
+
+
+def test_equal_poles_are_no_more_told_apart_for_being_equal() -> None:
+    """Three equal poles leave the bound of who counts them singular, and hardly change that of who doesn't."""
+    hertz = 0.1 * np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
+    watched = [Watched(speed, np.full(6, 0.3 + 0j), 100.0) for speed in (3.0, 5.0)]
+    bounds = []
+    for lags in ((0.20, 0.20, 0.20), (0.19, 0.20, 0.21)):
+        plant = replace(PLANT["three_poles"], speed_report=Report(lags))
+        slopes, plausible = slopes_of_unknown(plant, hertz)
+        bounds.append(bound_of(information(plant, hertz, watched, slopes) + plausible))
+    assert bound_of(information(PLANT["three_poles"], hertz, watched)) is None
+    assert bounds[0] == pytest.approx(bounds[1], rel=0.01)
 
 
 def _runs(values: list[tuple[float, float] | None]) -> list[SimulatedRun]:
@@ -77,25 +93,27 @@ def _runs(values: list[tuple[float, float] | None]) -> list[SimulatedRun]:
 
 
 def test_figures_count_misses_among_the_runs_that_gave_a_number() -> None:
-    found = figures_of(PLANT["field"], _runs([(104.0, 1.0), (106.0, 1.0), None, (103.0, 1.5)]), 0.5)
+    found = figures_of(PLANT["field"], _runs([(104.0, 1.0), (106.0, 1.0), None, (103.0, 1.5)]), Bounds(0.5, 0.8))
     assert (found.runs, found.refused, found.misses, found.answered) == (4, 1, 1, 3)
     assert found.miss_rate == pytest.approx(1.0 / 3.0)
     assert found.bias == pytest.approx(1.0 / 3.0 / 104.0)
     assert found.rmse == pytest.approx(np.sqrt(5.0 / 3.0) / 104.0)
     assert found.over_bound == pytest.approx(np.sqrt(5.0 / 3.0) / 0.5)
+    assert found.over_unknown == pytest.approx(np.sqrt(5.0 / 3.0) / 0.8)
+    assert found.width_over_unknown(2.0) == pytest.approx(3.5 / 3.0 / 1.6)
 
 
 def test_the_bounds_of_the_proof_refuse_what_they_should() -> None:
     field = PLANT["field"]
-    misses = figures_of(field, _runs([(106.0, 1.0)] * 20 + [(104.0, 1.0)] * 80), None)
+    misses = figures_of(field, _runs([(106.0, 1.0)] * 20 + [(104.0, 1.0)] * 80), _NO_BOUND)
     assert covers(misses, 0.05) is False
-    never = figures_of(field, _runs([(104.0, 1.0)] * 500), None)
+    never = figures_of(field, _runs([(104.0, 1.0)] * 500), _NO_BOUND)
     assert covers(never, 0.05) is True
     assert not_too_wide(never, 0.05) is False
     assert not_too_wide(replace(never, plant=PLANT["average"]), 0.05) is None
-    biased = figures_of(field, _runs([(104.4, 1.0), (104.401, 1.0)] * 50), None)
+    biased = figures_of(field, _runs([(104.4, 1.0), (104.401, 1.0)] * 50), _NO_BOUND)
     assert unbiased(biased) is False
-    silent = figures_of(field, _runs([None] * 5), None)
+    silent = figures_of(field, _runs([None] * 5), _NO_BOUND)
     assert (covers(silent, 0.05), unbiased(silent)) == (None, None)
 
 

@@ -19,6 +19,16 @@ and the mean torque T̄ = B ω̄ + T_c + r₀, E r₀² = S_0/(P L), adds (∂T�
 - what is added to each report and the rounding (q²/12), white over the samples.
 
 theta = (J, B, T_c, every lag, every average's width, the skew): derivatives by central differences.
+
+That bound knows how many poles and averages there are, and of which signal. Who doesn't, as nobody does before a drive
+that states nothing, has more to tell apart: with P = Π (1 + τ s) of each report,
+
+    ln H_T/H_w − d s = ln P_w − ln P_T + a(s; u) − d s,    theta = (J, B, T_c, p₁ and p₂ of P_w, of P_T, u, d),
+
+p₁ and p₂ the coefficients of s and s² in P, and u the square of an average's width, over either signal. What is
+plausible counts as measured: p₁ to 1 s, u to 1 s², and p₂ to the spread of what lies evenly between none, one pole, and
+p₁²/2, a Butterworth filter. Where poles are equal the first bound promises what nobody can have: to it they are one
+unknown, since to first order only their sum is seen (its information about each of them is singular).
 """
 
 from __future__ import annotations
@@ -33,6 +43,9 @@ from tdhil.studies.coverage.simulate import quiet_shaft
 _FOLDS = 30              # multiples of the sampling rate that are folded in, either way
 _SINGULAR = 1e-10        # of the scaled information: below it the bound is not a number
 _KNOWN_LAGS = [0, 1, 2, -1]
+_PLAUSIBLE = 1.0         # s of a lag, s² of an average's square: standard deviations
+_PLAUSIBLE_SHAPE = 0.5 / np.sqrt(12.0)     # of p₂/p₁²: uniform between 0 and 1/2
+_SHORTEST_S = 1e-3
 _ROUGH = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])    # five equal shares of the rough inertia's error
 
 
@@ -91,8 +104,8 @@ def density(plant: CoveragePlant, hertz: FloatArray) -> FloatArray:
     return result
 
 
-def information(plant: CoveragePlant, hertz: FloatArray, watched: list[Watched]) -> FloatArray:
-    """Fisher information about theta, (n, n)."""
+def slopes_of(plant: CoveragePlant, hertz: FloatArray) -> ComplexArray:
+    """∂G/∂theta where the filters' structure is known, (K, n)."""
     theta = theta_of(plant)
     s = 2j * np.pi * hertz.astype(np.complex128)
     columns = []
@@ -102,12 +115,40 @@ def information(plant: CoveragePlant, hertz: FloatArray, watched: list[Watched])
         rise = impedance_of(plant, theta + by, s) - impedance_of(plant, theta - by, s)
         columns.append(rise / (2.0 * by[index]))
     slopes: ComplexArray = np.stack(columns, axis=1)
+    return slopes
+
+
+def slopes_of_unknown(plant: CoveragePlant, hertz: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """∂G/∂theta where it isn't, (K, 9), and the information that what is plausible adds to it, (9, 9)."""
+    s: ComplexArray = 2j * np.pi * hertz.astype(np.complex128)
+    g = impedance_of(plant, theta_of(plant), s)
+    one = np.ones_like(s)
+    shaft: ComplexArray = plant.inertia_kg_m2 * s + plant.viscous_nm_s_rad
+    columns: list[ComplexArray] = [s / shaft, one / shaft, 0.0 * s]
+    sd = [np.inf] * 3
+    for report, sign in ((plant.speed_report, 1.0), (plant.torque_report, -1.0)):
+        polynomial = np.prod([1.0 + lag * s for lag in report.lags_s], axis=0) * one
+        columns += [sign * s / polynomial, sign * s * s / polynomial]
+        sd += [_PLAUSIBLE, _PLAUSIBLE_SHAPE * max(sum(report.lags_s), _SHORTEST_S) ** 2]
+    average_s = max(plant.speed_report.average_s, plant.torque_report.average_s, _SHORTEST_S)
+    half = np.minimum(0.5 * np.abs(s) * average_s, 0.9 * np.pi)
+    columns += [0.125 * np.abs(s) ** 2 * (half / np.tan(half) - 1.0) / half**2, -s]
+    sd += [_PLAUSIBLE, np.inf]
+    return np.stack(columns, axis=1) * g[:, None], np.diag(np.array(sd) ** -2.0)
+
+
+def information(
+    plant: CoveragePlant, hertz: FloatArray, watched: list[Watched], slopes: ComplexArray | None = None
+) -> FloatArray:
+    """Fisher information about theta, (n, n); ``slopes`` (K, n): of another theta than the one whose lags are known."""
+    slopes = slopes_of(plant, hertz) if slopes is None else slopes
     at_lines, at_rest = density(plant, hertz), float(density(plant, np.zeros(1))[0])
-    found = np.zeros((len(theta), len(theta)))
+    count = slopes.shape[1]
+    found = np.zeros((count, count))
     for one in watched:
         weight = np.abs(one.speed) ** 2 * one.seconds / (4.0 * at_lines)
         found += 2.0 * (slopes.conj().T @ (weight[:, None] * slopes)).real
-        level = np.zeros(len(theta))
+        level = np.zeros(count)
         level[1], level[2] = one.mean_rad_s, 1.0
         found += np.outer(level, level) * one.seconds / at_rest
     return found
@@ -122,13 +163,23 @@ def bound_of(fisher: FloatArray) -> float | None:
     return float(np.sqrt(np.linalg.inv(scaled)[0, 0]) * scale[0])
 
 
-def cramer_rao(plant: CoveragePlant, periods: int) -> float | None:
-    """Least standard deviation of J, kg·m²: root of the mean variance over rough inertias, which set the amplitude.
+@dataclass(frozen=True)
+class Bounds:
+    """Least standard deviations of J, kg·m²: where the filters' structure is known, and where it isn't.
 
-    Where the lags can't be told apart they count as known: that is the best estimator there, and no bound for ours.
+    Where the lags can't be told apart ``known`` takes them for known: that is the best estimator there, and no bound
+    for ours. ``unknown`` is never less: a plant may have more of a structure than its theta.
     """
+
+    known: float | None
+    unknown: float | None
+
+
+def cramer_rao(plant: CoveragePlant, periods: int) -> Bounds:
+    """Roots of the mean variance over rough inertias, which set the amplitude."""
     asked, shaft = quiet_shaft(plant, _ROUGH, periods)
-    variances = []
+    known: list[float | None] = []
+    unknown: list[float | None] = []
     for run, segments in enumerate(asked.segments):
         hertz = np.array(segments[0].lines_hz)
         watched = []
@@ -142,9 +193,15 @@ def cramer_rao(plant: CoveragePlant, periods: int) -> float | None:
             lines = lines * plant.speed_report.response(2j * np.pi * hertz.astype(np.complex128))
             watched.append(Watched(float(speed.mean()), lines, segment.end_s - first))
         fisher = information(plant, hertz, watched)
-        sd = bound_of(fisher[np.ix_(_KNOWN_LAGS, _KNOWN_LAGS)] if plant.degenerate else fisher)
-        if sd is None:
-            return None
-        variances.append(sd * sd)
-    return float(np.sqrt(np.mean(variances)))
+        known.append(bound_of(fisher[np.ix_(_KNOWN_LAGS, _KNOWN_LAGS)] if plant.degenerate else fisher))
+        slopes, plausible = slopes_of_unknown(plant, hertz)
+        unknown.append(bound_of(information(plant, hertz, watched, slopes) + plausible))
+    structure_known, structure_unknown = _pooled(known), _pooled(unknown)
+    if structure_known is not None and structure_unknown is not None:
+        structure_unknown = max(structure_known, structure_unknown)
+    return Bounds(structure_known, structure_unknown)
 
+
+def _pooled(sds: list[float | None]) -> float | None:
+    told = [sd for sd in sds if sd is not None]
+    return float(np.sqrt(np.mean(np.square(told)))) if len(told) == len(sds) else None
