@@ -94,6 +94,8 @@ LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
 """Where a login may lead to."""
+_GONE: Final = suppress(WebSocketDisconnect, RuntimeError)
+"""Around what is said to a socket: who is at its other end may go in mid-word."""
 
 
 class Web:
@@ -567,7 +569,7 @@ class Web:
             return role in who.roles
 
         async def look(socket: WebSocket, scope: anyio.CancelScope) -> None:
-            with suppress(RuntimeError):
+            with _GONE:
                 while await allowed(socket):
                     await anyio.sleep(SOCKET_LOOK_S)
             scope.cancel()
@@ -577,13 +579,11 @@ class Web:
                 await socket.accept()          # only so does a page hear why
                 await allowed(socket)
                 return
-            try:
-                async with anyio.create_task_group() as both:
-                    both.start_soon(look, socket, both.cancel_scope)
+            async with anyio.create_task_group() as both:
+                both.start_soon(look, socket, both.cancel_scope)
+                with _GONE:
                     await serve(socket)
-                    both.cancel_scope.cancel()
-            except* (WebSocketDisconnect, RuntimeError):
-                pass                       # it has gone in mid-word
+                both.cancel_scope.cancel()
 
         return guarded
 
@@ -610,19 +610,18 @@ class Web:
         try:
             async with anyio.create_task_group() as both:
                 both.start_soon(self._listen, socket, both.cancel_scope)
-                while (message := await queue.get()) is not None:
-                    await socket.send_text(json.dumps(message, allow_nan=False))
-                await socket.close(1013, "too slow: come again")
+                with _GONE:
+                    while (message := await queue.get()) is not None:
+                        await socket.send_text(json.dumps(message, allow_nan=False))
+                    await socket.close(1013, "too slow: come again")
                 both.cancel_scope.cancel()
-        except* (WebSocketDisconnect, RuntimeError):
-            pass                           # it has gone in mid-word
         finally:
             feed.leave(queue)
 
     @staticmethod
     async def _listen(socket: WebSocket, scope: anyio.CancelScope) -> None:
         """Nothing that a viewer sends is heard; only that it has gone."""
-        with suppress(WebSocketDisconnect, RuntimeError):
+        with _GONE:
             while True:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
@@ -645,15 +644,20 @@ class Web:
         await socket.accept(protocol)
         relay = Relay(rig_id, lambda: self._running(rig_id), socket.send_text, socket.send_bytes, rig.simulated)
         self._relays += 1
+
+        async def tell(scope: anyio.CancelScope) -> None:
+            with _GONE:
+                await relay.run()
+            scope.cancel()
+
         try:
             async with anyio.create_task_group() as both:
-                both.start_soon(relay.run)
-                while (message := await socket.receive())["type"] != "websocket.disconnect":
-                    said = message.get("text")
-                    await relay.hear(message.get("bytes") or b"" if said is None else said)
+                both.start_soon(tell, both.cancel_scope)
+                with _GONE:
+                    while (message := await socket.receive())["type"] != "websocket.disconnect":
+                        said = message.get("text")
+                        await relay.hear(message.get("bytes") or b"" if said is None else said)
                 both.cancel_scope.cancel()
-        except* (WebSocketDisconnect, RuntimeError):
-            pass                           # it has gone in mid-word
         finally:
             self._relays -= 1
 
