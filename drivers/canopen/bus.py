@@ -248,22 +248,23 @@ class CanLink:
         """
         if not self.asks:
             return self.pump_until(done, timeout_s)
-        begun_s = time.monotonic()
-        end_s = begun_s + (PEER_STILL_DEAD_S if self._dead else PEER_DEAD_S)
-        ask_s = begun_s + (ASK_SOON_S if self._in_vain else ASK_S)
+        waited_s, limit_s = 0.0, PEER_STILL_DEAD_S if self._dead else PEER_DEAD_S
+        ask_s = ASK_SOON_S if self._in_vain else ASK_S
         self._question, self._answered = (self._question + 1) % 256, False
         while not done():
-            now_s = time.monotonic()
-            if self._answered or now_s >= end_s:
+            if self._answered or waited_s >= limit_s:
                 self._in_vain, self._dead = True, not self._answered
                 return False
-            if now_s >= ask_s:
+            if waited_s >= ask_s:
                 self._put(self._message(
                     arbitration_id=CYCLE_ID, data=CYCLE_ASKED + bytes((self._question,)), is_extended_id=False,
                     check=False,
                 ))
-                ask_s = now_s + ASK_AGAIN_S
-            self.receive(min(ask_s, end_s) - now_s)
+                ask_s = waited_s + ASK_AGAIN_S
+            wait_s, begun_s = min(ask_s, limit_s) - waited_s, time.monotonic()
+            self.receive(wait_s)
+            # Whoever was frozen meanwhile has heard nobody: what he missed is there, and no wait counts for more.
+            waited_s += min(time.monotonic() - begun_s, wait_s)
         self._in_vain = self._dead = False
         return True
 

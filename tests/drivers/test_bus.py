@@ -3,7 +3,7 @@
 import can
 import pytest
 
-from drivers.canopen.bus import CanLink
+from drivers.canopen.bus import PEER_DEAD_S, PEER_STILL_DEAD_S, CanLink
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost
 
@@ -97,6 +97,28 @@ def test_pumping_ends_at_once_when_it_is_done(wire, link, fake_time):
     begin_s = fake_time.now_s
     assert link.pump_until(lambda: bool(got), 5.0)
     assert fake_time.now_s - begin_s == pytest.approx(0.1)
+
+
+def test_in_stepped_time_a_host_that_was_frozen_takes_nobody_for_dead(wire, link, fake_time):
+    """The peer has answered, or is about to: that this computer wasn't there tells nothing about it."""
+    got, recv = [], wire.recv
+    link.asks, link.handlers[0x181] = True, got.append
+
+    def frozen(timeout):
+        wire.recv = recv
+        fake_time.sleep(10.0 * PEER_DEAD_S)        # and the wait is over, with nothing read
+        wire.put(0x181, b"x", 0.001)
+
+    wire.recv = frozen
+    assert link.await_answer(lambda: bool(got), 0.1)
+
+
+def test_in_stepped_time_a_peer_that_says_nothing_is_dead_in_the_end(wire, link, fake_time):
+    link.asks = True
+    for waits_s in (PEER_DEAD_S, PEER_STILL_DEAD_S):
+        begin_s = fake_time.now_s
+        assert not link.await_answer(lambda: False, 0.1)
+        assert fake_time.now_s - begin_s == pytest.approx(waits_s, abs=1e-6)
 
 
 def test_a_babbling_bus_does_not_hold_the_loop(wire, link, fake_time):
