@@ -3,6 +3,10 @@
 The longest cases run with --long only, heavy ones in CI (--heavy: those alone), which the header of every run says.
 What the markers mean: pyproject.toml.
 
+A test in real time (`real_time`) that fails has shown nothing where this computer stood still meanwhile: a drive's
+watchdog acts then, and a run that is late ends itself, as both should. It is run again, and the log says so. So it is
+where the run itself says that it was late.
+
 And Ctrl-C as usual: a shell that starts the tests in the background has it ignored, which every child would inherit.
 
 Nothing that collection makes is garbage: it is looked through for some neither while it is made (a fifth of the time
@@ -16,9 +20,11 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
+from _pytest.runner import runtestprotocol
 from hypothesis import settings
 
 settings.register_profile("same", deadline=None, derandomize=True)
@@ -88,6 +94,52 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         marks = ((item.nodeid, item.get_closest_marker("one_worker")) for item in items)
         groups = {nodeid: " ".join(mark.args) or nodeid.split("::")[0] for nodeid, mark in marks if mark is not None}
         Path(write_to).write_text(json.dumps(groups))
+
+
+STOOD_STILL_S = 0.5
+LATE = ("stood still for", "host or adapter late", "host was silent for too long")
+"""Of what a run says at its end (drivers)."""
+TRIES = 4
+
+
+class Stalls:
+    """``longest_s``: for how long a thread that only sleeps came back late, while this was entered."""
+
+    def __enter__(self) -> "Stalls":
+        self.longest_s, self._over = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+        return self
+
+    def _look(self) -> None:
+        before_s = time.monotonic()
+        while not self._over.wait(0.05):
+            now_s = time.monotonic()
+            self.longest_s, before_s = max(self.longest_s, now_s - before_s - 0.05), now_s
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    if item.get_closest_marker("real_time") is None:
+        return None
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for left in reversed(range(TRIES)):
+        with Stalls() as stalls:
+            reports = runtestprotocol(item, nextitem=nextitem, log=False)
+        failed = [report.longreprtext for report in reports if report.failed]
+        late = stalls.longest_s >= STOOD_STILL_S or any(word in text for word in LATE for text in failed)
+        if not (left and failed and late):
+            break
+        item.warn(pytest.PytestWarning(f"this computer was late (by {stalls.longest_s:.1f} s here): run again"))
+        item._initrequest()         # type: ignore[attr-defined]  # anew, with fixtures of its own
+    for report in reports:
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
 
 
 @pytest.hookimpl(trylast=True)

@@ -262,7 +262,8 @@ def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_pre
     asked = Asked()
 
     def fails(text):
-        time.sleep(0.05)
+        while not asked.cycles:
+            time.sleep(0.001)
         raise RuntimeError("nobody home")
 
     with pytest.raises(RuntimeError, match="nobody home"):

@@ -1,7 +1,8 @@
 """The other end of a Modbus line, by hand: a thread behind a loopback socket or a pty that answers as a test says.
 
 ``behave(number, request)`` gets the number of the request (from 0) and its bytes as they stood on the line, and returns
-what is done: bytes are sent, numbers are waited (seconds), RESET and CLOSE end the connection.
+what is done: bytes are sent, numbers (seconds) and events waited for, functions called; RESET and CLOSE end the
+connection.
 """
 
 import contextlib
@@ -14,6 +15,7 @@ import time
 import tty
 
 RESET, CLOSE = "reset", "close"
+HANGS_S = 60.0
 
 
 def crc(data):
@@ -61,6 +63,10 @@ class Peer(threading.Thread):
                 send(what)
             elif isinstance(what, float):
                 time.sleep(what)
+            elif isinstance(what, threading.Event):
+                assert what.wait(HANGS_S)
+            elif callable(what):
+                what()
             else:
                 return what
         return None
@@ -108,7 +114,7 @@ class TcpPeer(Peer):
 
 
 class SerialPeer(Peer):
-    """The master side of a pty; ``device`` is the other one. Requests are told apart by the silence between them."""
+    """The master side of a pty; ``device`` is the other one. Requests are told apart by their CRC."""
 
     def __init__(self, behave):
         super().__init__(behave)
@@ -118,14 +124,15 @@ class SerialPeer(Peer):
         self.device = os.ttyname(self.slave)
 
     def run(self):
+        buffer = b""
         while not self.over.is_set():
-            if not select.select([self.master], [], [], 0.02)[0]:
-                continue
-            request = b""
-            while select.select([self.master], [], [], 0.004)[0]:
-                request += os.read(self.master, 1000)
-            if self.act(request, lambda data: os.write(self.master, data)) is not None:
-                return
+            if select.select([self.master], [], [], 0.02)[0]:
+                buffer += os.read(self.master, 1000)
+            while end := next((end for end in range(4, len(buffer) + 1)
+                               if crc(buffer[:end - 2]) == buffer[end - 2:end]), 0):
+                request, buffer = buffer[:end], buffer[end:]
+                if self.act(request, lambda data: os.write(self.master, data)) is not None:
+                    return
 
     def end(self):
         for end in (self.master, self.slave):

@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.clock import MonotonicClock
+from drivers.clock import MonotonicClock, SteppedClock
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus.link import EmbeddedLink
 from drivers.modbus.pdu import BadReply, LinkLost, NoReply
 from drivers.modbus.rtu import RtuLink, permission_command, refusal
 from drivers.modbus.tcp import MOST_RENEWED, TcpLink
-from tests.drivers.modbus_peers import CLOSE, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
+from tests.drivers.modbus_peers import CLOSE, HANGS_S, RESET, SerialPeer, TcpPeer, crc, rtu, tcp
 
 ASK = bytes.fromhex("03 0010 0002")
 GOOD = bytes.fromhex("03 04 0250 04d2")
 OTHER = bytes.fromhex("03 04 dead beef")
 SHORT_S = 0.1       # for a reply that doesn't come
-LONG_S = 2.0        # for one that does
+LONG_S = HANGS_S    # for one that does
 
 
 def head(request):
@@ -34,6 +34,18 @@ def good(request):
     return tcp(*head(request), GOOD)
 
 
+class Hasty(MonotonicClock):
+    """Can be made to jump: what isn't there by then is out of time, however busy this computer is."""
+
+    skipped_s = 0.0
+
+    def now_s(self):
+        return super().now_s() + self.skipped_s
+
+    def skip(self):
+        self.skipped_s += 2.0 * LONG_S
+
+
 class Line:
     """A link and its peer, with the reply's bytes for either kind of line."""
 
@@ -43,7 +55,7 @@ class Line:
 
     def __enter__(self):
         self.peer.__enter__()
-        clock = MonotonicClock()
+        self.clock = clock = Hasty()
         if self.kind == "tcp":
             self.link = TcpLink("127.0.0.1", self.peer.port, clock)
         else:
@@ -117,13 +129,17 @@ def test_silence(kind):
 
 @KINDS
 def test_a_late_reply_is_not_taken_for_the_next(kind):
-    """It comes 0.3 s after its time was over, which a busy machine doesn't sleep through, and says something else."""
+    """It comes once its time was over, and says something else."""
+    over, came = threading.Event(), threading.Event()
+
     def behave(number, request):
-        return [SHORT_S + 0.3, reply(kind, request, OTHER)] if number == 0 else [reply(kind, request)]
+        return [over, reply(kind, request, OTHER), came.set] if number == 0 else [reply(kind, request)]
 
     with Line(kind, behave) as line:
         with pytest.raises(NoReply):
             line.ask(SHORT_S)
+        over.set()
+        assert came.wait(HANGS_S)
         assert [line.ask().pdu for _ in range(3)] == [GOOD] * 3
         assert line.link.late == 1
 
@@ -141,6 +157,7 @@ def test_a_reply_so_late_that_the_next_request_is_out(kind):
         return [*late, reply(kind, request)]
 
     with Line(kind, behave) as line:
+        line.link._usual_s = LONG_S        # so long a good reply has taken before: so long it waits for the right one
         with pytest.raises(NoReply):
             line.ask(SHORT_S)
         assert [line.ask().pdu for _ in range(3)] == [GOOD] * 3
@@ -149,13 +166,15 @@ def test_a_reply_so_late_that_the_next_request_is_out(kind):
 
 @KINDS
 def test_a_reply_nobody_asked_for_is_thrown_away(kind):
+    over, came = threading.Event(), threading.Event()
+
     def behave(number, request):
-        return [reply(kind, request)] + ([0.01, reply(kind, request, OTHER)] if number == 0 else [])
+        return [reply(kind, request)] + ([over, reply(kind, request, OTHER), came.set] if number == 0 else [])
 
     with Line(kind, behave) as line:
         assert line.ask().pdu == GOOD
-        wait = threading.Event()
-        wait.wait(0.06)
+        over.set()
+        assert came.wait(HANGS_S)
         assert line.ask().pdu == GOOD
         assert line.link.late == 1
         assert line.ask().pdu == GOOD
@@ -212,9 +231,12 @@ def test_a_crc_error_on_the_line(bit):
 
 @pytest.mark.parametrize("length", range(1, 9))
 def test_a_short_reply_on_the_line(length):
-    with Line("rtu", lambda number, request: [rtu(1, GOOD)[: length if number == 0 else None]]) as line:
+    def behave(number, request):
+        return [rtu(1, GOOD)] if number else [rtu(1, GOOD)[:length], 0.05, line.clock.skip]
+
+    with Line("rtu", behave) as line:
         with pytest.raises(BadReply):
-            line.ask(SHORT_S)
+            line.ask()
         assert line.ask().pdu == GOOD
 
 
@@ -380,7 +402,7 @@ def test_what_is_queued_is_thrown_away_when_the_connection_is_closed():
                 while True:
                     link._socket.send(1000 * setpoint)
             link.close()
-            drive.settimeout(5.0)
+            drive.settimeout(HANGS_S)
             with pytest.raises(ConnectionResetError):   # an orderly end would be all of it, and then nothing
                 while drive.recv(100_000):
                     pass
@@ -419,6 +441,7 @@ def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
         link = TcpLink("127.0.0.1", peer.port, MonotonicClock(), connect_s=0.5)
         with pytest.raises(BadReply):
             link.transact(1, ASK, LONG_S)
+        link.clock = SteppedClock()
         link._peer = full.getsockname()
         for _ in range(4):             # its queue is full from here on, and further ones are left without an answer
             one = waiting.enter_context(socket.socket())
@@ -435,8 +458,7 @@ def test_opening_anew_never_takes_longer_than_a_reply_may(monkeypatch):
             with pytest.raises(NoReply):
                 link.transact(1, ASK, 0.02)
         assert waited == [0.02] * 5
+        link.clock.wait_until(0.6)
         with pytest.raises(LinkLost):  # and it is given up in the end
-            for _ in range(100):
-                with contextlib.suppress(NoReply):
-                    link.transact(1, ASK, 0.02)
+            link.transact(1, ASK, 0.02)
         link.close()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import pytest
 
 from sim_bus.modbus.faults import KINDS, ONLY_ON
-from tests.path.path_runs import Shaft, process, tdhil, wait_for
+from tests.path.path_runs import HANGS_S, Shaft, process, tdhil, wait_for
 
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
@@ -99,6 +99,7 @@ def test_the_list_names_those_of_both_buses():
 
 
 @pytest.mark.heavy
+@pytest.mark.real_time
 def test_a_connection_that_is_reset_in_motion(tmp_path):
     """Row 43 with the drive in a process of its own, in real time; its trace is in the plant's."""
     trace, rig = tmp_path / "shaft.csv", tmp_path / "rig.yaml"
@@ -114,7 +115,7 @@ def test_a_connection_that_is_reset_in_motion(tmp_path):
             "--rate", 4, "--rig", rig, "--log", tmp_path / "run.mcap", stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, cwd=tmp_path,
         ))
-        out, err = host.communicate(timeout=60.0)
+        out, err = host.communicate(timeout=HANGS_S)
 
         def resting():
             shaft = Shaft.read(trace)

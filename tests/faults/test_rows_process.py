@@ -11,6 +11,7 @@ import pytest
 
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import (
+    PATIENT,
     PLAIN,
     QUICK_STOP_RAD_S2,
     SETTLING_S,
@@ -28,9 +29,10 @@ SOURCES = ("drivers", "tdhil")
 
 
 @pytest.fixture
-def turning(no_bus_of_the_user, tmp_path):
-    """Peer and host, in stage 2 and past its ramp."""
-    with peer(tmp_path, "--stepped", "--seed", 1, program=PLAIN) as drive, host(
+def turning(no_bus_of_the_user, tmp_path, request):
+    """Peer and host, in stage 2 and past its ramp. A host that dies is noticed at once, a frozen one by its silence."""
+    program = PLAIN if "frozen" in request.node.name else PATIENT
+    with peer(tmp_path, "--stepped", "--seed", 1, program=program) as drive, host(
         tmp_path, *drive.options, "--stepped", "--rate", 25, "--periods", 40
     ) as running:
         assert running.wait_for_line("stage speed …"), running.err
@@ -97,10 +99,9 @@ def test_row_7_nothing_is_sent_by_kernel_or_thread():
 
 
 @pytest.mark.heavy
-@pytest.mark.heavy
 def test_a_host_that_dies_with_a_torque_offset_at_work(no_bus_of_the_user, tmp_path):
     """What stands in 60B2h stays, and the drive's own speed loop brings the shaft to rest against it."""
-    with peer(tmp_path, "--stepped", "--seed", 1, program=PLAIN) as drive, host(
+    with peer(tmp_path, "--stepped", "--seed", 1) as drive, host(
         tmp_path, *drive.options, "--stepped", "--rate", 25, "--impedance", "offset", "--periods", 10
     ) as running:
         assert running.wait_for_line("stage acquire …"), running.err

@@ -44,6 +44,13 @@ def quick(task: LogTask) -> Done:
     return Done(FleetRow(log=task.log, verdict="valid", sha256=content_hash(path), size_bytes=path.stat().st_size))
 
 
+def quick_at_first(task: LogTask) -> Done:
+    """As `quick`, until there are twenty notes; whoever comes then waits until he is ended."""
+    if len(Path(os.environ["TDHIL_CALLS"]).read_text().split()) >= 20:
+        time.sleep(3600)
+    return quick(task)
+
+
 def quick_anywhere(task: LogTask) -> Done:
     """The same of a log behind an address."""
     with local_copy(task.log) as path:

@@ -18,7 +18,7 @@ SKIPPED = {"__pycache__", "build", "dist", "site", "node_modules"}
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, timeout=600)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("importlinter") is None,

@@ -26,7 +26,8 @@ LIMITS = {
     "speed_min_rad_s": 0.5, "speed_max_rad_s": 10.0, "torque_nm": 400.0, "time_s": 900.0, "quick_stop_rad_s2": 2.0,
     "probe_torque_nm": 200.0, "probe_travel_rad": 3.0,
 }
-QUICK = ("--listen", 0.3)
+pytestmark = pytest.mark.real_time         # who is asked has so long to answer, on the wall's clock
+QUICK = ("--listen", 0.5)
 
 
 def filled(path):

@@ -7,7 +7,9 @@ import sys
 import can
 import pytest
 
-from tests.path.path_runs import QUICK, host, peer, process, tdhil, wait_for
+from tests.path.path_runs import HANGS_S, QUICK, host, peer, process, tdhil, wait_for
+
+pytestmark = pytest.mark.real_time
 
 NODE = 1
 SENTENCE = "STOP NOT CONFIRMED: use the hard-wired emergency stop now"
@@ -103,7 +105,8 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
     )
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err
-        assert wait_for("speed", lambda: max(drive.shaft.speed_rad_s, default=0.0) > 1.0)
+        turns = wait_for("speed", lambda: max(drive.shaft.speed_rad_s, default=0.0) > 1.0, running.child)
+        assert turns, running.err
         done = stop(drive)
         ended = running.finish()
         shaft = drive.shaft
@@ -199,7 +202,7 @@ def test_a_hub_that_dies_while_it_stops(turning):
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stdout=-1, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         drive.child.kill()
-        out, err = child.communicate(timeout=60)
+        out, err = child.communicate(timeout=HANGS_S)
     assert child.returncode == 8, err
     assert SENTENCE in out + err and "Traceback" not in err
 
@@ -246,5 +249,5 @@ def test_ctrl_c_ends_the_watching_only(turning, number):
     with process(sys.executable, "-m", "tdhil", "stop", *drive.options, "--node", NODE, stderr=-1) as child:
         assert wait_for("stop", lambda: master.state() == 0x07)
         child.send_signal(number)
-        assert child.wait(60) in (130, -2)
+        assert child.wait(HANGS_S) in (130, -2)
     assert wait_for("rest", lambda: abs(master.objects.read(0x606C, signed=True)) < 5)

@@ -108,6 +108,7 @@ def assert_stopped(shaft, done):
 
 
 @pytest.mark.heavy
+@pytest.mark.real_time
 def test_ctrl_c_in_real_time(tmp_path):
     """The embedded simulator against the wall clock; a slow cycle and a long watchdog bear a loaded machine."""
     rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
@@ -133,9 +134,7 @@ def test_ctrl_c_in_real_time(tmp_path):
     pytest.param("speed", marks=pytest.mark.heavy), pytest.param("hold", marks=pytest.mark.long), "acquire",
 ])
 def test_a_killed_host_leaves_the_shaft_to_the_drive_s_watchdog(tmp_path, stage):
-    with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
-        tmp_path, *drive.options, "--stepped", *LONG
-    ) as running:
+    with peer(tmp_path, *STEPPED) as drive, host(tmp_path, *drive.options, "--stepped", *LONG) as running:
         assert reached(drive, running, stage), running.err
         if stage == "speed":        # past its ramp up from rest
             wait_for("speed", lambda: tail_time(drive.trace) > 12.0, running.child)
@@ -166,8 +165,8 @@ def assert_stopped_by_watchdog(shaft):
     (silent_s,) = shaft.events("running on in own time")
     (lost_s,) = shaft.events("host heartbeat lost")
     assert lost_s - silent_s <= WATCHDOG_S + CYCLE_S
-    # Until then the last setpoint goes on acting: at most the torque limit on the bare inertia.
-    fastest = shaft.speed_at(silent_s) + WATCHDOG_S * TORQUE_NM / INERTIA
+    # Until then the last setpoint goes on acting: at most the torque limit on the bare inertia, and as it fades away.
+    fastest = shaft.speed_at(silent_s) + (WATCHDOG_S + CYCLE_S) * TORQUE_NM / INERTIA + SWINGS_IN_RAD_S
     after = shaft.time_s >= silent_s
     assert shaft.speed_rad_s[after].max() <= fastest
     assert shaft.at_rest_from() - lost_s <= shaft.speed_at(lost_s) / QUICK_STOP_RAD_S2 + SETTLING_S
@@ -178,18 +177,27 @@ def assert_stopped_by_watchdog(shaft):
 
 @pytest.mark.heavy
 def test_a_run_killed_late_in_acquire_is_replayed_as_a_partial_result(tmp_path):
-    with peer(tmp_path, *STEPPED, program=PLAIN) as drive, host(
-        tmp_path, *drive.options, "--stepped", *QUICK, "--periods", 7
-    ) as running:
-        assert reached(drive, running, "acquire"), running.err
-        begun_s = tail_time(drive.trace)
-        # one mean speed of seven periods of 10 s, and half of the other
-        wait_for("periods", lambda: tail_time(drive.trace) > begun_s + 105.0, running.child)
-        running.signal(signal.SIGKILL)
-        done = running.finish()
-        assert done.code == -signal.SIGKILL
-        wait_for("the end of the stop", lambda: rests_long(drive.trace))
-        assert_stopped_by_watchdog(drive.shaft)
+    for attempt in range(TRIES):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with peer(folder, *STEPPED) as drive, host(
+            folder, *drive.options, "--stepped", *QUICK, "--periods", 7
+        ) as running:
+            assert reached(drive, running, "acquire"), running.err
+            begun_s = tail_time(drive.trace)
+            # one mean speed of seven periods of 10 s, and half of the other
+            if wait_for("periods", lambda drive=drive, begun_s=begun_s: tail_time(drive.trace) > begun_s + 105.0,
+                        running.child):
+                running.signal(signal.SIGKILL)
+            done = running.finish()
+            if "stage acquire ok" in done.err:          # it was over before the signal came
+                continue
+            assert done.code == -signal.SIGKILL, done.err
+            wait_for("the end of the stop", lambda: rests_long(drive.trace))
+            assert_stopped_by_watchdog(drive.shaft)
+            break
+    else:
+        pytest.fail("the signal never came in time")
     replayed = tdhil("replay", "--json", done.log)
     document = replayed.document
     assert replayed.code == 3, replayed.out

@@ -126,7 +126,7 @@ def test_closed_descriptors_are_given_to_no_file():
     script = "import os, sys; os.close(1); os.close(0)\n" \
              "from tdhil.cli.main import main; main(['profiles', 'show', 'nothing'])\n" \
              "sys.exit(0 if min(os.open('/dev/null', 0), 9) > 2 else 1)"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=60, env=clean_environment())
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, timeout=600, env=clean_environment())
     assert done.returncode == 0, done.stderr
 
 
@@ -172,7 +172,7 @@ assert before
 slow = {{"scipy.stats", "scipy.signal"}}     # a second each; no run needs them
 print(sorted(set(sys.modules) - before | slow & before), file=sys.stderr)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, cwd=tmp_path,
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600, cwd=tmp_path,
                           env=clean_environment())
     assert done.stderr.splitlines()[-1] == "[]"
 

@@ -234,7 +234,7 @@ def read_in_a_small_process(path, before=""):
 
     done = subprocess.run(
         [sys.executable, "-c", CHILD.format(before=before), str(path)], preexec_fn=cap, capture_output=True, text=True,
-        cwd=Path(__file__).parents[2], timeout=60)
+        cwd=Path(__file__).parents[2], timeout=600)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

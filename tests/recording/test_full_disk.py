@@ -20,7 +20,7 @@ def identify(log, room):
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
     command = [sys.executable, "-m", "tdhil", "identify", "--simulate", *QUICK, "--json", "--log", str(log)]
-    return subprocess.run(command, cwd=ROOT, preexec_fn=cap, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, cwd=ROOT, preexec_fn=cap, capture_output=True, text=True, timeout=600)
 
 
 def test_a_log_that_fails_in_mid_run_stops_the_shaft(tmp_path):

@@ -27,7 +27,9 @@ while True:
     writer.sample(sample(cycle, rng))
     print(cycle * 0.004, flush=True)
     cycle += 1
-    time.sleep(max(0.0, start + cycle * 0.004 - time.monotonic()))
+    left_s = start + cycle * 0.004 - time.monotonic()
+    start -= min(0.0, left_s)           # as the control loop, which catches up with nothing that it overslept
+    time.sleep(max(0.0, left_s))
 """
 
 STEPPED = REAL_TIME.replace("block=False", "block=True, queue_size=256").replace("time.sleep(", "float(")

@@ -22,6 +22,9 @@ from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import RESULT, fill, frames, make_run, sample
 
+HANGS_S = 60.0
+"""Wall time after which something is taken to hang."""
+
 
 class Disk(io.FileIO):
     """A file that stands still while its gate is shut, and is full after so many bytes."""
@@ -185,7 +188,7 @@ def test_a_quiet_run_reaches_the_disk_too(tmp_path):
     writer = RunWriter(path, epoch_ns=0, block=False)
     before = path.stat().st_size
     writer.frame(frames(0, random.Random(1))[0])
-    end = time.monotonic() + 5
+    end = time.monotonic() + HANGS_S
     while path.stat().st_size == before and time.monotonic() < end:
         time.sleep(0.02)
     assert path.stat().st_size > before
@@ -250,7 +253,7 @@ def test_a_slow_sync_holds_up_nobody_but_the_end(tmp_path, monkeypatch):
     path = tmp_path / "run.mcap"
     writer = RunWriter(path, epoch_ns=0, block=True)
     fill(writer, RecordingBuilder(), 2000)
-    assert asked.is_set()
+    assert asked.wait(HANGS_S)
     written = len(read_run(path).recording.time_s)
     with pytest.raises(LogBroken, match="has not taken the log"):
         writer.close(timeout_s=0.05)
@@ -321,7 +324,7 @@ def test_a_log_that_was_taken_away_is_told_at_once(tmp_path, block, how, said):
     for cycle in range(500):
         writer.sample(sample(cycle, rng))
     written_from = time.monotonic()
-    while path.stat().st_size < 2000 and time.monotonic() - written_from < 10.0:
+    while path.stat().st_size < 2000 and time.monotonic() - written_from < HANGS_S:
         time.sleep(0.02)
     if how == "removed":
         path.unlink()
@@ -372,18 +375,16 @@ def test_a_log_whose_thread_died_is_told_within_a_second(tmp_path, monkeypatch, 
     else:
         monkeypatch.setattr(writer._pump, "_guarded", die)
         writer._backlog.ended = True
-        writer._thread.join(5.0)
+        writer._thread.join(HANGS_S)
         writer._backlog.ended = False              # as if it had been killed where it could not even say so
         writer._backlog._alert = 256
     rng = random.Random(1)
-    begun_s = time.monotonic()
     with pytest.raises(LogBroken, match="killed" if where == "at work" else "thread has ended"):
         for cycle in range(100_000):
             writer.sample(sample(cycle, rng))
             if where == "at work":
                 time.sleep(1e-4)
-    assert time.monotonic() - begun_s < 5.0
-    if where == "between":
-        assert cycle * 0.004 <= 1.1
+    # Between two looks at a thread lies a second of control time; a dead one that could say so takes the first sample.
+    assert cycle * 0.004 <= 1.1 if where == "between" else cycle < 50_000
     with pytest.raises(LogBroken):
         writer.close()

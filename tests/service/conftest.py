@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -24,7 +25,7 @@ from tdhil.service.web import Web
 
 FAKE = Path(__file__).with_name("fake_run.py")
 URL = "http://127.0.0.1:8420"
-HANGS_S = 60.0
+HANGS_S = 300.0
 
 
 def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -> Any:
@@ -59,7 +60,15 @@ class Service:
 
 
 @pytest.fixture
-def rigs(tmp_path: Path) -> Path:
+def nobody_s_port() -> Iterator[int]:
+    """One that nobody answers on and nobody else takes meanwhile: a drive's lock is one for all of this computer."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        yield taken.getsockname()[1]
+
+
+@pytest.fixture
+def rigs(tmp_path: Path, nobody_s_port: int) -> Path:
     """Two simulated ones, a real one that may be moved, one that may not, one that can't be read."""
     folder = tmp_path / "rigs"
     folder.mkdir()
@@ -67,7 +76,7 @@ def rigs(tmp_path: Path) -> Path:
         (folder / f"{name}.yaml").write_text(f"name: Rig {name}\nrun: {{simulate: true}}\n")
     limits = ("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
               " quick_stop_rad_s2: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n")
-    real = f"modbus: {{host: 127.0.0.1, port: 1}}\n{limits}"
+    real = f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{limits}"
     (folder / "real.yaml").write_text(real + "service: {motion: attended}\n")
     (folder / "never.yaml").write_text(real)
     (folder / "watched.yaml").write_text(real + "service: {motion: watched}\n")

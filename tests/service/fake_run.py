@@ -1,8 +1,9 @@
 """A run's process without a drive: the same files, socket and lock, and what the request's note says happens.
 
 ``done`` | ``hold`` (moves until it is stopped) | ``loose`` (the same, and is not seen at rest then) | ``ask`` (wants
-the code first; where its rig is watched, it then moves until it is stopped, or watched no more) | ``frozen`` (hears no
-stop) | ``die`` (killed while it moves)
+the code first; where its rig is watched, it then moves until it is stopped, or watched no more) | ``patient`` (the
+same, whose lease counts the time from when its page says that it goes: a test of it has all the time that it takes) |
+``frozen`` (hears no stop) | ``die`` (killed while it moves)
 """
 
 from __future__ import annotations
@@ -55,6 +56,9 @@ def main(folder: Path) -> None:
             return {"code": confirming.code, "left_s": confirming.left_s}
         return {"status": board.status.plain()}
 
+    def waiting():
+        return time.monotonic() if leases and leases[0].watch.how == "hidden" else 0.0
+
     heard = signal.SIG_IGN if what == "frozen" else lambda number, frame: setattr(stop, "asked", True)
     signal.signal(signal.SIGTERM, heard)
     listener = Listener(folder, answer)
@@ -64,7 +68,7 @@ def main(folder: Path) -> None:
         board.to(State.PREFLIGHT)
         if what == "deaf":
             (folder / "control.sock").unlink()
-        if what == "ask":
+        if what in ("ask", "patient"):
             board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()),
                      preflight=(Check("watchdog", "500 ms", "500 ms", "ok", "1016h:1"),), expected_half_width=0.013,
                      expected_s={"setup": 10.0, "acquire": 120.0}, safe_action="quick stop", identity="A drive")
@@ -76,7 +80,8 @@ def main(folder: Path) -> None:
         if watched and not stop.asked:
             leases.append(Lease(
                 confirming.lease_key, confirming.confirmed_by or "", change=lambda one: board.know(watch=one),
-                lost=lambda one: setattr(stop, "asked", True), needed=lambda: not stop.asked))
+                lost=lambda one: setattr(stop, "asked", True), needed=lambda: not stop.asked,
+                clock=time.monotonic if what == "ask" else waiting))
             leases[0].start()
             what = "hold"
         if not stop.asked:

@@ -462,7 +462,7 @@ def test_nobody_takes_away_the_watchdog_over_http(guarded):
 # -- a rig's file
 
 
-def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs):
+def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guarded, rigs, nobody_s_port):
     engineer, path = guarded.sessions["engineer"], rigs / "real.yaml"
     before = path.read_text()
     path.chmod(0o640)
@@ -477,7 +477,7 @@ def test_an_engineer_edits_a_rig_s_limits_and_nothing_that_leads_to_a_drive(guar
     save(before.replace("torque_nm: 400.0", "torque_nm: 300.0"), 403, guarded.sessions["operator"])
     for wrong in ("port: 2", "host: 192.0.2.9"):
         key, value = wrong.split(": ")
-        text = before.replace({"port": "port: 1", "host": "host: 127.0.0.1"}[key], wrong)
+        text = before.replace({"port": f"port: {nobody_s_port}", "host": "host: 127.0.0.1"}[key], wrong)
         assert "stands at the rig" in save(text, 403)["error"]["what"], value
     for more in ("allow_reverse: true\n", "run: {simulate: true}\n", "profile: ../../etc/passwd\n", "node: 3\n"):
         save(before + more, 403)

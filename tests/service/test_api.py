@@ -355,7 +355,7 @@ def test_another_plan_or_three_wrong_codes_void_it(call, service, sent):
 
 def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(call, service):
     assert "logged in" in call.start("watched", expect=403)["error"]["what"]       # a real one, and nobody has
-    run = call.start("rehearsed", what="ask")["id"]
+    run = call.start("rehearsed", what="patient")["id"]
     service.wait(run, "awaiting_confirmation")
     key, later = "k" * 16, "n" * 16
     code = {"code": "123456", "binding": "b" * 64}
@@ -368,8 +368,8 @@ def test_a_watched_run_moves_for_a_page_that_renews_its_lease_and_only_so_long(c
     found = call("POST", f"/runs/{run}/lease", 200, json={"key": key, "new_key": later})
     assert (found["watch"]["by"], found["lease_s"]) == ("local", 5.0)
     assert "another page" in call("POST", f"/runs/{run}/lease", 409, json={"key": key})["error"]["what"]
-    assert call("POST", f"/runs/{run}/lease", 200, json={"key": later, "gone": "hidden"})["watch"]["how"] == "hidden"
     call("POST", f"/runs/{run}/lease", 422, json={"key": later, "gone": "bored"})
+    assert call("POST", f"/runs/{run}/lease", 200, json={"key": later, "gone": "hidden"})["watch"]["how"] == "hidden"
     service.wait(run, "stopped")                       # nobody renewed it
     watch = call("GET", f"/runs/{run}", 200)["watch"]
     assert watch["how"] == "hidden"
@@ -521,9 +521,10 @@ def test_so_it_is_on_a_full_disk_once_there_is_room(call, service, monkeypatch):
             raise OSError(28, "No space left on device")
         save(status)
 
-    run = call.start(what="die")["id"]
+    run = call.start(what="hold")["id"]
     service.wait(run, "moving")
     monkeypatch.setattr(service.store, "save", full)
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
     wait_for("that it is told", lambda: any("can't be written yet" in one for one in service.said))
     assert call("GET", "/rigs/a", 200)["state"] == "busy"          # nobody takes it meanwhile
     room.set()

@@ -53,6 +53,7 @@ def test_a_code_is_void_once_the_rig_s_file_or_its_profile_is_another(tmp_path, 
 
 
 @pytest.mark.heavy
+@pytest.mark.real_time
 def test_a_real_drive_moves_with_its_code_and_no_other(tmp_path):
     rigs = tmp_path / "rigs"
     rigs.mkdir()

@@ -116,7 +116,8 @@ def moving(service: Service, samples: int = 200) -> tuple[str, Path]:
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_client_of_its_own_gets_what_the_log_holds(service, protocol):
     """Over a real socket, by `websockets`: every message of a growing log, byte for byte, under the log's schemas."""
-    with listening(service.web) as port, connect(f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol]) as peer:
+    with listening(service.web) as port, connect(
+            f"ws://127.0.0.1:{port}/foxglove/a", subprotocols=[protocol], open_timeout=HANGS_S) as peer:
         assert peer.subprotocol == protocol
         viewer = Viewer(peer.send)
         while not viewer.statuses():
@@ -166,12 +167,12 @@ def test_who_reads_slowly_has_little_on_its_way(service, monkeypatch):
         wanted = json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 1},
                                                                   {"id": 2, "channelId": 2}]}).encode()
         raw.sendall(b"\x81" + bytes([0x80 | len(wanted)]) + bytes(4) + wanted)          # masked by zeros
-        wait_for("something", lambda: sent, 20.0)
+        wait_for("something", lambda: sum(sent) > 1000)
         before = -1
         while len(sent) > before:
             before = len(sent)
             time.sleep(0.3)
-        assert 1000 < sum(sent) < 350_000 < total
+        assert sum(sent) < 350_000 < total
 
 
 # -- one relay, without a socket -------------------------------------------------------------------------------------

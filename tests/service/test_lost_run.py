@@ -44,6 +44,7 @@ def speed_rad_s(trace: Path) -> float:
 
 
 @pytest.mark.heavy
+@pytest.mark.real_time
 def test_the_shaft_comes_to_rest_the_run_is_told_of_and_its_log_kept(tmp_path):
     rigs, trace = tmp_path / "rigs", tmp_path / "shaft.csv"
     rigs.mkdir()

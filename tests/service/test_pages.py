@@ -30,6 +30,7 @@ from tests.service.conftest import Service, wait_for
 CHROMIUM = os.environ.get("TDHIL_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
     pytest.mark.browser,
+    pytest.mark.real_time,         # a page that is silent for five seconds brakes its run
     pytest.mark.one_worker,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium, or TDHIL_CHROMIUM=PATH)"),
     pytest.mark.skipif(find_spec("playwright") is None, reason="no playwright: pip install -e '.[browser]'"),
@@ -345,8 +346,9 @@ def test_a_watched_run_goes_on_when_its_page_is_loaded_anew_or_hidden_for_a_mome
     page.wait_for_timeout(1000)
     page.evaluate(HIDE, False)
     page.wait_for_timeout(5500)            # longer than a lease
-    status = served.service.store.status(run)
-    assert (status.state, status.watch.gone) == ("moving", None)
+    status = served.service.store.status
+    wait_for("its page", lambda: status(run).watch.gone is None or status(run).state != "moving")      # a moment late
+    assert status(run).state == "moving"
     copy = page.context.new_page()         # a tab that is copied has what the first had kept: the later one holds
     copy.goto("/")
     copy.evaluate("kept => sessionStorage.setItem(...kept)", page.evaluate("Object.entries(sessionStorage)[0]"))

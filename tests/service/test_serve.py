@@ -27,6 +27,11 @@ from tdhil.service.serving import require_way
 from tdhil.service.store import Store
 from tests.service.conftest import HANGS_S, wait_for
 
+PATIENT = """run: {simulate: true}
+limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
+  watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}
+"""
+"""A rig in real time that bears a busy computer: half of its watchdog's time is the longest pause of a loop."""
 QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
 
 
@@ -104,27 +109,31 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
     assert one == found["result"]
 
 
+@pytest.mark.real_time
 def test_its_end_brakes_what_moves(tmp_path):
     """SIGTERM, as of `systemctl stop`: the shaft is at rest before the service ends. A stop of a page comes to the
     same."""
-    with served(tmp_path / "data") as server:
-        run = server.client.start("simulated-modbus", real_time=True)["id"]
+    (tmp_path / "rigs").mkdir()
+    (tmp_path / "rigs" / "rig.yaml").write_text(f"drive: modbus\n{PATIENT}")
+    with served(tmp_path / "data", "--rigs", str(tmp_path / "rigs")) as server:
+        run = server.client.start("rig", real_time=True)["id"]
         wait_for("motion", lambda: server.client.run(run)["state"] == "moving")
         server.process.send_signal(signal.SIGTERM)
         assert server.process.wait(HANGS_S) == ExitCode.OK
     status = json.loads((tmp_path / "data" / "runs" / run / "state.json").read_bytes())
-    assert (status["state"], status["exit_code"]) == ("stopped", ExitCode.TERMINATED)
+    assert (status["state"], status["exit_code"]) == ("stopped", ExitCode.TERMINATED), status
     stop = status["stop"]
     assert stop["asked"] <= stop["seen"] <= stop["at_rest"]
     assert stop["confirmed"] is True
 
 
 @pytest.mark.heavy
+@pytest.mark.real_time
 def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_its_web_is_killed(tmp_path):
     """The run's own process counts: there is no web any more that could tell it."""
     rigs, data = tmp_path / "rigs", tmp_path / "data"
     rigs.mkdir()
-    (rigs / "rig.yaml").write_text("rate_hz: 20\nrun: {simulate: true}\nservice: {motion: watched}\n")
+    (rigs / "rig.yaml").write_text(f"rate_hz: 20\n{PATIENT}service: {{motion: watched}}\n")
     with served(data, "--rigs", str(rigs)) as server:
         with pytest.raises(UsageError, match="no runs of a service"):
             attend(tmp_path, print)
@@ -149,7 +158,7 @@ def test_a_watched_run_moves_with_the_code_of_another_terminal_and_brakes_when_i
         status = wait_for("its end", lambda: (
             found if (found := Store(data).status(run)).ended else None))
         going.set()
-    assert (status.state, status.exit_code) == ("stopped", ExitCode.TERMINATED)
+    assert (status.state, status.exit_code) == ("stopped", ExitCode.TERMINATED), status
     assert status.stop.confirmed is True
     assert status.stop.by == "nobody watched"
     assert (status.watch.by, status.watch.how) == ("local", "silent")

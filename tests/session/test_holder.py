@@ -109,10 +109,11 @@ def test_one_process_has_it_once(port):
 
 
 def test_another_unit_node_or_bus_is_another_drive(port):
-    with hold(address(port)), hold(address(port, unit=7)), hold(given(interface="socketcan", channel="none0", node=3)):
-        with hold(given(interface="socketcan", channel="none0", node=4)):
+    bus = f"none{port}"                # another one in every run of the tests: the locks are one for all
+    with hold(address(port)), hold(address(port, unit=7)), hold(given(interface="socketcan", channel=bus, node=3)):
+        with hold(given(interface="socketcan", channel=bus, node=4)):
             pass
-        with pytest.raises(DriveHeld), hold(given(interface="socketcan", channel="none0", node=3)):
+        with pytest.raises(DriveHeld), hold(given(interface="socketcan", channel=bus, node=3)):
             pass
 
 

@@ -29,7 +29,7 @@ class Host:
     def send(self, can_id: int, data: bytes = b"") -> None:
         self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
-    def wait(self, can_id: int, timeout_s: float = 3.0) -> bytes:
+    def wait(self, can_id: int, timeout_s: float = 60.0) -> bytes:
         while True:
             message = self.bus.recv(timeout_s)
             assert message is not None, f"no frame {can_id:03X}"

@@ -19,8 +19,10 @@ from profiles.library import load_modbus_profile
 from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.server import Server
+from tests.path.path_runs import wait_for
 from tests.sim_bus.modbus_host import QUIET_RIG
 
+pytestmark = pytest.mark.real_time
 WHY = "no mbpoll on this machine: no independent host has read the simulated drive; apt-get install mbpoll"
 LINES = ("tcp", "rtu")
 
@@ -42,8 +44,8 @@ class Poll:
 
     def __call__(self, *arguments: str, values: tuple[int, ...] = ()) -> str:
         *options, target = self._where
-        command = ["mbpoll", "-1", "-o", "2", *options, *arguments, "--", target, *map(str, values)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+        command = ["mbpoll", "-1", "-o", "10", *options, *arguments, "--", target, *map(str, values)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         return done.stdout + done.stderr
 
     def read(self, register: int, count: int = 1, *options: str) -> list[int]:
@@ -107,20 +109,15 @@ def test_generic_map(line: str) -> None:
 @pytest.mark.parametrize("line", LINES)
 def test_the_shaft_obeys(line: str) -> None:
     with served("generic/modbus", line) as (poll, machine):
-        poll.write(41, 500)
+        poll.write(41, 3000)               # every write is a program to be started, which may take its time
         for word, status in ((0x06, 0x21), (0x07, 0x23), (0x0F, 0x27)):
             assert "Written 1 references" in poll.write(1, word)
             assert poll.read(17)[0] & 0x6F == status
         poll.write(1, 2000, options=("-0", "-t", "4:int", "-B"))
-        moved = max(poll.read(17, 1, "-0", "-t", "4:int", "-B")[0] for _ in range(8))
-        assert moved > 0                                                         # speed, 0.01 rpm
-        machine_stopped = threading.Event()
-        for _ in range(100):                                                     # silence: the watchdog stops it
-            if machine.watchdog.lost and abs(machine.inverter.speed_rad_s) < 0.005:
-                machine_stopped.set()
-                break
-            threading.Event().wait(0.1)
-        assert machine_stopped.is_set() and poll.read(17)[0] & 0x6F == 0x07
+        wait_for("motion", lambda: poll.read(17, 1, "-0", "-t", "4:int", "-B")[0] > 0)       # speed, 0.01 rpm
+        # silence: the watchdog stops it
+        wait_for("rest", lambda: machine.watchdog.lost and abs(machine.inverter.speed_rad_s) < 0.005)
+        assert poll.read(17)[0] & 0x6F == 0x07
 
 
 # Typed from the documents' register numbers: as they are written there, what mbpoll is to be told, what is read of a

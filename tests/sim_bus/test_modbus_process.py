@@ -43,8 +43,8 @@ def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
         assert words[2] == "tcp" and words[4:] == ["unit", "9", "profile", "generic/modbus"]
         host, port = words[3].split(":")
         assert host == "127.0.0.1"
-        with socket.create_connection((host, int(port)), timeout=5) as first, \
-                socket.create_connection((host, int(port)), timeout=5) as second:
+        with socket.create_connection((host, int(port)), timeout=120) as first, \
+                socket.create_connection((host, int(port)), timeout=120) as second:
             second.sendall(b"GET / HTTP/1.0\r\n\r\n")                       # no Modbus: hung up on
             assert second.recv(64) == b""
             ask = struct.pack(">HHHB", 0x1234, 0, len(READ) + 1, 9) + READ
@@ -58,7 +58,7 @@ def test_over_tcp(tmp_path: Path, number: signal.Signals) -> None:
             with pytest.raises(TimeoutError):
                 first.recv(64)
         os.kill(process.pid, number)
-        assert process.wait(10.0) == 0
+        assert process.wait(120.0) == 0
         assert process.stderr is not None and process.stderr.read() == ""
     finally:
         process.kill()
@@ -85,7 +85,7 @@ def test_over_a_pseudo_terminal() -> None:
         finally:
             os.close(fd)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10.0) == 0
+        assert process.wait(120.0) == 0
     finally:
         process.kill()
         process.communicate()

@@ -17,6 +17,8 @@ import pytest
 from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.canopen.socketcand import Hub, HubPort, WireFrame, frame_word, parse_send, split
 
+HANGS_S = 120.0
+
 
 @contextmanager
 def serving(hub: Hub) -> Iterator[None]:
@@ -59,14 +61,14 @@ def test_two_stock_clients_and_one_that_dies() -> None:
             for frame in ((0x080, b""), (0x123, b"\x00\x0a\xff"), (0x7FF, bytes(range(8)))):
                 first.send(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False))
                 for other in (second, third):
-                    received = other.recv(3.0)
+                    received = other.recv(HANGS_S)
                     assert received is not None
                     assert (received.arbitration_id, bytes(received.data)) == frame
                     assert not received.is_extended_id
             assert first.recv(0.02) is None                       # never back to the sender
             third.shutdown()
             second.send(can.Message(arbitration_id=0x18FF0001, data=b"\x01", is_extended_id=True))
-            received = first.recv(3.0)
+            received = first.recv(HANGS_S)
             assert received is not None and received.is_extended_id and received.arbitration_id == 0x18FF0001
         finally:
             for bus in (first, second, third):
@@ -79,11 +81,11 @@ def test_a_babbler_is_dropped_and_a_wrong_channel_refused() -> None:
         with socket.create_connection(("127.0.0.1", hub.port)) as babbler:
             assert babbler.recv(64) == b"< hi >"
             babbler.sendall(b"x" * 5000)
-            babbler.settimeout(3.0)
+            babbler.settimeout(HANGS_S)
             with suppress(ConnectionResetError):
                 assert babbler.recv(64) == b""
         with socket.create_connection(("127.0.0.1", hub.port)) as other:
-            other.settimeout(3.0)
+            other.settimeout(HANGS_S)
             assert other.recv(64) == b"< hi >"
             other.sendall(b"< open can7 >")
             assert b"error" in other.recv(64)
@@ -97,7 +99,7 @@ def test_port_of_the_hub_tells_when_the_last_client_left() -> None:
         def talk() -> None:
             bus = client(hub.port)
             bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-            ready.wait(3.0)
+            ready.wait(HANGS_S)
             bus.shutdown()
 
         thread = threading.Thread(target=talk)
@@ -108,7 +110,7 @@ def test_port_of_the_hub_tells_when_the_last_client_left() -> None:
         assert message.arbitration_id == 0x80 and message.dlc == 0
         ready.set()
         with pytest.raises(can.CanOperationError, match="last client"):
-            for _ in range(30):
+            for _ in range(600):
                 port.recv(0.1)
         thread.join()
     finally:
@@ -133,11 +135,11 @@ def test_process_over_its_hub(tmp_path: Path, number: signal.Signals) -> None:
         assert line.startswith("ready: socketcand 127.0.0.1:") and line.endswith(" channel can0 node 1\n")
         bus = client(int(line.split()[2].rpartition(":")[2]))
         bus.send(can.Message(arbitration_id=0x601, data=struct.pack("<BHB4x", 0x40, 0x5FFE, 2), is_extended_id=False))
-        answer = bus.recv(5.0)
+        answer = bus.recv(HANGS_S)
         assert answer is not None and answer.data[4] == 1
         bus.shutdown()
         os.kill(process.pid, number)
-        assert process.wait(10.0) == 0
+        assert process.wait(HANGS_S) == 0
         assert process.stderr is not None and process.stderr.read() == ""
         assert "power on" in trace.read_text()
     finally:
@@ -147,7 +149,7 @@ def test_process_over_its_hub(tmp_path: Path, number: signal.Signals) -> None:
 
 def refused(*arguments: str) -> str:
     process = start(*arguments)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=HANGS_S)
     assert process.returncode == 2 and output == "" and "Traceback" not in errors
     return errors
 
@@ -196,7 +198,7 @@ def test_own_time_follows_the_wall_clock() -> None:
         bus.send(can.Message(arbitration_id=0x601, data=every_20_ms, is_extended_id=False))
         beats = 0
         while beats < 5:                                          # nobody sends SYNC
-            message = bus.recv(5.0)
+            message = bus.recv(HANGS_S)
             assert message is not None
             beats += message.arbitration_id == 0x701 and bytes(message.data) == b"\x7f"
         assert simulated.simulator.time_s >= 0.08

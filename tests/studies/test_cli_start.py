@@ -5,7 +5,7 @@ import sys
 
 
 def run(*words):
-    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=600)
 
 
 def test_help_lists_study():

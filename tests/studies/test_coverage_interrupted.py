@@ -102,7 +102,7 @@ def test_ctrl_c_on_a_terminal(tmp_path):
         child = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=follower, stdin=follower, start_new_session=True)
     os.close(follower)
     os.set_blocking(leader, False)
-    shown, end_s = b"", time.monotonic() + 120
+    shown, end_s = b"", time.monotonic() + 600
     try:
         while time.monotonic() < end_s and child.poll() is None and b"of 2000 in" not in shown:
             shown += read_some(leader)

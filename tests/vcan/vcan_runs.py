@@ -57,10 +57,10 @@ class Drive:
 
 @contextmanager
 def simulated(folder: Path, interface: str, *, stepped: bool = True) -> Iterator[Drive]:
-    """Stepped, a host that is silent for a second of wall time counts as gone."""
+    """Stepped, a host that is silent for long counts as gone."""
     trace, ended = folder / "shaft.csv", threading.Event()
     with can.Bus(interface="socketcan", channel=interface) as bus:
-        simulator = Simulator(bus, RigParams(), seed=1, trace=trace, stepped=stepped)
+        simulator = Simulator(bus, RigParams(), seed=1, trace=trace, stepped=stepped, silence_s=HANGS_S)
         thread = threading.Thread(target=simulator.run, args=(ended,), daemon=True)
         thread.start()
         try:
@@ -81,6 +81,7 @@ def run_into(trouble: Callable[[], None], folder: Path, drive: Drive, interface:
             wait_for("motion", lambda: drive.simulator.speed_rad_s > TURNING_RAD_S or over.is_set())
             if over.is_set():
                 return
+            drive.simulator._silence_s = 1.0           # from here on: he may be gone, and the drive has to see it
             trouble()
             due_s = drive.simulator.time_s + NOTICED_S
             wait_for("the end", lambda: over.is_set() or drive.simulator.time_s > due_s)
