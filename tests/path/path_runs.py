@@ -39,10 +39,12 @@ TORQUE_NM = 400.0
 INERTIA, SPEED_GAIN = 104.0, 300.0
 SETTLING_S = 5.0 * INERTIA / SPEED_GAIN
 """How long the drive's own speed loop trails behind the end of its ramp: five times J/K_p."""
-SWINGS_IN_RAD_S = TORQUE_NM / INERTIA * (0.02 + 0.01 + 0.002)
-"""How far a stop may carry the shaft past zero: its braking torque, the limit at most, acts on until the drive sees
-zero (speed filter) and has let go (torque lag, a control period). How much it is depends on the speed and on the
-torque at the moment when the stop began, and so on when a signal or a cut came."""
+LETS_GO_S = 0.02 + 0.01 + 0.002
+"""How long a stop's torque acts on past zero: until the simulated drive sees zero (its speed filter) and has let go
+(torque lag, a control period)."""
+SWINGS_IN_RAD_S = TORQUE_NM / INERTIA * LETS_GO_S
+"""How far a stop may carry the shaft past zero: its braking torque is the limit at most. How much it is
+depends on the speed and on the torque at the moment when the stop began, and so on when a signal or a cut came."""
 
 
 @dataclass

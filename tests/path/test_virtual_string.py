@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.path.path_runs import Shaft, host, peer, tdhil, wait_for
+from tests.path.path_runs import LETS_GO_S, Shaft, host, peer, tdhil, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PLANT = (EXAMPLES / "plant_top_drive.yaml").read_text(encoding="utf-8")
 RIG = (EXAMPLES / "rig_top_drive.yaml").read_text(encoding="utf-8")
+SWINGS_IN_RAD_S = 15_000.0 / 1500.0 * LETS_GO_S      # past zero, at a stop: rig's torque limit, plant's inertia
 
 
 def interval(value, low, high):
@@ -78,7 +79,7 @@ def test_a_soft_controller_does_on_the_drive_what_tune_says_and_its_log_says_the
     assert document["simulated"] is True and document["loop"]["clamped_cycles"] == 0
     shaft = Shaft.read(files / "shaft.csv")
     shaft.assert_at_rest()
-    assert shaft.speed_rad_s.min() > -0.1      # a heavy shaft swings in behind the drive's own stop
+    assert shaft.speed_rad_s.min() > -SWINGS_IN_RAD_S
     again = tdhil("replay", files / "run.mcap", "--json")
     assert (again.code, again.document) == (0, document)
     page = files / "page.html"
@@ -112,7 +113,7 @@ def test_a_fault_while_the_bit_sticks_and_slips_ends_with_a_shaft_at_rest(files,
     assert shaft.at_rest_from() <= shaft.time_s[-1] - 1.0
     if fault != "drive-fault":       # whose own reaction it is
         shaft.assert_never_let_go()
-    assert shaft.speed_rad_s.min() > -0.1
+    assert shaft.speed_rad_s.min() > -SWINGS_IN_RAD_S
     begun = [row for row, event in enumerate(shaft.event) if "quick stop active" in event or "fault" in event]
     if begun:      # nothing but braking comes after
         later = shaft.torque_nm[begun[-1] + 250:]
@@ -139,7 +140,7 @@ def test_a_host_killed_while_the_bit_sticks_and_slips_leaves_the_shaft_to_the_dr
         wait_for("the end of the stop", rests)
         shaft = drive.shaft
     shaft.assert_at_rest()
-    assert shaft.speed_rad_s.min() > -0.1
+    assert shaft.speed_rad_s.min() > -SWINGS_IN_RAD_S
     replayed = tdhil("replay", "--json", done.log)
     assert replayed.code == 9, replayed.err
     assert replayed.document["verdict"] == "not_found" and replayed.document["complete"] is False
