@@ -171,15 +171,24 @@ class Cia402Target:
         self._link.handlers[0x080] = self._on_sync
 
     def ask(self, attempt: int) -> None:
-        """SDO; then RPDOs; then without the other master's RPDO. Raises CommunicationLost or ObjectRefused."""
+        """SDO; then RPDOs; then without the other master's RPDO. Raises CommunicationLost, ObjectRefused or DriveFault.
+
+        Whatever of that the drive refuses, the word itself is written.
+        """
         if not self._prepared:
             self._prepare()
-        self._leave_torque_mode()
-        if attempt > BY_SDO_TRIES + BY_RPDO_TRIES:
-            self._switch_off_rpdos()
-        elif attempt > BY_SDO_TRIES:
-            self._burst()
+        refused: ObjectRefused | DriveFault | None = None
+        try:
+            self._leave_torque_mode()
+            if attempt > BY_SDO_TRIES + BY_RPDO_TRIES:
+                self._switch_off_rpdos()
+            elif attempt > BY_SDO_TRIES:
+                self._burst()
+        except (ObjectRefused, DriveFault) as error:
+            refused = error
         self._objects.write(_CONTROLWORD, 0, self._word, 16)
+        if refused is not None:
+            raise refused
 
     def poll(self) -> Seen:
         """6041h and 606Ch."""

@@ -15,6 +15,7 @@ from drivers.modbus.access import Access
 from drivers.modbus.codec import si_per_count
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.link import Link
+from drivers.modbus.pdu import RegisterRefused
 from drivers.modbus.state_machine import decode, power_state, seen
 from drivers.quick_stop import Seen
 from profiles.modbus import ModbusProfile, StatusState
@@ -49,13 +50,26 @@ class ModbusTarget:
         power = power_state(state)
         if state is not None and power not in _POWERED:
             return                     # but one that shows what the profile doesn't know may be under power
-        if power is PowerState.ENABLED and state is not None and not self._stop_would_brake():
-            self._ask_for_speed_mode(state)
-            if not self._stop_would_brake():
-                return
+        if power is PowerState.ENABLED and state is not None and not self._in_speed_mode(state):
+            return
         self._stops += 1
         self._driven = self._driven or (self._stops > 2 and power is PowerState.ENABLED)
         self._access.write(self._profile.cycle.control.register_, control.quick_stop | self._speed_bits())
+
+    def _in_speed_mode(self, state: StatusState) -> bool:
+        """Is it time for the quick stop? Else speed mode has been asked for; a drive that refuses it gets a while."""
+        try:
+            if self._stop_would_brake():
+                return True
+            self._ask_for_speed_mode(state)
+            return self._stop_would_brake()
+        except RegisterRefused:
+            now_s, since_s = self._access.clock.now_s(), self._switching_since_s
+            self._switching_since_s = now_s if since_s is None else since_s
+            if now_s - self._switching_since_s <= MODE_S:
+                raise
+            self._stayed_in_torque = True
+            return True
 
     def _stop_would_brake(self) -> bool:
         """Is it time for the quick stop: nothing to change, in speed mode now, or never to be?"""

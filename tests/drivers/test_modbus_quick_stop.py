@@ -1,6 +1,7 @@
 """`drivers.modbus.quick_stop` against simulated drives that somebody has left turning, judged on the true shaft."""
 
 import csv
+import json
 
 import pytest
 
@@ -14,7 +15,7 @@ from profiles.library import load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
-from tests.drivers.modbus_bank import STATUS, Bank
+from tests.drivers.modbus_bank import MODE, MODE_SHOWN, SPEED_SETPOINT, STATUS, Bank
 from tests.drivers.power_machine import ENABLED, STOPPING
 
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=1.0)
@@ -89,3 +90,17 @@ def test_a_drive_that_shows_a_state_nobody_knows_is_asked_all_the_same():
     target = ModbusTarget(EmbeddedLink(bank.serve, clock), load_profile("generic/modbus"), unit=1)
     assert bare_stop(target, clock).ended is Ended.AT_REST
     assert bank.machine.state == STOPPING
+
+
+@pytest.mark.parametrize("refused", [SPEED_SETPOINT, MODE, MODE_SHOWN])
+def test_a_drive_that_refuses_speed_mode_gets_its_quick_stop_in_the_end(refused):
+    bank, clock = Bank(), SteppedClock()
+    bank.machine.state, bank.words[MODE] = ENABLED, 1
+    bank.feedback = lambda: (0 if bank.machine.state == STOPPING else 3000, 0)
+    bank.refuse_at[refused] = 2
+    generic = load_profile("generic/modbus").model_dump(by_alias=True)
+    generic["quick_stop"] |= {"decelerates_in_torque_mode": False}
+    profile = ModbusProfile.model_validate_json(json.dumps(generic))
+    report = bare_stop(ModbusTarget(EmbeddedLink(bank.serve, clock), profile, unit=1), clock)
+    assert report.ended is Ended.AT_REST
+    assert any("did not change to speed mode" in remark for remark in report.remarks)

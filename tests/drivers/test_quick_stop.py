@@ -1,5 +1,7 @@
 """`tdhil stop` on a CANopen drive that is in torque mode, where its quick stop lets go of the shaft."""
 
+from contextlib import suppress
+
 import can
 import pytest
 
@@ -8,7 +10,7 @@ from drivers.canopen.bus import CanLink
 from drivers.canopen.quick_stop import BURST, BURST_PAUSE_S, BY_RPDO_TRIES, BY_SDO_TRIES, Cia402Target
 from drivers.canopen.sdo import Objects
 from drivers.clock import MonotonicClock
-from drivers.errors import DriveFault
+from drivers.errors import DriveFault, ObjectRefused
 from drivers.quick_stop import Ended
 from profiles.library import load_canopen_profile
 from sim_bus.canopen.simulator import EmbeddedSimulator
@@ -79,6 +81,16 @@ def test_a_drive_that_does_not_take_it_gets_the_quick_stop_all_the_same_and_that
     assert order(scripted).count((0x6040, 0x02)) == 2
     assert order(scripted).count((0x6060, 9)) == 1          # no more time is spent on it
     assert any("stays in torque mode" in line for line in target.remarks())
+
+
+@pytest.mark.parametrize("refused", [(0x60FF, 0), (0x6060, 0), (0x6061, 0)])
+def test_whatever_the_drive_refuses_before_it_the_quick_stop_is_written(wire, scripted, epos4, refused):
+    scripted.refuse_write[refused] = scripted.refuse_read[refused] = 0x08000022     # not in this state of the device
+    target = Cia402Target(wire, epos4, MonotonicClock(), node=1)
+    for attempt in range(1, BY_SDO_TRIES + 3):
+        with suppress(ObjectRefused, DriveFault):
+            target.ask(attempt)
+    assert order(scripted).count((0x6040, 0x02)) == BY_SDO_TRIES + 2
 
 
 @pytest.mark.parametrize("name", ["generic/cia402", "maxon/epos4"])
