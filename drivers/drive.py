@@ -107,6 +107,7 @@ class DriveLimits:
     accept_shared_watchdog: bool = False   # by the operator, by name: one that any client's requests feed
     temperature_c: float | None = None     # °C; above it the run is stopped, where the drive tells a temperature
     torque_offset: bool = False            # will `Command.torque_offset_nm` be used? refused where the drive has none
+    string: bool = False                   # does a drill string hang on the shaft? one that is held is refused
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,26 @@ def _hinted(check: Check, hint: str) -> Check:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# A drill string that an earlier stop has left wound up: the drive holds it, and preparing the drive disables that.
+
+
+HELD_SHARE, HELD_COUNTS = 0.02, 5.0
+"""Of the torque limit, or so many counts of the reported torque: less than both is nothing."""
+
+
+def check_nothing_held(table: Table, held_nm: float | None, limit_nm: float, count_nm: float, where: str) -> bool:
+    """A row of what a drive in quick stop holds, N·m; None: it doesn't tell. Whether the shaft may be let go."""
+    most_nm = max(HELD_SHARE * limit_nm, HELD_COUNTS * count_nm)
+    found = "not told" if held_nm is None else f"{held_nm:.4g} N·m"
+    return table.row(
+        "torque held in quick stop", f"at most {most_nm:.3g} N·m", found,
+        held_nm is not None and abs(held_nm) <= most_nm, where,
+        "A drill string is wound up, and the run would let go of it at once: bring its torque down with the rig's own"
+        " control, then disable the drive there",
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # The rated torque, which the drive and rig.yaml may both know: one row of the preflight table, whatever the bus.
 
 

@@ -45,7 +45,7 @@ from drivers.canopen.preflight import (
 from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
 from drivers.canopen.sdo_feedback import keep_stepping, poll, push
-from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards
+from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards, decode
 from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, ReadBack, SignOfLife, Watch
 from drivers.clock import RATES_HZ, Clock, Ticks, how_late
 from drivers.drive import Command, Counters, DriveLimits, FrameTap, Identity, Mode, PositionReading, Preflight, Sample
@@ -212,10 +212,11 @@ class Cia402Drive:
             raise PreflightRefused("preflight before connect", where="driver")
         table, objects, scaling = Table(), self._objects, Table()
         self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
+        checks.check_identity(table, self._identity, self._profile)
+        if not checks.check_state(table, objects, self._units, self._profile, limits):
+            return checks.report(table, self._identity, self._profile, objects, self._units, rated_nm, {}, 0.0, {})
         if self._journal is not None:
             checks.restore_from(table, objects, self._journal, self._identity)
-        checks.check_identity(table, self._identity, self._profile)
-        checks.check_state(table, objects, self._units, self._profile)
         check_parameters(table, objects, self._profile)
         self._codes = checks.choose_modes(table, objects, self._profile, limits.torque_offset)
         self._modes = {code: mode for mode, code in self._codes.items()}
@@ -360,7 +361,12 @@ class Cia402Drive:
         self._wish = Wish.OFF
 
     def reset_fault(self) -> None:
-        """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word."""
+        """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word.
+
+        Nothing is written to a drive that isn't in fault: the edge's low word would let go of a shaft that it holds.
+        """
+        if decode(self._objects.read(0x6041)) is not State.FAULT:
+            return
         # Low first, so that the drive sees an edge whatever stood there before.
         for word in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
             self._objects.write(0x6040, 0, word, 16)

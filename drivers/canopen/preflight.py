@@ -21,11 +21,12 @@ from drivers.canopen.pdo import (
     decode_value,
 )
 from drivers.canopen.sdo import Objects, name, place
+from drivers.canopen.sdo_feedback import reported_torque
 from drivers.canopen.state_machine import State, decode
-from drivers.drive import Identity, Mode, Preflight, ReportingFilters
+from drivers.drive import DriveLimits, Identity, Mode, Preflight, ReportingFilters
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
-from drivers.preflight import Table, agreed_rated_torque
+from drivers.preflight import Table, agreed_rated_torque, check_nothing_held
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, visible
 from profiles.canopen import CanopenProfile, ReportingFilter
@@ -201,13 +202,18 @@ def restore_from(table: Table, objects: Objects, journal: UndoJournal, identity:
     objects.journal = journal
 
 
-def check_state(table: Table, objects: Objects, units: Units, profile: CanopenProfile) -> None:
-    """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop."""
+def check_state(
+    table: Table, objects: Objects, units: Units, profile: CanopenProfile, limits: DriveLimits
+) -> bool:
+    """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop.
+
+    Whether anything may be written to it: not while it brakes, nor while it holds a drill string that is wound up.
+    """
     state = decode(objects.read(0x6041))
     faulty = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
     code = objects.read_if_there(0x603F)
     found = state.value + (f", error code {code:04X}h" if faulty and code is not None else "")
-    braking = False
+    braking, still = state is State.FAULT_REACTION_ACTIVE, True
     if state is State.QUICK_STOP_ACTIVE:
         # Disabling would let it coast: it must have come to rest under its own quick stop.
         speed_lsb = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], signed=True)
@@ -215,6 +221,13 @@ def check_state(table: Table, objects: Objects, units: Units, profile: CanopenPr
         found += f", velocity {speed_lsb}"
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
     table.row("state", "no fault, at rest", found, not faulty and not braking, "6041h", mend)
+    if state is State.QUICK_STOP_ACTIVE and not braking and limits.string:
+        counts = reported_torque(objects, profile)
+        held_nm = None if counts is None else counts * units.torque_nm_per_lsb
+        still = check_nothing_held(table, held_nm, limits.torque_nm, units.torque_nm_per_lsb, "6077h")
+    if braking or not still:
+        table.note("settings", "nothing was written to the drive: it brakes or holds the shaft", "driver")
+    return still and not braking
 
 
 def refuse_if_driven(objects: Objects) -> None:

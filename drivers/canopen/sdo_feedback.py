@@ -44,10 +44,11 @@ def poll(objects: Objects, profile: CanopenProfile, watchdog_s: float) -> Looked
             speed = objects.read((VL_ACTUAL if profile.speed.vl else VELOCITY_ACTUAL)[0], 0, signed=True)
         except (CommunicationLost, ObjectRefused):
             return None
-        return Looked(status, speed, _torque(objects, profile))
+        return Looked(status, speed, reported_torque(objects, profile))
 
 
-def _torque(objects: Objects, profile: CanopenProfile) -> float | None:
+def reported_torque(objects: Objects, profile: CanopenProfile) -> float | None:
+    """In counts; None where the drive doesn't give it."""
     actual = profile.torque.actual
     index, sub, kind = (0x6077, 0, _I16) if actual is None else (actual.index, actual.sub, actual.type)
     try:

@@ -176,7 +176,7 @@ class ModbusDrive:
             )
         found, scales, rated_nm = checks.read_only_checks(
             table, access, profile, self._given, self._rated_torque_nm, limits.speed_rad_s, limits.torque_nm,
-            limits.accept_no_watchdog,
+            limits.accept_no_watchdog, string=limits.string,
         )
         watched, shared = True, False
         own = OwnLimits(limits.accept_wider)
@@ -275,8 +275,14 @@ class ModbusDrive:
         self._wish = Wish.OFF
 
     def reset_fault(self) -> None:
-        """The profile's words one after the other, between connect and preflight; only on an operator's word."""
+        """The profile's words one after the other, between connect and preflight; only on an operator's word.
+
+        Nothing is written to a drive that isn't in fault: such words could let go of a shaft that it holds.
+        """
         control = self._profile.control
+        status = self._access.read(self._profile.cycle.status.register_) & 0xFFFF
+        if power_state(decode(control, status)) is not PowerState.FAULT:
+            return
         for word in control.fault_reset:
             self._access.write(self._profile.cycle.control.register_, word | control.speed_bits)
             self.clock.wait_until(self.clock.now_s() + RESET_PAUSE_S)

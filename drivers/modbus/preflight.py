@@ -17,7 +17,7 @@ from drivers.modbus.cycle import shown_mode
 from drivers.modbus.parameters import Parameters, check_name_plate, check_required, find_rated_torque, read_parameters
 from drivers.modbus.state_machine import decode, power_state, seen
 from drivers.modbus.watchdog import counts_of, is_off
-from drivers.preflight import Table
+from drivers.preflight import Table, check_nothing_held
 from profiles.modbus import Echo, ModbusProfile, Signal
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ MODE_POLLS, MODE_POLL_S = 20, 0.05
 
 def read_only_checks(
     table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float], rated_torque_nm: float | None,
-    speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False,
+    speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False, *, string: bool = False,
 ) -> tuple[Parameters, Scales | None, float]:
     """All that can be known without writing; no scales where something is refused."""
     spared = watchdogs_own(access, profile, given) if accept_no_watchdog else frozenset()
@@ -152,6 +152,8 @@ def read_only_checks(
     if scales is not None:
         check_resolution(table, profile, scales, speed_limit_rad_s, torque_limit_nm)
         check_state(table, access, profile, scales, speed_limit_rad_s)
+        if string:
+            check_string(table, access, profile, scales, torque_limit_nm)
     refused = any(check.outcome is Outcome.REFUSED for check in table.checks)
     if refused:
         table.note("settings", "nothing was written to the drive: mend the rows above first", "driver")
@@ -216,6 +218,15 @@ def check_state(table: Table, access: Access, profile: ModbusProfile, scales: Sc
             "control over the field bus", "yes", "yes" if remote else f"no, status {status:04X}h", remote,
             register_name(register), "Switch the drive from its panel (local) to remote, and check its command source",
         )
+
+
+def check_string(table: Table, access: Access, profile: ModbusProfile, scales: Scales, torque_limit_nm: float) -> None:
+    """A drive that holds a wound-up drill string after an earlier stop is refused: `off` would let go of it."""
+    cycle = profile.cycle
+    if power_state(decode(profile.control, access.read(cycle.status.register_) & 0xFFFF)) is PowerState.QUICK_STOP:
+        register = cycle.torque.register_
+        held_nm = access.read(register) * scales.torque
+        check_nothing_held(table, held_nm, torque_limit_nm, scales.torque, register_name(register))
 
 
 def check_modes(table: Table, access: Access, profile: ModbusProfile) -> None:

@@ -13,6 +13,7 @@ from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.modbus_bank import CONTROL, SPEED_SETPOINT, STATUS, TIME_OUT, Bank
+from tests.drivers.power_machine import OFF, STOPPING
 
 LIMITS = DriveLimits(speed_rad_s=15.0, torque_nm=300.0, quick_stop_rad_s2=1.0, watchdog_s=0.5)
 
@@ -120,6 +121,29 @@ def test_a_fault_is_never_reset_silently(bank, generic):
     drive.reset_fault()
     assert [words for _, words in bank.writes] == [[0x0000], [0x0080], [0x0000]]
     assert drive.preflight(LIMITS).refused == ()
+
+
+@pytest.mark.parametrize("state", [STOPPING, OFF])
+def test_a_drive_that_is_not_in_fault_is_not_reset(bank, generic, state):
+    bank.machine.state = state
+    drive = drive_on(bank, generic)
+    drive.connect()
+    drive.reset_fault()
+    assert bank.writes == []
+    assert bank.machine.state == state
+
+
+@pytest.mark.parametrize(("string", "torque", "let_go"), [
+    (True, 250, False), (True, -250, False), (True, 4, True), (False, 250, True),
+])
+def test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run(bank, generic, string, torque, let_go):
+    bank.machine.state = STOPPING
+    bank.feedback = lambda: (0, torque)
+    rows = refused(bank, generic, dataclasses.replace(LIMITS, string=string))
+    assert ("torque held in quick stop" in rows) is not let_go
+    if not let_go:
+        assert bank.writes == []
+        assert bank.machine.state == STOPPING
 
 
 def test_a_turning_shaft_and_local_control(bank, generic):

@@ -8,7 +8,7 @@ from drivers.canopen.drive import Cia402Drive
 from drivers.clock import MonotonicClock, SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, Outcome
 from drivers.errors import CommunicationLost, PreflightRefused
-from tests.drivers.power_machine import ENABLED, FAULT, OFF, STOPPING
+from tests.drivers.power_machine import ENABLED, FAULT, OFF, REACTION, STOPPING
 from tests.drivers.scripted_drive import ScriptedDrive, u
 
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=300.0, quick_stop_rad_s2=2.0, watchdog_s=0.4)
@@ -157,7 +157,47 @@ def test_a_drive_that_another_master_runs(make, peer):
 def test_a_drive_that_still_brakes_after_a_stop_is_left_alone(make, peer, velocity, good):
     peer.machine.state = STOPPING
     peer.objects[0x606C, 0] = velocity.to_bytes(4, "little", signed=True)
-    assert ("state" not in refused(preflight(make()))) == good
+    drive = make()
+    assert ("state" not in refused(preflight(drive))) == good
+    if not good:                       # neither its mode nor what a quick stop does is changed under way
+        drive.close()
+        assert peer.writes == []
+        assert peer.machine.state == STOPPING
+
+
+def test_a_fault_reaction_is_left_alone_too(make, peer):
+    peer.machine.state = REACTION
+    assert "state" in refused(preflight(make()))
+    assert peer.writes == []
+
+
+@pytest.mark.parametrize("state", [STOPPING, REACTION, OFF])
+def test_a_drive_that_is_not_in_fault_is_not_reset(make, peer, state):
+    """The edge's low word is 'disable voltage', which lets go of a shaft that brakes or is held."""
+    peer.machine.state = state
+    drive = make()
+    drive.connect()
+    drive.reset_fault()
+    assert peer.writes == []
+    assert peer.machine.state == state
+
+
+@pytest.mark.parametrize(("string", "torque", "let_go"), [
+    (True, 250, False), (True, -250, False), (True, None, False), (True, 4, True), (False, 250, True),
+])
+def test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run(make, peer, string, torque, let_go):
+    peer.machine.state = STOPPING
+    peer.objects[0x606C, 0] = u(0, 4)
+    if torque is not None:
+        peer.objects[0x6077, 0] = u(torque, 2)
+    drive = make()
+    drive.connect()
+    found = drive.preflight(dataclasses.replace(LIMITS, string=string))
+    assert ("torque held in quick stop" in refused(found)) is not let_go
+    if not let_go:
+        drive.close()
+        assert peer.writes == []
+        assert peer.machine.state == STOPPING
 
 
 def test_no_rated_torque(make, peer):
