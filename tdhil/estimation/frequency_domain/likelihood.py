@@ -67,6 +67,7 @@ class Likelihood:
         self._load = load
         self._believing = model.shaft if isinstance(model.shaft, Believing) else None
         self._of_line = np.equal.outer(np.arange(len(lines)), self.owner).astype(np.float64)
+        self._twice_tw = 2.0 * self.s_tw
         known = (*priors, *model.plausible({prior.index for prior in priors}))
         self._prior_rows = np.zeros((len(known), model.size))
         for row, prior in enumerate(known):
@@ -110,7 +111,7 @@ class Likelihood:
     def variance(self, g: ComplexArray) -> FloatArray:
         """v_k of one period's equation error, (K,); floored where the cross term cancels all but rounding."""
         alone = self.s_tt + (g.real * g.real + g.imag * g.imag) * self.s_ww
-        v: FloatArray = np.maximum(alone - 2.0 * (g.real * self.s_tw.real + g.imag * self.s_tw.imag), 1e-9 * alone)
+        v: FloatArray = np.maximum(alone - (g.real * self._twice_tw.real + g.imag * self._twice_tw.imag), 1e-9 * alone)
         return v
 
     def weighted(self, theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -124,8 +125,9 @@ class Likelihood:
         return gain
 
     def _weighted(self, theta: FloatArray, g: ComplexArray, gain: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        e: ComplexArray = (self._unloaded(theta) - g[self.owner] * self.speed) * gain
-        q: FloatArray = self._of_line @ (e.real * e.real + e.imag * e.imag)
+        torque = self.torque if self._load is None else self._unloaded(theta)
+        e: ComplexArray = (torque - g[self.owner] * self.speed) * gain
+        q: FloatArray = self._of_line.dot(e.real * e.real + e.imag * e.imag)
         return e, q
 
     def residuals(self, theta: FloatArray) -> FloatArray:
@@ -140,31 +142,47 @@ class Likelihood:
     def at(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
         """The residuals (R,), and what gives ∂residuals/∂theta (R, P) should it be asked for.
 
-        With u = √P r/√v: ∂u = −√P W ∂G/√v − u ∂v/(2v), ∂v = 2 Re[(G* S_WW − S_TW*) ∂G], ∂q = 2 Σ Re(u* ∂u), and
-        ∂(φ u) = φ ∂u + φ' ∂q u. A descent tries more places than it goes to.
+        With u = √P r/√v: ∂u = −√P ∂(G W + c N)/√v − u Re(h ∂G), h = (G* S_WW − S_TW*)/v, since ∂v = 2 v Re(h ∂G);
+        ∂q = 2 Σ Re(u* ∂u), and ∂(φ u) = φ ∂u + φ' ∂q u. All but W, N and u is one number for a line, whose sums go
+        before the product with ∂G:
+
+            ∂(φ u) = −φ √P ∂(G W + c N)/√v − u Re[(φ h + 2 φ' (q h + Σ u* √P W/√v)) ∂G] − 2 φ' u Re Σ u* √P N ∂c/√v.
+
+        A descent tries more places than it goes to.
         """
         g, g_slopes = self.model.seen(theta, self.s)
         v = self.variance(g)
         gain = self._gain(v)
-        e, q = self._weighted(theta, g, gain)
+        u, q = self._weighted(theta, g, gain)
         phi, phi_slope = self._phi(q)
-        k, n = self.owner, len(self.owner)
-        u = phi[k] * e
-        known = self._prior_residuals(theta)
-        residuals = np.empty(2 * n + len(known))
-        residuals[:n], residuals[n : 2 * n], residuals[2 * n :] = u.real, u.imag, known
+        k, n, sized = self.owner, len(self.owner), phi[self.owner]
+        pulled = sized * u
+        known, known_slopes = self._known(theta)
+        residuals = np.concatenate((pulled.real, pulled.imag, known))
 
         def slopes() -> FloatArray:
-            by_g = g_slopes()
-            by_v = ((g.conj() * self.s_ww - self._s_wt) / v)[:, None] * by_g
-            e_slopes = -gain[:, None] * self._by(by_g) - e[:, None] * by_v.real[k]
-            q_slopes = 2.0 * (self._of_line @ (e.conj()[:, None] * e_slopes).real)
-            u_slopes = phi[k][:, None] * e_slopes + e[:, None] * (phi_slope()[:, None] * q_slopes)[k]
-            found = np.empty((len(residuals), len(theta)))
-            found[:n], found[n : 2 * n], found[2 * n :] = u_slopes.real, u_slopes.imag, self._prior_jacobian(theta)
-            return found
+            by_g, phi_twice = g_slopes(), 2.0 * phi_slope()
+            by_v = (g.conj() * self.s_ww - self._s_wt) / v
+            pull = u.conj() * gain
+            own = pull * self.speed
+            turned = phi * by_v + phi_twice * (q * by_v + self._summed(own))
+            each: ComplexArray = (gain * sized * self.speed) * by_g[:, k] + u * (turned * by_g).real[:, k]
+            if self._load is not None:
+                by_q = phi_twice * (self._of_line @ (pull * self._load.lines).real)
+                each[self._load.index] += gain * sized * self._load.lines + u * by_q[k]
+            found = np.empty((len(theta), len(residuals)))
+            np.negative(each.real, out=found[:, :n])
+            np.negative(each.imag, out=found[:, n : 2 * n])
+            found[:, 2 * n :] = known_slopes()
+            return found.T
 
         return residuals, slopes
+
+    def _summed(self, each: ComplexArray) -> ComplexArray:
+        """Over the segments of every line."""
+        found = np.empty(len(self.s), dtype=np.complex128)
+        found.real, found.imag = self._of_line.dot(each.real), self._of_line.dot(each.imag)
+        return found
 
     def _by(self, slopes: ComplexArray) -> ComplexArray:
         """∂(G W̄ + c N)/∂theta of every segment and line, from ∂G/∂theta (K, P)."""
@@ -177,7 +195,7 @@ class Likelihood:
         """φ(q) = √(2 (ν + M) ln(1 + q/ν)/q), (K,), and what gives dφ/dq; by series where q/ν is small."""
         x = q / self.nu
         small = x < _SERIES
-        few = bool(small.any())          # hardly ever
+        few = True in small.tolist()     # hardly ever
         safe = np.where(small, 1.0, x) if few else x
         plain = np.log1p(safe) / safe
         phi: FloatArray = np.sqrt(self._scale * (np.where(small, 1.0 - x / 2.0 + x * x / 3.0, plain) if few else plain))
@@ -195,15 +213,39 @@ class Likelihood:
         """−2 ln L."""
         return float(np.sum(self.residuals(theta) ** 2))
 
-    def _prior_residuals(self, theta: FloatArray) -> FloatArray:
-        known: FloatArray = self._prior_rows @ theta - self._prior_offset
-        if self._believing is not None:
-            known = np.concatenate([known, self.beliefs(theta)[0]])
-        more = [] if self._lags is None else [self._shared_lag(theta)[0]]
-        if self.constraint is not None:
-            z, dof = self.tie_error(theta), self.constraint.dof
-            more.append(math.copysign(math.sqrt((dof + 1.0) * math.log1p(z * z / dof)), z))
-        return np.concatenate([known, more]) if more else known
+    def _known(self, theta: FloatArray) -> tuple[FloatArray, Callable[[], FloatArray]]:
+        """The residuals of what is known besides the lines, and what gives their slopes (P, R).
+
+        In their order: priors, beliefs, the lag that the reports share, the tie.
+        """
+        tie = self.constraint
+        off = self._prior_rows.dot(theta) - self._prior_offset
+        believed = None if self._believing is None else self.beliefs(theta)
+        shared = None if self._lags is None else self._shared_lag(theta)
+        z = 0.0 if tie is None else self.tie_error(theta)
+        pull = 0.0 if tie is None else math.copysign(math.sqrt((tie.dof + 1.0) * math.log1p(z * z / tie.dof)), z)
+        residuals = np.concatenate((
+            off, () if believed is None else believed[0], () if shared is None else shared[:1],
+            () if tie is None else (pull,),
+        ))
+
+        def slopes() -> FloatArray:
+            found = np.zeros((len(theta), len(residuals)))
+            found[:, : len(off)] = self._prior_rows.T
+            at = len(off)
+            if believed is not None:
+                found[:, at : at + len(believed[0])] = believed[1].T
+                at += len(believed[0])
+            if shared is not None and self._lags is not None:
+                found[self._lags[0], at], found[self._lags[1], at] = shared[1:]
+                at += 1
+            if tie is not None:
+                n, value = tie.dof, abs(pull)
+                slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else math.sqrt((n + 1.0) / n)
+                found[:, at] = slope / tie.sd * self._tie_row
+            return found
+
+        return residuals, slopes
 
     def _shared_lag(self, theta: FloatArray) -> tuple[float, float, float]:
         """What the reports' common lag costs (`signal_filters.shared_lag`), and its slopes over either lag."""
@@ -218,26 +260,13 @@ class Likelihood:
         _, *row[list(self._lags)] = self._shared_lag(theta)
         return row
 
-    def _prior_jacobian(self, theta: FloatArray) -> FloatArray:
-        rows = [self._prior_rows]
-        if self._believing is not None:
-            rows.append(self.beliefs(theta)[1])
-        if self._lags is not None:
-            rows.append(self._shared_lag_row(theta)[None, :])
-        if self.constraint is not None:
-            z, n = self.tie_error(theta), self.constraint.dof
-            value = math.sqrt((n + 1.0) * math.log1p(z * z / n))
-            slope = (n + 1.0) * abs(z) / (n + z * z) / value if value > 1e-6 else math.sqrt((n + 1.0) / n)
-            rows.append(slope / self.constraint.sd * self._tie_row[None, :])
-        return np.concatenate(rows)
-
     def tie_error(self, theta: FloatArray) -> float:
         """How far the friction is from what the levels say, in standard deviations.
 
         The combination of theta that they speak of is the friction slope plus its slope per inertia.
         """
         assert self.constraint is not None
-        return float((self._tie_row @ theta - self.constraint.slope) / self.constraint.sd)
+        return (float(self._tie_row.dot(theta)) - self.constraint.slope) / self.constraint.sd
 
     def information(self, theta: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, float]]]:
         """Fisher information (P, P), and its parts with the degrees of freedom of each part's weight.

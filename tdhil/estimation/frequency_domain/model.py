@@ -72,18 +72,19 @@ class Model:
     def impedance_jacobian(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
         """G (K,) and ∂G/∂theta (K, P)."""
         g, slopes = self.seen(theta, s)
-        return g, slopes()
+        return g, slopes().T
 
     def seen(self, theta: FloatArray, s: ComplexArray) -> tuple[ComplexArray, Callable[[], ComplexArray]]:
-        """G (K,), and what gives ∂G/∂theta (K, P) should it be asked for."""
-        m = theta[: self.mechanical]
-        reports = signal_filters.Ratio(theta[self.mechanical :], s)
+        """G (K,), and what gives ∂G/∂theta (P, K) should it be asked for."""
+        mechanical = len(theta) - signal_filters.COUNT
+        m = theta[:mechanical]
+        reports = signal_filters.Ratio(theta[mechanical:], s)
         g: ComplexArray = self.shaft.impedance(m, s) * reports.value
 
         def slopes() -> ComplexArray:
-            found = np.empty((len(s), len(theta)), dtype=np.complex128)
-            np.multiply(self.shaft.jacobian(m, s), reports.value[:, None], out=found[:, : self.mechanical])
-            np.multiply(reports.log_slopes(), g[:, None], out=found[:, self.mechanical :])
+            found = np.empty((len(theta), len(s)), dtype=np.complex128)
+            np.multiply(self.shaft.jacobian(m, s).T, reports.value, out=found[:mechanical])
+            np.multiply(reports.log_slopes(), g, out=found[mechanical:])
             return found
 
         return g, slopes

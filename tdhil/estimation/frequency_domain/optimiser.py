@@ -46,38 +46,42 @@ class Box:
 
 def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
     """From ``start`` (P,) down; only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent."""
-    low, high = box.low, box.high
-    theta = np.where(free, np.clip(start, low, high), start)
+    theta = np.where(free, np.clip(start, box.low, box.high), start)
     r, slopes = at(theta)
-    cost = float(r @ r)
+    cost = float(r.dot(r))
     damping = 1e-3
+    every = np.flatnonzero(free)
+    lowest, highest, scales = box.low[every], box.high[every], box.scale[every]
+    bounds = list(zip(lowest.tolist(), highest.tolist(), strict=True))
     for _ in range(_MOST_STEPS):
-        a = slopes()
-        gradient = a.T @ r
-        stuck = (theta <= low) & (gradient > 0.0) | (theta >= high) & (gradient < 0.0)
-        moving = np.flatnonzero(free & ~stuck)
-        if len(moving) == 0:
-            break
-        scale = box.scale[moving]
-        scaled = a[:, moving] * scale
-        normal, pull = scaled.T @ scaled, scaled.T @ r
+        moving, here, least, most, scale = every, theta[every], lowest, highest, scales
+        scaled = slopes()[:, every] * scales
+        downhill = -r.dot(scaled)
+        moves = [x > low if pull < 0.0 else x < high if pull > 0.0 else True
+                 for x, (low, high), pull in zip(here.tolist(), bounds, downhill.tolist(), strict=True)]
+        if not all(moves):
+            if not any(moves):
+                break
+            moving, here, downhill, scaled = every[moves], here[moves], downhill[moves], scaled[:, moves]
+            least, most, scale = lowest[moves], highest[moves], scales[moves]
+        normal = scaled.T.dot(scaled)
         size = normal.diagonal().copy()
         size[size <= 0.0] = 1.0
-        here, least, most, floor = theta[moving], low[moving], high[moving], 1e-14 * size.max()
+        floor, several = 1e-14 * max(size.tolist()), len(moving) + 1
         gain = 0.0
         for _ in range(_MOST_TRIES):
             damped = normal.copy()
-            damped.flat[:: len(moving) + 1] += damping * size + floor
-            step = _solved(damped, -pull)
+            damped.reshape(-1)[::several] += damping * size + floor
+            step = _solved(damped, downhill)
             trial = theta.copy()
             trial[moving] = np.minimum(np.maximum(here + step * scale, least), most)
             tried, slopes = at(trial)
-            trial_cost = float(tried @ tried)
+            trial_cost = float(tried.dot(tried))
             if trial_cost < cost:
                 gain = cost - trial_cost
                 break
             damping *= 8.0
-            if float(np.max(np.abs(step))) < _SMALL_STEP:
+            if max(map(abs, step.tolist())) < _SMALL_STEP:
                 break
         if gain <= 0.0:
             break

@@ -42,6 +42,9 @@ SHAPE_BOUND: Final = 0.5
 PLAUSIBLE: Final = ((SPEED_LAG, 1.0), (TORQUE_LAG, 1.0), (AVERAGE, 1.0))     # standard deviations about zero: s, s, s²
 _AVERAGE_CYCLES = 0.8          # an average of w has a zero at 1/w: lines must stay below it
 
+_SIGNS: Final = np.array([[1.0], [-1.0]])      # of ln P in the ratio: of speed, of torque
+_SERIES: Final = 1e-3                          # of y², below which a is its series
+
 
 class Ratio:
     """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are asked for a result.
@@ -50,42 +53,37 @@ class Ratio:
     """
 
     def __init__(self, phi: FloatArray, s: ComplexArray) -> None:
-        self._phi, self._s = phi.tolist(), s
-        speed_lag, speed_shape, torque_lag, torque_shape, u, skew = self._phi
-        self._x, self._y = speed_lag * s, torque_lag * s
-        self._speed = 1.0 + self._x * (1.0 + speed_shape * self._x)
-        self._torque = 1.0 + self._y * (1.0 + torque_shape * self._y)
-        value: ComplexArray = self._speed / self._torque * np.exp(-skew * s)
-        if u != 0.0:
-            half = 0.5 * math.sqrt(abs(u)) * np.abs(s)
+        poles = phi[:AVERAGE].reshape(2, 2)                             # of speed and of torque: lag, shape
+        self._s, self._shapes = s, poles[:, 1:]
+        self._u, skew = float(phi[AVERAGE]), float(phi[SKEW])
+        self._x = poles[:, :1] * s
+        self._poles = 1.0 + self._x * (1.0 + self._shapes * self._x)
+        value: ComplexArray = self._poles[0] / self._poles[1] * np.exp(-skew * s)
+        if self._u != 0.0:
+            half = 0.5 * math.sqrt(abs(self._u)) * np.abs(s.imag)
             sinc = np.sin(half) / half
-            value = value * sinc if u > 0.0 else value / sinc
+            value = value * sinc if self._u > 0.0 else value / sinc
         self.value = value
 
     def log_slopes(self) -> ComplexArray:
-        """∂ ln F_T/F_w / ∂phi, (K, 6).
+        """∂ ln F_T/F_w / ∂phi, (6, K).
 
         With y = ω √|u|/2: ∂a/∂u = (y cot y − 1)/(2|u|), which is −ω²/24 at u = 0.
         """
-        s = self._s
-        found = np.empty((len(s), COUNT), dtype=np.complex128)
-        _, speed_shape, _, torque_shape, u, _ = self._phi
-        for lag, shape, size, x, poles in (
-            (SPEED_LAG, SPEED_SHAPE, speed_shape, self._x, 1.0 / self._speed),
-            (TORQUE_LAG, TORQUE_SHAPE, torque_shape, self._y, -1.0 / self._torque),
-        ):
-            found[:, lag] = (1.0 + 2.0 * size * x) * s * poles
-            found[:, shape] = x * x * poles
+        s, x, u = self._s, self._x, self._u
+        found = np.empty((COUNT, len(s)), dtype=np.complex128)
+        by = _SIGNS / self._poles
+        found[SPEED_LAG:TORQUE_SHAPE:2] = (1.0 + 2.0 * self._shapes * x) * s * by
+        found[SPEED_SHAPE:AVERAGE:2] = x * x * by
         quarter = 0.25 * s.imag * s.imag
         y2 = quarter * abs(u)
-        series = -1.0 / 6.0 - y2 / 90.0
-        small = y2 < 1e-3
-        if small.all():
-            found[:, AVERAGE] = quarter * series
-        else:
-            y = np.sqrt(np.where(small, 1.0, y2))
-            found[:, AVERAGE] = quarter * np.where(small, series, (y / np.tan(y) - 1.0) / (2.0 * y * y))
-        found[:, SKEW] = -s
+        by_u = -1.0 / 6.0 - y2 / 90.0
+        if y2.max() >= _SERIES:
+            far = np.maximum(y2, _SERIES)
+            y = np.sqrt(far)
+            by_u = np.where(y2 < _SERIES, by_u, (y / np.tan(y) - 1.0) / (2.0 * far))
+        found[AVERAGE] = quarter * by_u
+        found[SKEW] = -s
         return found
 
 
