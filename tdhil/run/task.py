@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from drivers import Command, Identity, Preflight, PreflightRefused, Sample
 from tdhil.recording import Stage
-from tdhil.run.excitation import Plan, SwingPlan
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
-from tdhil.run.stop import StopReport
-from tdhil.soft_torque import EvaluationCase
+
+if TYPE_CHECKING:       # whoever only reads of a run in its log has no use for what they load
+    from tdhil.run.excitation import Plan, SwingPlan
+    from tdhil.run.stop import StopReport
+    from tdhil.soft_torque import EvaluationCase
 
 STAGES = ("setup", "speed", "torque", "hold", "acquire")
 
