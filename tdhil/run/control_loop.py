@@ -40,6 +40,7 @@ class ControlLoop:
         self.period_s = drive.period_s
         self.stop_side_troubles: list[str] = []
         self.last: Sample | None = None
+        self.before: Sample | None = None            # the one before it
         self.observer: Watcher | None = None         # what a stage does after every cycle, behind the guard
         self.quiet = False                         # somebody is being asked: the display leaves the terminal alone
         self.reckoner: Reckoner | None = None      # where longer arithmetic is done in real time; None: in a thread
@@ -59,7 +60,7 @@ class ControlLoop:
         self.guard.check_command(command)
         sample = self.drive.exchange(command)
         self.log.cycle(command, sample)
-        self.last = sample
+        self.before, self.last = self.last, sample
         if self._telling is not None:
             self._note(self._telling)
         self.guard.check_sample(command, sample)

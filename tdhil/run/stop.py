@@ -281,8 +281,7 @@ class StopSequence:
 
     def _slow_down(self) -> bool:
         """Speed mode, ramped to zero: whether the drive followed, and so holds the shaft under speed control now."""
-        last = self._loop.last
-        speed = last.speed_rad_s if last is not None and math.isfinite(last.speed_rad_s) else 0.0
+        speed = self._begins_at()
         came_from, step = math.copysign(1.0, speed), self._limits.quick_stop_rad_s2 * self._loop.period_s
         patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
         since_s = 0.0
@@ -303,6 +302,13 @@ class StopSequence:
                 return True
         self._trouble.append("the shaft did not follow speed mode to standstill; quick stop instead")
         return False
+
+    def _begins_at(self) -> float:
+        """The speed that the ramp begins at: a single wrong report, or one beyond the limit, must not be followed."""
+        seen = [one.speed_rad_s for one in (self._loop.last, self._loop.before) if one is not None]
+        speed = min((one for one in seen if math.isfinite(one)), key=abs, default=0.0)
+        most = self._limits.speed_max_rad_s
+        return max(-most, min(most, speed))
 
     def _let_go(self, string: StringReleaseLimits) -> None:
         """Yield to what the string holds, until nothing is left or the bounds are reached."""

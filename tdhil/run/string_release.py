@@ -123,12 +123,12 @@ class StringRelease:
 
     def step(self, torque_nm: float, speed_rad_s: float) -> float:
         """The speed to command next, rad/s, from what was reported last; anything not finite counts as unheard."""
+        self._time_s += self._period_s
         if not (math.isfinite(torque_nm) and math.isfinite(speed_rad_s)):
             self._quiet_s = 0.0
             return 0.0
         torque_nm -= self._limits.torque_offset_nm
         self._recent.append(torque_nm)
-        self._time_s += self._period_s
         held_nm = self.torque_nm
         if self._reference_nm is None:
             self._reference_nm, self.trapped_nm = abs(held_nm), held_nm

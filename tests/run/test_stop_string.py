@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.drive import Check, Identity, Mode, Outcome, PowerState
-from drivers.errors import PreflightRefused
+from drivers.drive import Check, Command, Identity, Mode, Outcome, PowerState
+from drivers.errors import DriveFault, LimitHit, PreflightRefused
 from tdhil.run.preconditions import refuse_with_string
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.stop import BLOCK_S, LONGEST_S, MODE_S, StopTimeout
@@ -143,6 +143,15 @@ def test_torque_that_does_not_come_down_is_given_up_and_held():
     assert here.bench.now_s < 2 * 300.0 / 20.0 + 90.0 + 30.0
 
 
+def test_torque_that_is_no_number_is_given_up_and_held():
+    here = StringWorld(twist_nm=300.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=NAN)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+    assert here.bench.now_s < 150.0
+
+
 @pytest.mark.parametrize("begin", [1, 50])
 @pytest.mark.parametrize("dead", [lost, lambda drive, sample: sample._replace(fresh=False)], ids=["dead", "stale"])
 def test_a_drive_that_falls_silent_is_left_to_its_watchdog(begin, dead):
@@ -185,6 +194,26 @@ def test_it_begins_from_a_speed_of_zero_where_none_is_known(last):
     here.bench.last = None if last == "none" else here.bench.last._replace(speed_rad_s=NAN)
     assert here.stop_sequence().run().confirmed
     assert here.drive.commands[0].speed_rad_s == 0.0
+
+
+@pytest.mark.parametrize("told", [40.0, -40.0, 1e12, NAN])
+def test_one_wrong_report_is_not_followed(told):
+    """What tripped the run is the last report; a ramp from there would drive the shaft up to it."""
+    here = StringWorld(speed=4.0, stiffness=10.0)
+    here.drive.wish = PowerState.ENABLED
+    here.drive.misbehave = lambda drive, sample: sample._replace(speed_rad_s=told) if drive.cycles == 3 else sample
+    with pytest.raises((DriveFault, LimitHit)):
+        here.bench.hold(Command(Mode.SPEED, 4.0, 0.0), 1.0)
+    begun = len(here.drive.commands)
+    assert here.stop_sequence().run().confirmed
+    assert 3.9 < here.drive.commands[begun].speed_rad_s <= 4.0
+    assert max(abs(command.speed_rad_s) for command in here.drive.commands) <= 4.0
+
+
+def test_a_speed_beyond_the_limit_is_braked_from_the_limit():
+    here = StringWorld(speed=1e12, stiffness=0.1)
+    here.stop_sequence().run()
+    assert here.drive.commands[0].speed_rad_s == pytest.approx(10.0 - 2.0 * PERIOD_S)
 
 
 def test_backwards_too_it_comes_to_rest_first():
