@@ -19,7 +19,7 @@
     │   ├── LogRefused              too little space to begin with; nothing moved                4
     │   └── NothingRecoverable      not one message of the file can be read                     10
     ├── TuningRefused               `tdhil tune`: such gains would make the string swing        11
-    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT (143)
+    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT, SIGTSTP (143)
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
 broke off ends with 3 as well, since what it holds can be replayed.
@@ -56,7 +56,7 @@ class ExitCode(IntEnum):
     NOTHING_RECOVERABLE = 10    # nothing recoverable in a log
     TUNING_REFUSED = 11         # the gains that were asked for can't be recommended
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
-    TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\)
+    TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\), SIGTSTP (Ctrl-Z)
 
 
 class UsageError(TdhilError):

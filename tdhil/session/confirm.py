@@ -147,9 +147,18 @@ def _taken(unverified: Sequence[str]) -> str:
 
 
 def _ask(idle: Idle) -> str:
-    """A line from the terminal."""
-    line: str = _meanwhile(idle, sys.stdin.readline)
-    return line
+    """A line from the terminal. Raises PreflightRefused where it can't be read, as by a program in the background."""
+    return _meanwhile(idle, _line)
+
+
+def _line() -> str:
+    try:
+        return sys.stdin.readline()
+    except OSError as error:
+        raise PreflightRefused(
+            f"the terminal can't be asked: {error.strerror or error}", where="terminal",
+            next_step="Run it in the foreground, at a terminal",
+        ) from error
 
 
 def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:

@@ -2,7 +2,8 @@
 
 The lock (flock) belongs to an open file, so that the system lets go of it when the process ends, whatever ends it. The
 file says who holds it. It lies where every user and every service of this computer finds the same one; a folder of the
-user's would leave two users two locks. Stopping takes no lock.
+user's would leave two users two locks. A file can be removed while it is locked, and the next one would lock another:
+so on Linux a name in the kernel is taken besides (abstract socket), which nobody can remove. Stopping takes no lock.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import hashlib
 import json
 import os
 import shlex
+import socket
 import stat
 import sys
 import time
@@ -45,6 +47,9 @@ class Holder:
 
     def __str__(self) -> str:
         return f"process {self.pid} ({self.command}), since {self.since}"
+
+
+NOBODY_KNOWN = Holder(0, "it does not say who it is", "it does not say when")
 
 
 class DriveHeld(PreflightRefused):
@@ -81,11 +86,12 @@ def hold(address: str | None) -> Iterator[None]:
     descriptor = _open(_path(address))
     try:
         _take(descriptor, address)
-        try:
-            yield
-        finally:
-            with suppress(OSError):
-                os.ftruncate(descriptor, 0)
+        with _name_in_kernel(address):
+            try:
+                yield
+            finally:
+                with suppress(OSError):
+                    os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
 
@@ -140,13 +146,25 @@ def _take(descriptor: int, address: str) -> None:
         os.pwrite(descriptor, json.dumps(asdict(me)).encode(), 0)
 
 
+@contextmanager
+def _name_in_kernel(address: str) -> Iterator[None]:
+    with socket.socket(socket.AF_UNIX) as taken:
+        if sys.platform == "linux":
+            try:
+                taken.bind("\0" + _path(address).name)
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise DriveHeld(NOBODY_KNOWN, address) from None
+        yield
+
+
 def _read(descriptor: int) -> Holder:
     """What the file says of its holder; what another user wrote there may be anything."""
     try:
         found: Any = json.loads(os.pread(descriptor, _LONGEST, 0))
         return Holder(int(found["pid"]), str(found["command"])[:300], str(found["since"])[:40])
     except (OSError, ValueError, TypeError, KeyError, ArithmeticError, RecursionError):
-        return Holder(0, "it does not say who it is", "it does not say when")
+        return NOBODY_KNOWN
 
 
 def _command() -> str:

@@ -1,4 +1,8 @@
-"""Ctrl-C, SIGQUIT, SIGTERM and SIGHUP become a wish to stop, which the control loop sees in its next cycle."""
+"""Ctrl-C, Ctrl-Z, SIGQUIT, SIGTERM and SIGHUP become a wish to stop, which the control loop sees in its next cycle.
+
+A program in the background that asks its terminal something is stopped by the system where it stands (SIGTTIN,
+SIGTTOU). Meanwhile it isn't: a turning shaft must not be left to the drive's watchdog, if it has one, by that.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,8 @@ from types import FrameType
 
 from tdhil.run import StopRequest
 
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")  # the last three don't exist everywhere
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")  # the last four don't exist everywhere
+_UNHEARD = ("SIGTTIN", "SIGTTOU")
 
 
 @contextmanager
@@ -28,10 +33,11 @@ def stop_on_signals(request: StopRequest | None = None) -> Iterator[StopRequest]
     def handler(signum: int, frame: FrameType | None) -> None:
         request.ask(signum)
 
-    known = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
-    former = {number: signal.signal(number, handler) for number in known}
+    wanted = dict.fromkeys(_NAMES, handler) | dict.fromkeys(_UNHEARD, signal.SIG_IGN)
+    known = {getattr(signal, name): what for name, what in wanted.items() if hasattr(signal, name)}
+    former = {number: signal.signal(number, what) for number, what in known.items()}
     try:
         yield request
     finally:
         for number, before in former.items():
-            signal.signal(number, before)
+            signal.signal(number, signal.SIG_DFL if before is None else before)    # None: not set by Python

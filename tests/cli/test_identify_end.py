@@ -135,15 +135,28 @@ def test_the_result_stands_in_the_log(ends):
     assert read_run(Path("run.mcap")).result == {"verdict": "as the test has it"}
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGQUIT", "SIGTERM", "SIGHUP", "SIGTSTP"])
 def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
     number, former = signal.Signals[name], signal.getsignal(signal.Signals[name])
     with stop_on_signals() as request:
         assert request.signum is None
+        assert callable(signal.getsignal(number))      # else a stop signal would stop the tests
         os.kill(os.getpid(), number)
         os.kill(os.getpid(), signal.SIGTERM)
         assert (request.signum, request.count) == (number, 2)
     assert signal.getsignal(number) is former
+
+
+def test_a_program_in_the_background_is_not_stopped_by_its_terminal_while_a_shaft_turns():
+    former = signal.signal(signal.SIGTTIN, signal.SIG_DFL)
+    try:
+        with stop_on_signals() as request:
+            assert signal.getsignal(signal.SIGTTIN) is signal.getsignal(signal.SIGTTOU) is signal.SIG_IGN
+            os.kill(os.getpid(), signal.SIGTTIN)
+            assert request.signum is None
+        assert signal.getsignal(signal.SIGTTIN) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTTIN, former)
 
 
 def test_in_another_thread_signals_stay_with_the_main_threads_owner():

@@ -1,7 +1,9 @@
 """What the operator is asked at the first slow speed, and what counts as his word."""
 
+import errno
 import io
 import sys
+from unittest.mock import Mock
 
 import pytest
 from rich.console import Console
@@ -50,6 +52,15 @@ def test_nobody_at_a_terminal_is_no_yes(monkeypatch):
     with pytest.raises(PreflightRefused, match="nobody is there to see") as caught:
         ask(monkeypatch, "yes\n", terminal=False)
     assert "--accept-speed-unit" in caught.value.next_step
+
+
+def test_a_program_in_the_background_is_refused_not_stopped(monkeypatch):
+    """SIGTTIN is not heard meanwhile: reading the terminal then fails with EIO."""
+    terminal = Terminal()
+    terminal.readline = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    monkeypatch.setattr(sys, "stdin", terminal)
+    with pytest.raises(PreflightRefused, match="the terminal can't be asked: Input/output error"):
+        confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 
 def test_no_terminal_at_all(monkeypatch):

@@ -90,6 +90,19 @@ def test_a_second_process_is_told_who_has_it_and_a_killed_one_has_it_no_more(por
     assert exit_code(refused.value) is ExitCode.REFUSED
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="no names in the kernel there")
+def test_a_lock_whose_file_was_removed_holds_all_the_same(port):
+    at = address(port)
+    with another_process(at) as process:
+        holder._path(at).unlink()
+        with pytest.raises(DriveHeld, match="the drive is held"), hold(at):
+            pass
+        process.kill()
+        process.wait()
+        with hold(at):
+            pass
+
+
 def test_identify_is_refused_while_stop_is_not(port, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     where = ("--host", "localhost", "--port", str(port))
