@@ -17,6 +17,7 @@ from tdhil.run.design import (
     Knowledge,
     Stopping,
     choose,
+    choose_soonest,
     half_width,
     interval_confidence,
     least_scale,
@@ -129,7 +130,14 @@ def plan_acquisition(
     chosen = choose(limits, guess, wish, known, request.confidence)
     if chosen.plan.duration_s > allowed_s:
         chosen = choose(limits, guess, wish, known, request.confidence, allowed_s)
-    return _with_pilot(request, chosen, known, allowed_s)
+    planned = _with_pilot(request, chosen, known, allowed_s)
+    assert request.tolerance is not None
+    working = interval_confidence(request.confidence, pilot_dof(chosen.plan.with_counted(LEAST_COUNTED)), 0)
+    soonest = choose_soonest(limits, guess, wish, known, working, request.tolerance / MARGIN, allowed_s)
+    if soonest is None:
+        return planned
+    sooner = _with_pilot(request, replace(chosen, plan=soonest), known, allowed_s)
+    return sooner if sooner.stopping is not None and sooner.stopping.reachable else planned
 
 
 RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))

@@ -1,10 +1,12 @@
 """Stage 5 that goes on until it is enough: what is run, what is announced, what is decided, and how it ends early."""
 
+import math
 import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import tdhil.run.adaptive_duration as enough_room
 from drivers.drive import Command, Mode
@@ -12,7 +14,7 @@ from tdhil.errors import Interrupted
 from tdhil.recording.recording import Excitation, Recording
 from tdhil.run.adaptive_duration import Decision, decide
 from tdhil.run.design import Stopping
-from tdhil.run.design.stopping_rule import Look
+from tdhil.run.design.stopping_rule import MOST_BEHIND, Look, spent_confidence
 from tdhil.run.excitation import ExcitationWish, MotionLimits, RigGuess, make_plan
 from tdhil.run.planning import counted_in, pilot_dof
 from tdhil.run.settings import ControlAssumptions
@@ -26,15 +28,17 @@ RULE = Stopping(0.01, 0.95, 20.0, 6, 10, 600.0, True)
 class Stub:
     """Says in advance how many periods more are wanted."""
 
+    at_last = False
+
     def __init__(self, *wanted):
         self.wanted, self.asked_s = list(wanted), []
 
     def question(self, spent_s):
         self.asked_s.append(spent_s)
-        return lambda: Decision(self.wanted.pop(0), "because", None, 0, 0.95)
+        return lambda: Decision(self.wanted.pop(0), "because", None, 0, 0.95, at_last=self.at_last)
 
     def decided(self, decision):
-        return decision.periods
+        """Not kept."""
 
 
 def acquire(world, stub):
@@ -63,6 +67,15 @@ def test_the_last_mean_speed_goes_on_and_the_others_are_gone_back_to(world):
     assert stub.asked_s == sorted(stub.asked_s)
     # the time that an extension is reckoned to take is the time that it takes
     assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(PLAN.extension_s(4), abs=3.0)
+
+
+def test_what_is_little_is_run_where_the_shaft_is(world):
+    stub = Stub(4, 0)
+    stub.at_last = True
+    _, _, run = acquire(world, stub)
+    excitation = run()
+    assert [round((one.end_s - one.start_s) / one.period_s) for one in excitation.segments] == [3, 7]
+    assert stub.asked_s[1] - stub.asked_s[0] == pytest.approx(4.0 * PLAN.segments[0].reference.period_s, abs=0.1)
 
 
 def test_a_pilot_that_is_enough_is_the_whole_run(world):
@@ -113,9 +126,12 @@ def recording(counted=6):
         (0.008, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 0, 0),      # both say that it is enough
         (0.030, 0.0200, 2.0, 0.0095, 0, 0, 400.0, 6, 0),      # the scatter says how much
         (0.008, 0.0120, 1.2, 0.0095, 0, 0, 400.0, 2, 0),      # never by a narrow interval alone, nor too little
-        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 3, 1),      # too wide all the same: once more, and another look
+        (0.0101, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 6, 1),     # too wide all the same: once more here, another look
+        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 12, 1),     # … by how much it is too wide, at most as much again
+        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 70.0, 7, 1),
         (0.008, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 0, 1),
-        (0.030, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 3, 2),
+        (0.030, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 12, 2),
+        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 15.0, 0, 0),
         (0.030, 0.0080, 1.0, 0.0080, 4, 2, 400.0, 0, 2),      # no more looks
         (0.030, 0.0200, 2.0, 0.0095, 4, 0, 400.0, 0, 0),
         (0.030, 0.0200, 2.0, 0.0095, 0, 0, 30.0, 0, 0),       # no more time
@@ -134,10 +150,11 @@ def test_decisions(monkeypatch, interval, now, scale, then, looks, seen, left_s,
 
 @pytest.mark.parametrize(("interval", "looks", "left_s", "periods", "after"), [
     (0.008, 0, 400.0, 0, 0),
-    (0.011, 0, 900.0, 8, 1),              # six periods at ±1.1 %: (1.05·1.1·1.291)² − 1 = 1.22 times as many more
+    (0.0105, 0, 900.0, 4, 1),             # six periods at ±1.05 %: (1.05·1.05·1.13)² − 1 = 0.55 times as many more
     (0.0099999, 0, 900.0, 0, 0),
-    (0.010001, 0, 900.0, 6, 1),           # the next interval that is looked at has a wider quantile
-    (0.100, 0, 900.0, 44, 1),             # what there is time for
+    (0.010001, 0, 900.0, 3, 1),           # the next interval that is looked at has a wider quantile
+    (0.100, 0, 900.0, 6, 1),              # never longer than all before, which the next one's confidence counts on
+    (0.100, 0, 100.0, 4, 1),              # what there is time for
     (0.011, 4, 900.0, 0, 0),
     (0.011, 0, 50.0, 0, 0),               # no time for two
     (np.inf, 0, 900.0, 0, 0),
@@ -152,10 +169,22 @@ def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, int
     assert found.plain()["interval"] == (interval if np.isfinite(interval) else None)
 
 
+def test_what_the_scatter_says_is_missing_is_run_where_the_shaft_is(monkeypatch):
+    monkeypatch.setattr(enough_room, "look", lambda *_: Look(12.0, 0.012, 1.3, 0.0095, True, at_last=True))
+    found = decide(recording(), RULE, PLAN, 400.0, 0, 0)
+    assert (found.periods, found.at_last, found.seen) == (4, True, 0)
+    assert "4 more periods here" in found.why
+
+
 def test_all_looks_together_miss_no_more_than_asked():
-    assert RULE.working(0) > 0.96
-    assert RULE.working(1) > 0.99
-    assert sum(1.0 - RULE.working(seen) for seen in range(20)) < 0.05
+    """Signed roots of data that grow as fast as they may behind a look: an interval whose root is too large misses."""
+    rng = np.random.default_rng(3)
+    root, missed = rng.standard_normal(400_000), np.zeros(400_000, dtype=bool)
+    for seen in range(5):
+        missed |= np.abs(root) > norm.ppf(0.5 + 0.5 * spent_confidence(0.95, seen))
+        assert RULE.working(seen) > spent_confidence(0.95, seen)
+        root = (root + math.sqrt(MOST_BEHIND) * rng.standard_normal(root.size)) / math.sqrt(1.0 + MOST_BEHIND)
+    assert 0.047 < np.mean(missed) <= 0.05 + 3.0 * math.sqrt(0.05 * 0.95 / root.size)
     assert pilot_dof(PLAN.with_counted(6)) == 20.0
 
 

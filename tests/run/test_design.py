@@ -7,11 +7,22 @@ import pytest
 
 from tdhil.estimation.samples import Samples
 from tdhil.recording.recording import LagPrior
-from tdhil.run.design import Knowledge, Noise, assumed_noise, choose, expected_half_width, measured_noise
+from tdhil.run.design import (
+    Knowledge,
+    Noise,
+    assumed_noise,
+    choose,
+    expected_half_width,
+    half_width,
+    longer,
+    measured_noise,
+    predicted,
+)
 from tdhil.run.design.prediction import assumed_theta
 from tdhil.run.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan
 from tdhil.run.guard import Guard
-from tdhil.run.settings import ControlAssumptions
+from tdhil.run.planning import plan_acquisition
+from tdhil.run.settings import ControlAssumptions, ExcitationRequest
 from tdhil.studies.coverage.bound import density
 from tdhil.studies.coverage.plants import FLEET
 
@@ -144,3 +155,25 @@ def test_the_time_allowed_is_kept():
         assert all(segment.periods - segment.settle_periods >= 6 for segment in plan.segments)
     with pytest.raises(PlanRefused, match="time"):
         choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95, 40.0)
+
+
+def test_with_a_tolerance_the_plan_that_meets_it_soonest_is_taken():
+    asked, left_s = ExcitationRequest(tolerance=0.01), 900.0
+    planned = plan_acquisition(asked, "torque", LIMITS, GUESS, KNOWN, left_s)
+    assert planned.stopping.reachable
+    assert planned.plan.duration_s < 0.7 * make_plan(LIMITS, GUESS).duration_s
+    assert {one.periods - one.settle_periods for one in planned.plan.segments} == {planned.stopping.pilot_periods}
+    assert all(one.settle_periods * one.reference.period_s >= 8.0 for one in planned.plan.segments)
+    fixed = plan_acquisition(replace(asked, frequency_hz=0.2), "torque", LIMITS, GUESS, KNOWN, left_s).plan
+    assert fixed.segments[0].reference.lines_hz[0] == pytest.approx(0.2)
+
+
+def test_longer_at_the_last_mean_speed_alone():
+    plan = make_plan(LIMITS, GUESS)
+    evidence = predicted(plan, KNOWN.theta(GUESS), KNOWN.noise, KNOWN.prior)
+    alone, both = longer(evidence, 1.5, at_last=True), longer(evidence, 1.5)
+    for line, one, other in zip(evidence.lines, alone.lines, both.lines, strict=True):
+        assert (one.periods[0], one.nu) == (line.periods[0], other.nu)
+        assert np.sum(one.periods) == pytest.approx(np.sum(other.periods))
+    assert alone.levels.duration[0] == evidence.levels.duration[0]
+    assert half_width(both, 0.95) <= half_width(alone, 0.95) < half_width(evidence, 0.95)

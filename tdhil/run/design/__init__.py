@@ -1,7 +1,8 @@
 """What to ask of the shaft: lines, amplitudes, mean speeds and periods for the tightest interval, and when to stop."""
 
 from tdhil.run.design.choice import (
-    Choice as Choice, Knowledge as Knowledge, choose as choose, refuse_unfit as refuse_unfit,
+    Choice as Choice, Knowledge as Knowledge, choose as choose, choose_soonest as choose_soonest,
+    refuse_unfit as refuse_unfit,
 )
 from tdhil.run.design.prediction import (
     Evidence as Evidence, Noise as Noise, assumed_noise as assumed_noise,
@@ -9,7 +10,7 @@ from tdhil.run.design.prediction import (
     measured_noise as measured_noise, predicted as predicted,
 )
 from tdhil.run.design.stopping_rule import (
-    LOOKS as LOOKS, MARGIN as MARGIN, Look as Look, Stopping as Stopping,
+    LOOKS as LOOKS, MARGIN as MARGIN, MOST_BEHIND as MOST_BEHIND, Look as Look, Stopping as Stopping,
     interval_confidence as interval_confidence, interval_of as interval_of, least_scale as least_scale,
     look as look, working_confidence as working_confidence,
 )

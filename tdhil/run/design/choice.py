@@ -26,7 +26,16 @@ from tdhil.estimation.frequency_domain import (
     VISCOUS,
 )
 from tdhil.recording import FloatArray, LagPrior
-from tdhil.run.design.prediction import RIGID, SPEED_LAG_S, TORQUE_LAG_S, Noise, assumed_theta, expected_half_width
+from tdhil.run.design.prediction import (
+    RIGID,
+    SPEED_LAG_S,
+    TORQUE_LAG_S,
+    Noise,
+    assumed_theta,
+    expected_half_width,
+    predicted,
+    safe_half_width,
+)
 from tdhil.run.excitation import (
     LEAST_COUNTED,
     DriveMode,
@@ -254,11 +263,10 @@ def choose(
     def width(plan: Plan) -> float:
         return expected_half_width(plan, theta, known.noise, known.prior, confidence)
 
-    given = not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
     usual = make_plan(limits, guess, wish)
     if told_before_echo(wish.kind):     # the prediction is of a rigid shaft
         return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
-    if given:
+    if _fixed(wish):
         usual = _in_time(usual, wish, time_s)
         found = width(usual)
         return Choice(usual, found, found)
@@ -285,6 +293,59 @@ def choose(
     return Choice(best, best_width, usual_width)
 
 
+def choose_soonest(
+    limits: MotionLimits,
+    guess: RigGuess,
+    wish: ExcitationWish,
+    known: Knowledge,
+    confidence: float,
+    tolerance: float,
+    time_s: float,
+) -> Plan | None:
+    """The plan that is expected to meet a tolerance soonest if extended as it needs, with as few periods as may be.
+
+    None where no candidate fits into ``time_s``, or what the user fixes leaves nothing to choose. As in `choose` the
+    information matrix picks for each slope, and the estimator's own interval has the last word.
+    """
+    if _fixed(wish):
+        return None
+    theta, wish = known.theta(guess), replace(wish, settle_s=SETTLE_SOON_S)
+    rated: list[tuple[float, int, Plan]] = []
+    for slope in SLOPES:
+        fit = [plan.with_counted(LEAST_COUNTED) for plan in _candidates(limits, guess, wish, known, time_s, slope)]
+        widths = [_WIDTHS_OF_SD * relative_sd(plan, theta, known.noise, known.prior) for plan in fit]
+        of_slope = [(_until_s(*one, tolerance), len(rated) + number, one[0])
+                    for number, one in enumerate(zip(fit, widths, strict=True))]
+        rated += sorted(of_slope)[:_OF_A_SLOPE]
+    best, soonest_s = None, math.inf
+    for _, _, plan in sorted(rated)[:_FINALISTS]:
+        if plan.duration_s < soonest_s:
+            width = safe_half_width(predicted(plan, theta, known.noise, known.prior), confidence)
+            until_s = _until_s(plan, width, tolerance)
+            if until_s < soonest_s:
+                best, soonest_s = plan, until_s
+    return best
+
+
+SETTLE_SOON_S = 8.0       # settling, where time is what counts: leaves 0.03 % of J at most, with reports' lags of 1 s
+_WIDTHS_OF_SD = 2.3       # half-width over the bound's standard deviation, as plans have it
+_OF_A_SLOPE, _FINALISTS = 4, 8
+_SPREAD = 0.2             # of the logarithm of a half-width about the one that was predicted: 1 sd
+_QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # of a normal distribution, equally likely
+
+
+def _until_s(plan: Plan, width: float, tolerance: float) -> float:
+    """How long it may be expected to take until the tolerance is met, if its half-width is predicted so now."""
+    counted_s = sum((one.periods - one.settle_periods) * one.reference.period_s for one in plan.segments)
+    missing = np.maximum((width * np.exp(_SPREAD * _QUANTILES) / tolerance) ** 2 - 1.0, 0.0)
+    return plan.duration_s + counted_s * float(np.mean(missing))
+
+
+def _fixed(wish: ExcitationWish) -> bool:
+    """Does the wish leave no lines to choose?"""
+    return not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
+
+
 def refuse_unfit(
     limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
 ) -> None:
@@ -292,8 +353,7 @@ def refuse_unfit(
     try:
         _in_time(make_plan(limits, guess, wish), wish, time_s)
     except PlanRefused:
-        given = not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
-        if given or time_s is None:
+        if _fixed(wish) or time_s is None:
             raise
         if not any(True for slope in SLOPES for _ in _candidates(limits, guess, wish, known, time_s, slope)):
             raise
@@ -305,7 +365,7 @@ def _candidates(
     speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)
     for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):
         period_s = 1.0 / proposal.lowest_hz
-        if speeds * (LEAST_COUNTED + settling_periods(period_s)) * period_s > time_s:
+        if speeds * (LEAST_COUNTED + settling_periods(period_s, wish.settle_s)) * period_s > time_s:
             continue                   # too long before it is looked at, which takes its time
         shape = phased(proposal, limits, guess, wish.mode)
         for share in OFFSET_SHARES:

@@ -198,21 +198,34 @@ def noise_free(evidence: Evidence, fitted: Fitted) -> Evidence:
     return replace(evidence, lines=tuple(lines), levels=replace(levels, torque=torque))
 
 
-def longer(evidence: Evidence, scale: float, scatter: float = 1.0) -> Evidence:
-    """The same motion ``scale`` times as long, with ``scatter`` times the variance."""
+def longer(evidence: Evidence, scale: float, scatter: float = 1.0, at_last: bool = False) -> Evidence:
+    """The same motion ``scale`` times as long, with ``scatter`` times the variance.
+
+    ``at_last``: what it is longer by all goes to the last segment.
+    """
     lines = []
     for line in evidence.lines:
-        nu = line.nu + float(np.sum(line.periods)) * (scale - 1.0)
+        more = float(np.sum(line.periods)) * (scale - 1.0)
         lines.append(
             replace(
-                line, periods=line.periods * scale, nu=nu,
+                line, periods=_grown(line.periods, scale, at_last), nu=line.nu + more,
                 s_ww=scatter * line.s_ww, s_tt=scatter * line.s_tt, s_tw=scatter * line.s_tw,
             )
         )
     levels = evidence.levels
     dof = levels.dof * scale
-    levels = replace(levels, duration=levels.duration * scale, density=scatter * levels.density, dof=dof)
+    duration = _grown(levels.duration, scale, at_last)
+    levels = replace(levels, duration=duration, density=scatter * levels.density, dof=dof)
     return replace(evidence, lines=tuple(lines), levels=levels)
+
+
+def _grown(lengths: FloatArray, scale: float, at_last: bool) -> FloatArray:
+    """Lengths of segments, (S,), that add up to ``scale`` times as much."""
+    if not at_last:
+        return lengths * scale
+    grown = lengths.copy()
+    grown[-1] += (scale - 1.0) * np.sum(lengths)
+    return grown
 
 
 def half_width(evidence: Evidence, confidence: float) -> float:

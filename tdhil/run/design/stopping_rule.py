@@ -18,9 +18,13 @@ variance; J rests on several lines and on B, so that the true ν₀ is larger an
 By the interval. It also depends on how the residuals fell: another set of lags may be excluded, or just not. So when
 the scatter says that it is enough, the interval itself is looked at; if it is too wide all the same, there is one more
 extension, and another look at it. Keeping an interval only where it is narrow is a choice by the data, of whatever
-kind. But the run's interval is one of several; if these miss with α₁, α₂, …, it misses with at most their sum (Boole),
-however the choice is made. The k-th to be looked at gets α_k = 0.8·0.2^(k − 1) α, which add up to α: most runs pay a
-few percent of width for it, and those that need a second look pay more.
+kind. But the run's interval is one of several; it misses at most as often as any of these does, however the choice is
+made. That any does is P(I₁ misses) + P(I₂ misses and I₁ doesn't) + … , of which the k-th gets α_k = 0.7·0.3^(k − 1) α;
+they add up to α. Where the k-th misses the (k − 1)-th mostly does too, since it holds a share r of the same data: an
+interval misses where the signed root z of its likelihood ratio at the true J is too large, and such roots of data that
+grow have normal increments, so that z_k and z_(k − 1) are correlated with √r (Lan and DeMets' spending). An extension
+behind an interval is never longer than all before it: r ≥ ½ is reckoned with. Most runs pay a few percent of width for
+it, those that need a second look an eighth.
 """
 
 from __future__ import annotations
@@ -48,7 +52,8 @@ from tdhil.recording import FloatArray, Recording
 from tdhil.run.design.prediction import LEAST_NU, Evidence, Fitted, fit, half_width, longer, noise_free, whole_periods
 
 LOOKS = 4                 # extensions at most
-FIRST_SHARE = 0.8         # of the probability to miss that is left, spent on the next interval that is looked at
+FIRST_SHARE = 0.7         # of the probability to miss that is left, spent on the next interval that is looked at
+MOST_BEHIND = 1.0         # of all before, that an extension behind an interval may be long: r ≥ ½
 AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
 MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
 _WORTH_SHARE = 0.1        # of the interval at the end of the time: what is nearer than this needs no more time
@@ -84,8 +89,34 @@ class Stopping:
 
 def interval_confidence(confidence: float, pilot_dof: float, seen: int) -> float:
     """The confidence to compute the interval with that is looked at after ``seen`` others."""
-    share = FIRST_SHARE * (1.0 - FIRST_SHARE) ** seen
-    return working_confidence(1.0 - share * (1.0 - confidence), pilot_dof)
+    return working_confidence(spent_confidence(confidence, seen), pilot_dof)
+
+
+@lru_cache(maxsize=64)
+def spent_confidence(confidence: float, seen: int) -> float:
+    """Of the interval that is looked at after ``seen`` others, were its scatter known (above)."""
+    from scipy.special import ndtr, ndtri
+
+    spent = FIRST_SHARE * (1.0 - FIRST_SHARE) ** seen * (1.0 - confidence)
+    if seen == 0:
+        return 1.0 - spent
+    before = float(ndtri(0.5 + 0.5 * spent_confidence(confidence, seen - 1)))
+    root = math.sqrt(1.0 / (1.0 + MOST_BEHIND))
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+
+    def newly(edge: float) -> float:
+        """How often |z_k| is beyond ``edge`` and |z_(k − 1)| isn't beyond its own."""
+        z = edge + 4.0 * (nodes + 1.0)
+        inside = ndtr((before - root * z) / math.sqrt(1.0 - root**2)) - ndtr(
+            (-before - root * z) / math.sqrt(1.0 - root**2)
+        )
+        return float(8.0 * np.sum(weights * inside * np.exp(-0.5 * z * z)) / math.sqrt(2.0 * math.pi))
+
+    low, high = 0.0, float(-ndtri(0.5 * spent))
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if newly(middle) > spent else (low, middle)
+    return float(2.0 * ndtr(high) - 1.0)
 
 
 @lru_cache(maxsize=16)
@@ -191,7 +222,8 @@ def _between(low: tuple[float, float], high: tuple[float, float], target: float)
 class Look:
     """What the scatter says: J's relative half-width now, and after ``scale`` times as many periods.
 
-    ``enough``: the tolerance is met then (now, if ``scale`` is 1). None of it knows how J came out but for what the
+    ``enough``: the tolerance is met then (now, if ``scale`` is 1). ``at_last``: all of what is more may be at the mean
+    speed where the shaft is, without a way back to the others. None of it knows how J came out but for what the
     lines' weights owe to it, which is of second order: multiply torque by anything, and nothing here changes.
     """
 
@@ -200,31 +232,47 @@ class Look:
     scale: float
     half_width_then: float
     enough: bool
+    at_last: bool = False
 
 
 def look(
-    recording: Recording, confidence: float, tolerance: float, most_scale: float, pilot_dof: float
+    recording: Recording,
+    confidence: float,
+    tolerance: float,
+    most_scale: float,
+    pilot_dof: float,
+    most_at_last: float = 1.0,
 ) -> Look | None:
     """Look at what has been acquired so far; None where the estimator would refuse it."""
     evidence = evidence_of(recording)
     fitted = None if evidence is None else fit(evidence, confidence)
     return None if evidence is None or fitted is None else _look(
-        evidence, fitted, confidence, tolerance, most_scale, pilot_dof
+        evidence, fitted, confidence, tolerance, most_scale, pilot_dof, most_at_last
     )
 
 
 def _look(
-    evidence: Evidence, fitted: Fitted, confidence: float, tolerance: float, most_scale: float, pilot_dof: float
+    evidence: Evidence,
+    fitted: Fitted,
+    confidence: float,
+    tolerance: float,
+    most_scale: float,
+    pilot_dof: float,
+    most_at_last: float,
 ) -> Look:
     explained = noise_free(evidence, fitted)
     dof = max(pilot_dof, 2.0 * evidence.lines[0].nu)
+    periods = whole_periods(evidence.lines)
 
-    def width(scale: float) -> float:
-        return half_width(longer(explained, scale, aimed_scatter(dof, dof * (scale - 1.0))), confidence)
+    def width(scale: float, at_last: bool = False) -> float:
+        return half_width(longer(explained, scale, aimed_scatter(dof, dof * (scale - 1.0)), at_last), confidence)
 
     now = width(1.0)
+    scale, then, enough = least_scale(lambda x: now if x == 1.0 else width(x, True), tolerance, most_at_last)
+    if enough and scale > 1.0:
+        return Look(periods, now, scale, then, True, at_last=True)
     scale, then, enough = least_scale(lambda x: now if x == 1.0 else width(x), tolerance, most_scale)
-    return Look(whole_periods(evidence.lines), now, scale, then, enough)
+    return Look(periods, now, scale, then, enough)
 
 
 def interval_of(recording: Recording, confidence: float) -> float:

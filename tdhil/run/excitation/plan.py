@@ -26,7 +26,7 @@ _OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at 
 LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
 RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
 _BACKWARDS_SHARE = 0.012  # of the greatest speed: foreseen backwards less than this, the guard's own allowance is kept
-_SETTLE_S = 10.0         # at least this long before the first period that counts
+SETTLE_S = 10.0          # at least this long before the first period that counts
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,8 @@ class ExcitationWish:
     ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
     deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
     settling included. ``shape``: other lines for the multisine than its own; ``offset_share`` of the usable window: how
-    far apart two mean speeds of the plan's own choice are at least (friction's lever).
+    far apart two mean speeds of the plan's own choice are at least (friction's lever). ``settle_s``: how long each
+    segment settles at least.
     """
 
     kind: str = DEFAULT_EXCITATION
@@ -47,6 +48,7 @@ class ExcitationWish:
     periods: int | None = None
     shape: Shape | None = None
     offset_share: float | None = None
+    settle_s: float = SETTLE_S
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish | None
     shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
     fit = _Fit.of(shape, period, limits, guess, wish.mode)
     amplitude, offsets = _amplitude_and_offsets(fit, wish)
-    settle = settling_periods(period)
+    settle = settling_periods(period, wish.settle_s)
     periods = _periods(wish, period, settle)
     return Plan(
         wish.kind,
@@ -317,9 +319,9 @@ def periodic_kind(name: str) -> PeriodicKind:
     return kind
 
 
-def settling_periods(period_s: float) -> int:
+def settling_periods(period_s: float, settle_s: float = SETTLE_S) -> int:
     """How many periods go to settling."""
-    return max(1, math.ceil(_SETTLE_S / period_s - 1e-9))
+    return max(1, math.ceil(settle_s / period_s - 1e-9))
 
 
 def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:

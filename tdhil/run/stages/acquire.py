@@ -118,8 +118,8 @@ def run_acquire(
 
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
     ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
-    more is wanted so many periods more at its mean speed and then, settled anew, at the others. In speed mode a
-    coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
+    more is wanted so many periods more at its mean speed and then, unless that is enough, settled anew at the others.
+    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
     """
     begun_s = loop.now_s
     dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
@@ -127,12 +127,13 @@ def run_acquire(
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
-        more = enough.decided(course.ask(enough.question(loop.now_s - begun_s)))
-        if more == 0:
+        decision = course.ask(enough.question(loop.now_s - begun_s))
+        enough.decided(decision)
+        if decision.periods == 0:
             break
-        course.go_on(more)
-        for index in course.others():
-            course.go_to(index, more)
+        course.go_on(decision.periods)
+        for index in () if decision.at_last else course.others():
+            course.go_to(index, decision.periods)
     announce(course.excitation)
 
 
