@@ -529,7 +529,7 @@ class HostLoop:
         self._net_nm = by_drive_nm - share * string_nm
         others_nm = by_drive_nm if self._own_loop else 0.0      # of what acts, that isn't ours to command
         wanted = self.scale * (self._net_nm - others_nm + self._more_friction(speed))
-        torque = min(self._limit_nm, max(-self._limit_nm, wanted))
+        torque = min(max(wanted, -self._limit_nm), self._limit_nm)     # NaN stays NaN, for the guard
         self._acted_nm, self._torque_nm = self._torque_nm, torque / self.scale + others_nm
         self._clamped = self._cut or torque != wanted
         self.row = (

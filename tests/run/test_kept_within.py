@@ -3,15 +3,19 @@
 A setpoint that the guard rejects is a mistake of this program, and ends the run; so no stage may make one.
 """
 
+import math
+
 import pytest
 
 from drivers.drive import Mode
+from drivers.errors import CommandRejected
 from tdhil.run.excitation import MotionLimits, RigGuess, SwingPlan
 from tdhil.run.excitation.pulses import CALM_S, Way
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.stages.acquire import Follower, run_swings
 from tdhil.run.stages.hold import MeanSpeedControl, run_hold
-from tests.run.fake_drive import LIMITS, FakeDrive
+from tdhil.run.stages.torque import _within
+from tests.run.fake_drive import LIMITS, NAN, FakeDrive
 
 ROOM = MotionLimits(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
 
@@ -70,6 +74,23 @@ def test_acquire_keeps_to_it_with_what_the_slow_loop_adds(world):
     with pytest.raises(Seen):
         follower.follow(lambda _: (9.0, 300.0), 10.0)
     assert max(torques(here)) == LIMITS.torque_nm
+
+
+@pytest.mark.parametrize(("mode", "speed_rad_s", "torque_nm"), [
+    (Mode.TORQUE, 5.0, NAN), (Mode.TORQUE, NAN, 50.0), (Mode.SPEED, NAN, 0.0),
+])
+@pytest.mark.parametrize("slow_loop", [False, True])
+def test_a_reference_that_is_no_number_becomes_no_limit(world, mode, speed_rad_s, torque_nm, slow_loop):
+    """Held to a limit it would be that limit: full torque, or the highest speed."""
+    here = turning(world)
+    control = MeanSpeedControl(RigGuess(200.0, 8.0, 60.0), 1000.0, ControlAssumptions()) if slow_loop else None
+    with pytest.raises(CommandRejected, match="not finite"):
+        Follower(here.bench, LIMITS, mode, control).follow(lambda _: (speed_rad_s, torque_nm), 10.0)
+    assert here.drive.commands == []
+
+
+def test_nor_does_the_seed_of_torque_mode():
+    assert math.isnan(_within(NAN, 400.0))
 
 
 def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):

@@ -77,11 +77,11 @@ def run_hold(
     wanted = reported = start_rad_s
     timeout_s = TIMEOUT_S + abs(target_rad_s - start_rad_s) / rate
     for _ in range(loop.cycles(timeout_s)):
-        step = max(-rate * loop.period_s, min(rate * loop.period_s, target_rad_s - wanted))
+        step = max(min(target_rad_s - wanted, rate * loop.period_s), -rate * loop.period_s)
         wanted += step
         correction = control.update(wanted - reported, loop.period_s)
         ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / loop.period_s
-        torque = max(loop.guard.least_torque_nm, min(limits.torque_nm, ahead_nm + correction))
+        torque = max(min(ahead_nm + correction, limits.torque_nm), loop.guard.least_torque_nm)      # NaN stays NaN
         sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
         reported = sample.speed_rad_s
         recent.append(reported)

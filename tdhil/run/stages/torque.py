@@ -82,4 +82,4 @@ def run_torque(
 
 
 def _within(torque_nm: float, limit_nm: float) -> float:
-    return max(0.0, min(limit_nm, torque_nm))
+    return max(min(torque_nm, limit_nm), 0.0)      # what is no number stays none, for the guard

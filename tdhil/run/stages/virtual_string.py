@@ -120,7 +120,7 @@ def run_virtual_string(
     phase: Phase = host.phase
     clamped = False
     while host.phase is not Phase.DONE:
-        wanted = max(0.0, min(limits.speed_max_rad_s, host.set_rad_s * ratio))
+        wanted = max(min(host.set_rad_s * ratio, limits.speed_max_rad_s), 0.0)     # NaN stays NaN, for the guard
         command = Command(Mode.SPEED, wanted, 0.0, torque) if case.own_loop else Command(Mode.TORQUE, wanted, torque)
         sample = loop.cycle(command)
         torque = host.step(sample.time_s, sample.speed_rad_s if sample.fresh else None)
