@@ -51,13 +51,35 @@ class Machine:
     torque_quantum: float = 1.0
     period: float = 0.004
     late: float = 0.0              # of the command
+    control: float = 0.0           # the loop's own sampling period, 0 for a continuous one
+
+    def lag(self, time, s):
+        """First order; sampled, as y += (1 - exp(-h/time)) (x - y)."""
+        if self.control == 0.0:
+            return 1.0 / (1.0 + time * s)
+        keep = np.exp(-self.control / time)
+        return (1.0 - keep) / (1.0 - keep * np.exp(-s * self.control))
+
+    def torque_loop(self, s):
+        """Torque for one unit of what the loop demands; sampled, it holds from one step to the next."""
+        step = s * self.control
+        hold = 1.0 if self.control == 0.0 else (1.0 - np.exp(-step)) / step
+        return self.lag(self.torque_lag, s) * hold
+
+    @property
+    def inner_lag(self):
+        """Of torque behind speed in the loop, for what is slow beside it: a lag that is sampled is shorter."""
+        if self.control == 0.0:
+            return self.torque_lag + self.speed_filter
+        kept = [np.exp(-self.control / time) for time in (self.torque_lag, self.speed_filter)]
+        return self.control * (0.5 + sum(keep / (1.0 - keep) for keep in kept))
 
     def law(self, s):
-        return (self.gain + self.integral / s) / (1.0 + self.torque_lag * s)
+        return (self.gain + self.integral / s) * self.torque_loop(s)
 
     def impedance(self, hertz):
         s = 2j * np.pi * np.asarray(hertz)
-        return self.inertia * s + self.viscous + self.law(s) / (1.0 + self.speed_filter * s)
+        return self.inertia * s + self.viscous + self.law(s) * self.lag(self.speed_filter, s)
 
     def reflection(self, hertz, zeta=ZETA):
         z = self.impedance(hertz)
@@ -65,7 +87,7 @@ class Machine:
 
     def driven(self, by, s):
         """Speed for one unit of the command."""
-        drive = 1.0 / (1.0 + self.torque_lag * s) if by == "offset" else self.law(s) / (1.0 + self.reference_filter * s)
+        drive = self.torque_loop(s) if by == "offset" else self.law(s) / (1.0 + self.reference_filter * s)
         return drive * np.exp(-self.late * s) / self.impedance(s.imag / (2.0 * np.pi))
 
     def reported(self, speed, s):
@@ -158,7 +180,7 @@ def _noise(machine, total, rng):
     load = load * machine.load_sd * np.sqrt(1.0 - keep**2) / (1.0 - keep * np.exp(-s * h))
     ripple, sensor = white * machine.ripple_sd * ripple, white * machine.sensor_sd * sensor
     z = machine.impedance(s.imag / (2.0 * np.pi))
-    loop = machine.law(s) / (1.0 + machine.speed_filter * s)
+    loop = machine.law(s) * machine.lag(machine.speed_filter, s)
     speed = (load + ripple - loop * sensor) / z
     torque = ripple - loop * (speed + sensor)
     seen = (speed + sensor) / (1.0 + machine.speed_report * s), torque / (1.0 + machine.torque_report * s)
