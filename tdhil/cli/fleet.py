@@ -85,6 +85,8 @@ def run_watch(namespace: argparse.Namespace) -> int:
         raise UsageError("there is no such folder", where=str(folder))
     request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
     watch = Watch(request)
+    if not namespace.once and sys.stderr.isatty():
+        print(f"watching {folder}, table {request.out}; Ctrl-C ends it", file=sys.stderr)  # noqa: T201
     while True:
         for row in watch.look(at_once=namespace.once):
             _tell(row, namespace.json)
@@ -212,10 +214,13 @@ def _print(summary: FleetSummary, as_json: bool) -> None:
 
     console = PlainConsole()
     found = summary.document()
-    left = f", {summary.left} left to do" if summary.left else ""
     before = f" ({summary.done_before} of them done before)" if summary.done_before else ""
-    logs = counted(found["logs"], "log")
-    console.print(f"{logs}{before}{left} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
+    part = f"{found['logs']} of " if summary.left else ""
+    logs = part + counted(found["logs"] + summary.left, "log")
+    console.print(f"{logs}{before} in {summary.wall_s:.1f} s: {summary.out}", soft_wrap=True)
+    if summary.left:
+        why = "interrupted: " if summary.interrupted else ""
+        console.print(f"{why}{summary.left} left to do, by the same command again")
     console.print(_counts(found))
     if found["simulated"]:
         console.print(f"{found['simulated']} of them {SIMULATED}", style="magenta")

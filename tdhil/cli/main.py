@@ -67,7 +67,10 @@ def _main(arguments: list[str], namespace: argparse.Namespace) -> int:
     for library in ("can", "canopen"):
         logging.getLogger(library).addHandler(logging.NullHandler())
         logging.getLogger(library).propagate = False
-    parser = build_parser(_chosen(arguments))
+    chosen = _chosen(arguments)
+    if chosen is not None and chosen == arguments[0] and chosen not in _COMMANDS:
+        raise _no_command(chosen)
+    parser = build_parser(chosen)
     parser.parse_args(arguments, namespace)
     if namespace.command is None:
         parser.print_help(sys.stderr)
@@ -106,6 +109,14 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def _chosen(arguments: Sequence[str]) -> str | None:
     return next((argument for argument in arguments if not argument.startswith("-")), None)
+
+
+def _no_command(name: str) -> UsageError:
+    from difflib import get_close_matches
+
+    close = get_close_matches(name[:40], _COMMANDS, n=1)
+    meant = f"Did you mean '{close[0]}'? " if close else ""
+    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant}See tdhil --help")
 
 
 _ELSEWHERE = {

@@ -56,7 +56,7 @@ def run(namespace: argparse.Namespace) -> int:
         _print_trend(document)
     if namespace.report is not None:
         title = f"{document['rig']} over time{_simulated(document)}"
-        lines = [f"{one['name']}: {one['text']}" for one in document["quantities"]] + list(document["notes"])
+        lines = [_followed_text(one) for one in document["quantities"]] + list(document["notes"])
         if any(point["in_part"] is not None for one in document["quantities"] for point in one["points"]):
             lines.append("hollow: a result from a part of the run")
         _write(namespace.report, title, lines, "", lambda figure: _draw_trend(figure, document), (7.2, 7.5))
@@ -101,9 +101,16 @@ def _print_trend(document: Mapping[str, Any]) -> None:
     results, logs = counted(document["results"], "result"), counted(document["logs"], "log")
     console.print(f"rig {document['rig']}{_simulated(document)}: {results} that {stand}, of {logs}", soft_wrap=True)
     for one in document["quantities"]:
-        console.print(f"{one['name']}: {one['text']}", soft_wrap=True)
+        console.print(_followed_text(one), soft_wrap=True)
     for note in document["notes"]:
         console.print(f"note: {note}", soft_wrap=True)
+
+
+def _followed_text(one: Mapping[str, Any]) -> str:
+    """What became of a quantity, behind the least and the greatest of its values."""
+    values = [point["value"] for point in one["points"]]
+    seen = f", {min(values):.4g} to {max(values):.4g} {one['unit']}" if values else ""
+    return f"{one['name']}{seen}: {one['text']}"
 
 
 def _print_compared(document: Mapping[str, Any]) -> None:

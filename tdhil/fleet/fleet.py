@@ -291,8 +291,18 @@ def find_logs(roots: Sequence[str]) -> Found:
                     if name.lower().endswith((".mcap", ".csv")):
                         _sort_in(Path(folder) / name, logs, live, bare, named=False)
         else:
-            raise UsageError("there is no such file or folder", where=root)
+            raise UsageError("there is no such file or folder", where=root, next_step=_meant(path))
     return Found(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
+
+
+def _meant(path: Path) -> str:
+    """What stands there under a name much like it."""
+    from difflib import get_close_matches
+
+    with suppress(OSError):
+        if close := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], n=1):
+            return f"Did you mean {path.parent / close[0]}?"
+    return ""
 
 
 def _sort_in(path: Path, logs: set[str], live: set[str], bare: set[str], *, named: bool) -> None:

@@ -70,7 +70,8 @@ def trend_document(rows: Sequence[FleetRow], rig: str | None = None) -> dict[str
     mine = [row for row in rows if row.rig == rig and rig is not None]
     if not mine:
         shown = ", ".join(known[:12]) + (", …" if len(known) > 12 else "")
-        raise UsageError("which rig?" if rig is None and known else f"no log is of a rig {rig or ''!r}", where="--rig",
+        what = "the table is of several rigs, and none is named" if rig is None else f"no log is of a rig {rig!r}"
+        raise UsageError(what if known else "no log is of a rig that has a name", where="--rig",
                          next_step=f"There are: {shown}" if known else "No log in the table names its rig: `name:` in "
                          "rig.yaml does, or `rig:` in the .yaml beside a trace")
     standing = [row for row in mine if row.verdict in _GOOD]

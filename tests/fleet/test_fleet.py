@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 
 from tdhil import process_pool
+from tdhil.cli import fleet as fleet_command
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet import (
     FleetRequest,
+    FleetSummary,
     LogTask,
     Settings,
     compare_document,
@@ -423,7 +425,12 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
     for wrong in (["--jobs", "0"], ["--confidence", "1.5"], ["--time-limit", "0"], ["--memory-limit", "1"]):
         assert main(["fleet", str(few), "--out", str(out), *wrong]) == 2
     assert main(["fleet", str(few), "--out", str(tmp_path / "fleet.txt")]) == 2
-    assert main(["fleet", str(tmp_path / "none"), "--out", str(out)]) == 2
+    capsys.readouterr()
+    assert main(["fleet", f"{few}x", "--out", str(out)]) == 2
+    assert f"there is no such file or folder. Did you mean {few}?" in capsys.readouterr().err
+    fleet_command._print(FleetSummary((), out, left=2, wall_s=1.0, interrupted=True), as_json=False)
+    assert capsys.readouterr().out.startswith(
+        f"0 of 2 logs in 1.0 s: {out}\ninterrupted: 2 left to do, by the same command again\n")
     assert main(["watch", str(few), "--out", str(out), "--once", "--jobs", "1"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 7
 
