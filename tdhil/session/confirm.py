@@ -7,7 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TypeVar
 
@@ -57,6 +57,7 @@ def confirm_motion(
             where="no terminal",
             next_step="Run it at a terminal, or pass --yes if somebody stands at the hard-wired stop",
         )
+    _forget_what_was_typed()
     console.print(f"Type {WORD} and Enter to turn the shaft, anything else to leave it alone: ", end="")
     if _ask(idle).strip() != WORD:
         raise PreflightRefused("not confirmed", where="prompt", next_step="Nothing has moved")
@@ -76,7 +77,6 @@ def confirm_speed(
     Asked while the shaft turns, one cycle after the other; ``--yes`` is no answer to it.
     """
     turning = turns_text(speed_rad_s)
-    pause_display()
     if sys.stdin is None or not sys.stdin.isatty():
         raise PreflightRefused(
             f"nobody is there to see whether the shaft turns {turning}, as the drive reports ({why})",
@@ -85,15 +85,22 @@ def confirm_speed(
             f" its angle (position); or take the unit of speed by name: {SPEED_FLAG}",
         )
     main = f" (the main shaft, behind the gear, {turns_text(speed_rad_s / gear_ratio)})" if gear_ratio != 1.0 else ""
-    console.print(
-        f"\nThe shaft turns, and {why}.\n"
-        f"The drive reports {speed_rad_s:.3g} rad/s: watch a mark on the motor's shaft for some turns.",
-        markup=False,
-    )
-    console.print(
-        f"Is it turning {turning}{main}? Type yes and Enter; anything else stops it: ", end="", markup=False
-    )
-    answer = _ask(idle).strip().lower()
+
+    def ask() -> str:
+        """In the thread that waits, and the display's last words too: a terminal that takes nothing holds no cycle."""
+        pause_display()
+        _forget_what_was_typed()
+        console.print(
+            f"\nThe shaft turns, and {why}.\n"
+            f"The drive reports {speed_rad_s:.3g} rad/s: watch a mark on the motor's shaft for some turns.",
+            markup=False,
+        )
+        console.print(
+            f"Is it turning {turning}{main}? Type yes and Enter; anything else stops it: ", end="", markup=False
+        )
+        return _line()
+
+    answer = _meanwhile(idle, ask).strip().lower()
     if answer not in ("y", "yes"):
         raise PreflightRefused(
             f"the shaft was not seen to turn {turning}, as the drive reports: its unit of speed is not what the profile"
@@ -149,6 +156,15 @@ def _taken(unverified: Sequence[str]) -> str:
 def _ask(idle: Idle) -> str:
     """A line from the terminal. Raises PreflightRefused where it can't be read, as by a program in the background."""
     return _meanwhile(idle, _line)
+
+
+def _forget_what_was_typed() -> None:
+    """What was typed before the question was asked is no answer to it."""
+    with suppress(ImportError, OSError, ValueError):
+        import termios
+
+        with suppress(termios.error):
+            termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
 
 
 def _line() -> str:

@@ -2,7 +2,11 @@
 
 import errno
 import io
+import os
+import signal
 import sys
+import threading
+import time
 from unittest.mock import Mock
 
 import pytest
@@ -10,6 +14,7 @@ from rich.console import Console
 
 from drivers.errors import PreflightRefused
 from tdhil.config.rig import RunSection
+from tdhil.errors import Interrupted
 from tdhil.session.confirm import confirm_speed, turns_text
 
 
@@ -61,6 +66,43 @@ def test_a_program_in_the_background_is_refused_not_stopped(monkeypatch):
     monkeypatch.setattr(sys, "stdin", terminal)
     with pytest.raises(PreflightRefused, match="the terminal can't be asked: Input/output error"):
         confirm_speed(1.0, "", lambda: None, console=Console(file=io.StringIO()), pause_display=lambda: None)
+
+
+def test_a_terminal_that_takes_nothing_holds_no_cycle_up(monkeypatch):
+    """Ctrl-S, a connection that hangs: the shaft turns, and gets its cycles and its stop all the same."""
+    taken, cycles = threading.Event(), []
+    stuck = io.StringIO()
+    stuck.write = lambda text: taken.wait(5.0) and len(text)
+    monkeypatch.setattr(sys, "stdin", Terminal("yes\n"))
+
+    def idle():
+        cycles.append(1)
+        if len(cycles) == 50:
+            raise Interrupted(signal.SIGINT)
+
+    try:
+        with pytest.raises(Interrupted):
+            confirm_speed(1.0, "", idle, console=Console(file=stuck), pause_display=lambda: None)
+    finally:
+        taken.set()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such terminals there")
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch):
+    operator, terminal = os.openpty()
+    cycles = []
+
+    def idle():
+        cycles.append(1)
+        time.sleep(0.001)
+        if len(cycles) == 50:
+            os.write(operator, b"no\n")
+
+    with os.fdopen(terminal, encoding="utf-8") as stdin, os.fdopen(operator, "wb", buffering=0):
+        monkeypatch.setattr(sys, "stdin", stdin)
+        os.write(operator, b"yes\n")
+        with pytest.raises(PreflightRefused, match="was not seen to turn"):
+            confirm_speed(1.0, "", idle, console=Console(file=io.StringIO()), pause_display=lambda: None)
 
 
 def test_no_terminal_at_all(monkeypatch):
