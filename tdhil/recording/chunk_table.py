@@ -140,27 +140,24 @@ def _records(
     whole = np.ones(len(starts), np.bool_)
     places, opcodes, lengths = [], [], []
     chunk = np.flatnonzero(starts < ends)
-    at = starts[chunk]
+    at, last = starts[chunk], ends[chunk] - _HEAD.size          # where a record's head may stand at the latest
     while len(chunk) >= _FEW:
-        room = ends[chunk] - at - _HEAD.size
-        fits = room >= 0
-        if not fits.all():
-            whole[chunk[~fits]] = False
-            chunk, at, room = chunk[fits], at[fits], room[fits]
+        room = last - at
+        if room.min() < 0:
+            going = room >= 0
+            whole[chunk[(room < 0) & (room > -_HEAD.size)]] = False
+            chunk, at, last = chunk[going], at[going], last[going]
             continue
         head = _taken(data, at, _HEAD_ROW)
-        fits = head["length"] <= room.astype(np.uint64)
+        fits = head["length"] <= room.view(np.uint64)
         if not fits.all():
             whole[chunk[~fits]] = False
-            chunk, at, head = chunk[fits], at[fits], head[fits]
+            chunk, at, last, head = chunk[fits], at[fits], last[fits], head[fits]
         length = head["length"].astype(np.int64)
         places.append(at)
         opcodes.append(head["opcode"])
         lengths.append(length)
-        at = at + _HEAD.size + length
-        going = at < ends[chunk]
-        if not going.all():
-            chunk, at = chunk[going], at[going]
+        at = at + (length + _HEAD.size)
     for one, start in zip(chunk.tolist(), at.tolist(), strict=True):
         found, whole[one] = _walk(data, start, int(ends[one]))
         if found:

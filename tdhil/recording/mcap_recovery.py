@@ -125,6 +125,7 @@ TOTAL_LIMIT: Final = 4 * 2**30
 HEADER, MESSAGE_INDEX, DATA_END = 0x01, 0x07, 0x0F
 _KNOWN: Final = frozenset(range(0x01, 0x10))
 _RECORD: Final = Struct("<BQ")
+_INDEX_HEAD: Final = _RECORD.size + 6                     # channel:2  length of the rest:4
 _NAMES: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4")
 _FOOTER: Final = _RECORD.pack(0x02, 20)
 _STEP: Final = 2**20
@@ -152,9 +153,12 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
     offset, total = len(MAGIC), 0
     zstd = zstandard.ZstdDecompressor(max_window_size=CHUNK_LIMIT)
     while True:
-        head = read_at(file, offset, _RECORD.size)
-        opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+        head = read_at(file, offset, _INDEX_HEAD)
+        opcode, length = _RECORD.unpack_from(head) if len(head) >= _RECORD.size else (0, 0)
         end = offset + _RECORD.size + length
+        if opcode == MESSAGE_INDEX and end <= size and _is_index(head, length):
+            offset = end                    # most of all records
+            continue
         if not head:
             yield Damage(offset, "the file ends in mid-run: it was not closed")
             return
@@ -171,7 +175,7 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
             yield found
         elif opcode == HEADER and end <= size and length < 4096:
             yield Library(_library(read_at(file, offset + _RECORD.size, length)))
-        elif opcode != MESSAGE_INDEX or not _is_index(file, offset, length, size):
+        else:
             found_at = _next_chunk(file, offset + 1, size)
             cut = found_at is None and (len(head) < _RECORD.size or (opcode in _KNOWN and end > size))
             text = "the file ends in the middle of a record: it was not closed" if cut else "not a record"
@@ -182,11 +186,9 @@ def walk(file: BinaryIO, size: int) -> Iterator[Found]:
         offset = end
 
 
-def _is_index(file: BinaryIO, offset: int, length: int, size: int) -> bool:
-    """Is this a message index whose two lengths agree?"""
-    start = offset + _RECORD.size
-    head = read_at(file, start, 6)
-    return len(head) == 6 and int.from_bytes(head[2:], "little") + 6 == length and start + length <= size
+def _is_index(head: bytes, length: int) -> bool:
+    """Is this of a message index whose two lengths agree?"""
+    return len(head) == _INDEX_HEAD and int.from_bytes(head[-4:], "little") + 6 == length
 
 
 def _next_chunk(file: BinaryIO, offset: int, size: int) -> int | None:
