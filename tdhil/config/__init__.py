@@ -6,7 +6,8 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.config.options import (
-        OPTIONS as OPTIONS, Origin as Origin, RunOptions as RunOptions, Setting as Setting, resolve as resolve,
+        OPTIONS as OPTIONS, Origin as Origin, RunOptions as RunOptions, Setting as Setting,
+        check_values as check_values, resolve as resolve,
     )
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,

@@ -6,7 +6,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from profiles import messages_of
 from tdhil.config.registry import DEFAULT_BUS, DEFAULT_EXCITATION
@@ -190,8 +190,13 @@ def _check(given: Mapping[str, Any]) -> None:
             *section, key = option.at.split(".")
             (data.setdefault(section[0], {}) if section else data)[key] = given[option.name]
             flags[tuple(option.at.split("."))] = option.flag
+    check_values(Rig, data, flags)
+
+
+def check_values(model: type[BaseModel], data: Mapping[str, Any], flags: Mapping[tuple[str | int, ...], str]) -> None:
+    """Raise UsageError with every value that ``model`` wouldn't take, each by the flag of its place."""
     try:
-        Rig.model_validate(data)
+        model.model_validate(data)
     except ValidationError as error:
-        wrong = [f"{flags.get(path, '')}: {message}" for path, message in messages_of(error, data, Rig)]
+        wrong = [f"{flags.get(path, '')}: {message}" for path, message in messages_of(error, data, model)]
         raise UsageError("; ".join(wrong), next_step="See tdhil identify --help") from None

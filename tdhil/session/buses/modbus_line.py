@@ -9,11 +9,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
-from pydantic import ValidationError
-
-from profiles import messages_of
 from profiles.modbus import Line, ModbusProfile
-from tdhil.config import Modbus, Origin, Rig, Setting
+from tdhil.config import Modbus, Origin, Rig, Setting, check_values
 from tdhil.errors import UsageError
 from tdhil.session.connection import LineConfig
 
@@ -77,7 +74,8 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
     UsageError where a value can't be used. Without a profile what it would say is left as the standard has it.
     """
     given = {name: Setting.by_flag(cli[name], flag) for name, flag in FLAGS.items() if cli.get(name) is not None}
-    _check(given)
+    values = {name: setting.value for name, setting in given.items()}
+    check_values(Modbus, values, {(name,): flag for name, flag in FLAGS.items()})
     settings = dict(given)
     for name in FLAGS:
         if rig is not None and (value := getattr(rig.modbus, name)) is not None:
@@ -106,13 +104,3 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
 
 
 _STANDARD = Line(transports=("tcp", "rtu"), source="the Modbus specification", confidence="verified")
-
-
-def _check(given: Mapping[str, Setting]) -> None:
-    """The same rules as for rig.yaml, in terms of the flags."""
-    data = {name: setting.value for name, setting in given.items()}
-    try:
-        Modbus.model_validate(data)
-    except ValidationError as error:
-        wrong = [f"{FLAGS.get('.'.join(map(str, at)), '')}: {text}" for at, text in messages_of(error, data, Modbus)]
-        raise UsageError("; ".join(wrong), next_step="See tdhil identify --help") from None
