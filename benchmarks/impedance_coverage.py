@@ -1,15 +1,18 @@
 """The drive's own impedance: error of |r|, coverage of P, I and the inner lags, and undeclared filters refused.
 
     python benchmarks/impedance_coverage.py [--seeds 5] [--by offset|reference|both] [--filter 0.1]
-                                            [--control 0] [--stepped 0] [--rate HZ] [--setting NAME ...]
+                                            [--own-command] [--control 0] [--stepped 0] [--rate HZ]
+                                            [--setting NAME ...]
 
 Records in closed form (tests/estimation/impedance_bench.py, which shares no code with estimator or simulator) of the
 settings of the reference case, as a motor of 104 kg·m² has them, with reporting lags of 0.40 and 0.15 s, through the
 measurement alone. ``--filter``: besides, the reference is smoothed by so many seconds, and nobody says so; all of them
-must be refused. ``--control``: the loop is sampled at that period, s, as a real drive's is and the simulated one's, at
-2 ms: with filters of 0.03 s it then lags by 0.029 s, and that is what is to be found. ``--stepped``: besides, so many
-whole runs of each setting on the simulated drive through CANopen, in stepped time, by the torque offset; ``--rate``: at
-so many cycles a second instead of the profile's.
+must be refused. ``--own-command``: each seed has one, by the offset; else all share one, and so the errors that the
+rounding of its answer makes alike in every period, so that their coverage is that of a single draw of those.
+``--control``: the loop is sampled at that period, s, as a real drive's is and the simulated one's, at 2 ms: with
+filters of 0.03 s it then lags by 0.029 s, and that is what is to be found. ``--stepped``: besides, so many whole runs
+of each setting on the simulated drive through CANopen, in stepped time, by the torque offset; ``--rate``: at so many
+cycles a second instead of the profile's.
 
 Prints, for each setting: how many stand, the largest error of |r| from 0.05 to 1.5 Hz over all seeds, the mean of it,
 and how often each interval holds the truth. The exit code is 1 where an error of |r| is above 0.005 or a filter passes.
@@ -51,11 +54,11 @@ def simulated(machine: Machine, seed: int, more: list[str]) -> dict[str, Any]:
         return document.get("impedance") or {"verdict": str(document.get("error"))}
 
 
-def in_closed_form(machine: Machine, by: str, seed: int) -> dict[str, Any]:
+def in_closed_form(machine: Machine, by: str, seed: int, draw: int = 1) -> dict[str, Any]:
     """The same of a record in closed form."""
     from dataclasses import asdict
 
-    seen = found(record(machine, by, seed))
+    seen = found(record(machine, by, seed, draw=draw))
     return asdict(seen) | {"verdict": seen.verdict.value}
 
 
@@ -86,6 +89,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--by", choices=("offset", "reference", "both"), default="both")
     parser.add_argument("--filter", type=float, default=0.1, metavar="S")
+    parser.add_argument("--own-command", action="store_true")
     parser.add_argument("--control", type=float, default=0.0, metavar="S")
     parser.add_argument("--stepped", type=int, default=0, metavar="RUNS")
     parser.add_argument("--rate", type=float, metavar="HZ")
@@ -98,8 +102,8 @@ def main() -> int:
     for by in ways:
         for name, (gain, integral) in settings.items() if asked.seeds else ():
             machine = Machine(gain=gain, integral=integral, control=asked.control)
-            seeds = range(asked.seeds)
-            bad |= row(f"{name}, {by}", machine, (in_closed_form(machine, by, seed) for seed in seeds)) > MOST
+            runs = (in_closed_form(machine, by, k, k if asked.own_command else 1) for k in range(asked.seeds))
+            bad |= row(f"{name}, {by}", machine, runs) > MOST
     if asked.filter > 0.0 and "reference" in ways:
         for name, (gain, integral) in settings.items():
             machine = Machine(gain=gain, integral=integral, reference_filter=asked.filter)

@@ -96,10 +96,10 @@ class Machine:
 
 
 @cache
-def command(machine, by, peak=None):
+def command(machine, by, peak=None, draw=1):
     """Sizes and phases of the lines: what the field rig's window (4 rad/s about its mean) and torque (210 N·m) leave.
 
-    By the offset with the best of some phases, as a run draws them.
+    By the offset with the best of some phases, as a run draws them: others with another ``draw``.
     """
     hertz = HARMONICS / PERIOD_S
     s = 2j * np.pi * hertz
@@ -120,17 +120,17 @@ def command(machine, by, peak=None):
         within = min(4.0 / highest(speed), 210.0 / highest((machine.inertia * s + machine.viscous) * speed))
         return min(within, 160.0 / highest(np.ones(len(s)))) if by == "offset" else within
 
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(draw)
     drawn = [PHASES, *(rng.uniform(0.0, 2.0 * np.pi, (300 * (by == "offset" and peak is None), len(s))))]
     best = max(drawn, key=most)
     return sizes * most(best), best
 
 
-def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, scale_sd=0.0, declared=0.0):
+def record(machine, by="offset", seed=0, *, peak=None, counted=24, prior=None, scale_sd=0.0, declared=0.0, draw=1):
     """A Recording: two levels, then the counted periods."""
     rng = np.random.default_rng(seed)
     h = machine.period
-    sizes, phases = command(machine, by, peak)
+    sizes, phases = command(machine, by, peak, draw)
     omega = 2.0 * np.pi * HARMONICS / PERIOD_S
     in_period, in_level = round(PERIOD_S / h), round(LEVEL_S / h)
     lines = np.cos(np.outer(np.arange(in_period) * h, omega) + phases) @ sizes
