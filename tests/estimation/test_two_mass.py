@@ -8,7 +8,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from tdhil.estimation import Options, Verdict, identify
-from tdhil.estimation.frequency_domain.compliant import Chosen, choose, may_swing
+from tdhil.estimation.frequency_domain.compliant import Chosen, choose, choose_unlike, may_swing
 from tdhil.estimation.frequency_domain.compliant_fit import (
     RESONANCE,
     STIFFNESS,
@@ -203,6 +203,27 @@ def test_a_line_that_stands_still_at_the_antiresonance_is_no_weak_line():
         assert found.model == "two-mass", found.reason
         assert found.inertia.low <= plant.motor <= found.inertia.high
         assert identify(recording, Options(model="rigid")).residual.p_value < 0.01
+
+
+def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_difference():
+    """The load's dry friction changes sign there at the slower mean speed alone, and nowhere else."""
+    plant = TwoMass()
+    lines, constraint = synthetic(plant, 2, 20.0, (0.05, 0.1, 0.18, 0.35, 0.7))
+    swing = next(index for index, line in enumerate(lines) if line.hertz == 0.18)
+
+    def unlike(at):
+        torque = lines[at].torque * np.array([1.15 + 0.1j, 1.0])
+        return (*lines[:at], replace(lines[at], torque=torque), *lines[at + 1:])
+
+    bad = choose("two-mass", unlike(swing), constraint, (), {})
+    assert bad.rejected
+    found = choose_unlike(bad, "two-mass", unlike(swing), constraint, (), {})
+    assert (found.rejected, found.unlike_hz) == (False, (0.18,))
+    inertia = inertias(found.fit, 0.95)["inertia"]
+    assert inertia.low <= plant.motor <= inertia.high
+    elsewhere = choose("two-mass", unlike(swing + 1), constraint, (), {})
+    assert elsewhere.rejected
+    assert choose_unlike(elsewhere, "two-mass", unlike(swing + 1), constraint, (), {}) is elsewhere
 
 
 def test_too_few_lines_are_counted_and_refused():

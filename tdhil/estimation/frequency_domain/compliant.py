@@ -18,6 +18,7 @@ from tdhil.estimation.frequency_domain.compliant_fit import (
 )
 from tdhil.estimation.frequency_domain.filter_order import excess_rise
 from tdhil.estimation.frequency_domain.inference import (
+    fisher_tail,
     grown_lines,
     half_width_first_order,
     standard_deviation,
@@ -76,6 +77,7 @@ class Chosen:
     """``fit`` stands, or was the last to be tried if ``rejected``; ``beside``: the string, where two masses stand.
 
     ``pipe``: the fit takes the pipe for what its sizes say; ``other_pipe``: it doesn't, since the data contradict them.
+    ``unlike_hz``: of lines that the mean speeds differ at, and that count by that difference.
     """
 
     fit: CompliantFit
@@ -83,6 +85,7 @@ class Chosen:
     rejected: bool = False
     pipe: Pipe | None = None
     other_pipe: bool = False
+    unlike_hz: tuple[float, ...] = ()
 
 
 def usable_lines(every: tuple[Line, ...], least_nu: float) -> tuple[Line, ...]:
@@ -134,6 +137,49 @@ def choose(
     if not rejects(two.residual) and not _outdoes(string, two):
         return Chosen(two, string, rejected=not plausible(two))
     return Chosen(string, rejected=rejects(string.residual) or not plausible(string))
+
+
+# Where the motor all but stands still the load swings widest, faster than the mean speed it may be. Its dry friction
+# then changes sign twice a period at the slower mean speed and never at the faster one: 30 N·m of it at the end of a
+# string made T/ω of that line differ by 15 %, and of its harmonics by less, and a sound shaft was rejected for it. Such
+# a line hardly tells J_r (it is the motor that stands still), but where the swing lies. So where no shaft that swings
+# is allowed, and the line by the swing differs from one mean speed to another beyond its scatter, lines that differ
+# count by their difference instead, which with two mean speeds is a variance on one complex degree of freedom. All
+# others, half of the lines at least, must fit as ever.
+
+
+_BY_THE_SWING = 0.1          # of its frequency
+_LEAST_NU = 2.0              # complex degrees of freedom of a difference, at least: the likelihood's tails need them
+
+
+def choose_unlike(
+    found: Chosen, asked: str, lines: tuple[Line, ...], constraint: ViscousConstraint | None,
+    priors: tuple[GaussianPrior, ...], fixed: Fixed, pipe: Pipe | None = None
+) -> Chosen:
+    """What stands in place of ``found``, which is rejected, with lines that count by how the mean speeds differ."""
+    swing_hz = float(found.fit.mechanical[SWING]) / (2.0 * math.pi)
+    counted = tuple(_by_difference(line) for line in lines)
+    unlike = tuple(line.hertz for line, before in zip(counted, lines, strict=True) if line is not before)
+    if len(unlike) > len(lines) // 2 or not any(abs(hz / swing_hz - 1.0) <= _BY_THE_SWING for hz in unlike):
+        return found
+    again = choose(asked, counted, constraint, priors, fixed, pipe)
+    return replace(again, unlike_hz=unlike) if isinstance(again, Chosen) and not again.rejected else found
+
+
+def _by_difference(line: Line) -> Line:
+    """With the scatter that the segments' T/ω have between them, where that is beyond the scatter of their periods."""
+    weight = line.periods * np.abs(line.speed) ** 2
+    g = complex(np.sum(line.periods * line.torque * line.speed.conj()) / np.sum(weight))
+    apart = float(np.sum(line.periods * np.abs(line.torque - g * line.speed) ** 2))
+    variance = line.s_tt + abs(g) ** 2 * line.s_ww - 2.0 * (g.conjugate() * line.s_tw).real
+    free = len(line.speed) - 1
+    if free < 1 or not variance > 0.0:
+        return line
+    ratio = apart / free / variance
+    if fisher_tail(ratio, 2.0 * free, 2.0 * line.nu) >= REJECT_P:
+        return line
+    return replace(line, s_ww=ratio * line.s_ww, s_tt=ratio * line.s_tt, s_tw=ratio * line.s_tw,
+                   nu=max(float(free), _LEAST_NU))
 
 
 def _outdoes(string: CompliantFit, two: CompliantFit) -> bool:
@@ -317,6 +363,10 @@ def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = Non
     priors, fixed = known_of(case.recording.lag_prior, len(case.usable), case.constraint)
     try:
         chosen = choose(case.options.model, case.usable, case.constraint, priors, fixed, case.recording.pipe)
+        if isinstance(chosen, Chosen) and chosen.rejected:
+            chosen = choose_unlike(
+                chosen, case.options.model, case.usable, case.constraint, priors, fixed, case.recording.pipe
+            )
         if isinstance(chosen, Chosen) and not chosen.rejected:
             told = result_of(chosen, case.levels, case.options.confidence, case.recording.torque_scale_rel_sd)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
@@ -412,6 +462,10 @@ def _conditions(chosen: Chosen) -> tuple[str, ...]:
 def _caveats(chosen: Chosen, found: CompliantResult) -> tuple[str, ...]:
     fit = chosen.fit
     said = [_OTHER_PIPE] if chosen.other_pipe else []
+    if chosen.unlike_hz:
+        where = ", ".join(f"{hz:.3g}" for hz in chosen.unlike_hz)
+        said.append("the load swings so widely that it answers otherwise at one mean speed than at another (it may turn"
+                    f" back at the slower one): lines at {where} Hz count by that difference")
     said += ["J is the motor's side of the spring, J_r; what a slow motion feels is J_r + J_L"]
     if not _told(found.shaft.total_inertia):
         said.append("J_r + J_L is left open on one side: a slower line, well below the resonance, would show it")
