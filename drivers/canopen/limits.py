@@ -213,9 +213,12 @@ def _count(settings: Settings, one: Parameter, limits: DriveLimits, rated_nm: fl
 def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[float], int]) -> float:
     if one.type == "f32":
         return value
-    counts = max(1, rounding(value / per_lsb * (1.0 + (1e-9 if rounding is math.floor else -1e-9))))
+    counts = rounding(value / per_lsb * (1.0 + (1e-9 if rounding is math.floor else -1e-9)))
     if counts > 0xFFFF_FFFF:
         raise ObjectRefused(f"{value:g} is out of its range", where=name(one.index, one.sub))
+    if counts < 1 and _LIMIT[one.set_to or ""] == TORQUE:      # one count would be a wider limit than was asked for
+        raise ObjectRefused(f"{value:g} is less than one count, {per_lsb:g}", where=name(one.index, one.sub))
+    counts = max(1, counts)
     return counts * per_lsb
 
 
@@ -234,8 +237,13 @@ def _limit(
 ) -> None:
     # One part in 10^9 of slack: a limit that is a whole number of LSB must not lose one to the last bit.
     slack = 1e-9 if rounding is math.floor else -1e-9
-    raw = max(1, rounding(value / per_lsb * (1.0 + slack)))
+    counts = rounding(value / per_lsb * (1.0 + slack))
+    raw = max(1, counts)
     wanted, where = f"{raw * per_lsb:.6g} {unit}", name(index)
+    if counts < 1 and limit == TORQUE:     # one count would be a wider limit than was asked for
+        table.row(title, f"{value:g} {unit}", f"one count is {per_lsb:g} {unit}", False, where,
+                  "The drive can't hold so low a limit: is the unit in the profile right, and the limit in rig.yaml?")
+        return
     try:
         data = objects.read_bytes(index)
         before = int.from_bytes(data, "little")

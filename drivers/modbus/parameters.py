@@ -377,6 +377,11 @@ def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float, v
         rounding = math.floor
     slack = _SLACK if rounding is math.floor else -_SLACK
     counts = to_counts(value * (1.0 + slack), lsb, register, where, rounding)
+    if counts < 1 and _LIMIT.get(kind or "") == TORQUE:        # one count would be a wider limit than was asked for
+        raise CommandRejected(
+            f"{show(value, parameter)} is less than one count, {show(lsb, parameter)}", where=where,
+            next_step="The drive can't hold so low a limit: is its scale right, and the limit in rig.yaml?",
+        )
     # A limit of no count at all would switch it off on many drives.
     return Setting(int(sign) * max(1, counts), lsb)
 

@@ -146,6 +146,11 @@ def test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run(bank, gene
         assert bank.machine.state == STOPPING
 
 
+def test_a_torque_limit_below_one_count_is_no_wider_one(bank, generic):
+    rows = refused(bank, changed(generic, torque_limit={"per_lsb": 0.5}))
+    assert "less than one count" in next(row.found for row in rows.values() if "highest torque" in row.name)
+
+
 def test_a_turning_shaft_and_local_control(bank, generic):
     bank.feedback = lambda: (2000, 0)
     bank.remote = False

@@ -200,6 +200,15 @@ def test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run(make, peer
         assert peer.machine.state == STOPPING
 
 
+def test_a_torque_limit_below_one_count_is_no_wider_one(make, peer, profile):
+    coarse = changed(profile, "torque", max_torque_rated_per_lsb=0.5)
+    drive = make(changed=coarse)
+    drive.connect()
+    row = refused(drive.preflight(LIMITS))["torque limit"]
+    assert (row.wanted, row.found) == ("300 N·m", "one count is 500 N·m")
+    assert peer.value(0x6072) == 900
+
+
 def test_no_rated_torque(make, peer):
     del peer.objects[0x6076, 0]
     found = preflight(make())
