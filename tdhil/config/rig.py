@@ -118,6 +118,10 @@ class Modbus(DataModel):
         return findings
 
 
+LONGEST_BRAKING_S = 90.0
+"""From the highest speed. A stop is waited for by three times its ramp, and five minutes at most."""
+
+
 class Limits(DataModel):
     """What the machine may do; watched by the host and, where it can, by the drive."""
 
@@ -135,7 +139,7 @@ class Limits(DataModel):
 
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
-        """A window that is empty, and a probe beyond the limit."""
+        """A window that is empty, a probe beyond the limit, and a stop that never ends."""
         findings = []
         lowest, highest = values.get("speed_min_rad_s"), values.get("speed_max_rad_s")
         if lowest is not None and highest is not None and lowest >= highest:
@@ -143,6 +147,10 @@ class Limits(DataModel):
         probe, most = values.get("probe_torque_nm"), values.get("torque_nm")
         if probe is not None and most is not None and probe > most:
             findings.append(("probe_torque_nm", f"must not be above torque_nm, which is {most:g}"))
+        braking = values.get("quick_stop_rad_s2")
+        if highest is not None and braking is not None and highest > LONGEST_BRAKING_S * braking:
+            findings.append(("quick_stop_rad_s2", f"brakes from speed_max_rad_s in {highest / braking:.3g} s; more than"
+                             f" {LONGEST_BRAKING_S:g} s is no stop: give {highest / LONGEST_BRAKING_S:.2g} or more"))
         return findings
 
 

@@ -138,13 +138,15 @@ def take_life(folder: Path) -> int:
 
 
 def lives(folder: Path) -> bool:
-    """Does the run's process live?"""
+    """Does the run's process live? Where that can't be known (no descriptor left, say) it isn't given up for dead."""
     import fcntl
 
     try:
         descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
-    except OSError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
+    except OSError:
+        return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -100,6 +100,7 @@ def test_an_almost_empty_rig_will_do(tmp_path: Path) -> None:
         ("speed_min_rad_s: 1", "speed_min_rad_s: 9", 7, "must be below speed_max_rad_s, which is 8.5"),
         ("speed_min_rad_s: 1", "speed_min_rad_s: -1", 7, "allow_reverse"),
         ("probe_torque_nm: 150", "probe_torque_nm: 500", 13, "must not be above torque_nm"),
+        ("quick_stop_rad_s2: 2", "quick_stop_rad_s2: 0.05", 11, "in 170 s; more than 90 s is no stop: give 0.094"),
         ("make_up_torque_nm: 900", "make_up_torque_nm: 400", 9, "must be below make_up_torque_nm, which is 400"),
         ("torque_ramp_nm_s: 50\n", "", 16, "string needs 'torque_ramp_nm_s'"),
         ("watchdog_s: 0.25", "watchdog_s: 0.02", 12, "at least 5 cycles (0.025 s"),

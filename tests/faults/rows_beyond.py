@@ -263,4 +263,63 @@ SOFT_TORQUE: dict[int, Row] = {
              "model_rejected, with its time constant"),
 }
 
-BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE
+STRING, SESSION = "tests/run/test_stop_string.py::", "tests/session/"
+BETWEEN: dict[int, Row] = {
+    105: Row("Modbus: a status word that makes no sense (zeros of a gateway for a cycle, a pattern nobody knows)",
+             "QS; never off while the shaft may turn", "6",
+             ("tests/drivers/test_modbus_drive.py::test_one_status_word_that_makes_no_sense_lets_no_shaft_go",
+              "tests/drivers/test_modbus_drive.py::"
+              "test_a_drive_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog",
+              "tests/drivers/test_falling_out.py::"
+              "test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog"),
+             "quick stop goes out until a state is shown; closing writes nothing to such a drive"),
+    106: Row("a run, or --reset-fault, while the drive still brakes after an earlier one", "R, nothing written", "4",
+             ("tests/drivers/test_preflight.py::test_a_drive_that_still_brakes_after_a_stop_is_left_alone",
+              "tests/drivers/test_preflight.py::test_a_fault_reaction_is_left_alone_too",
+              "tests/drivers/test_preflight.py::test_a_drive_that_is_not_in_fault_is_not_reset",
+              "tests/drivers/test_modbus_preflight.py::test_a_drive_that_is_not_in_fault_is_not_reset"),
+             "neither mode nor quick-stop option is touched; fault words go to a drive in fault only"),
+    107: Row("a run on a drive that an earlier stop left holding a wound-up drill string", "R, nothing written", "4",
+             ("tests/drivers/test_preflight.py::"
+              "test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run",
+              "tests/drivers/test_modbus_preflight.py::"
+              "test_a_string_that_is_held_wound_up_is_not_let_go_by_the_next_run"),
+             "the torque is named; the drive stays in quick stop"),
+    108: Row("drill string: the report that trips the guard is wrong (40 rad/s of 4), or torque is no number",
+             "QS, from the report before; bounded in time", "6, 7, 8",
+             (f"{STRING}test_one_wrong_report_is_not_followed",
+              f"{STRING}test_a_speed_beyond_the_limit_is_braked_from_the_limit",
+              f"{STRING}test_torque_that_is_no_number_is_given_up_and_held"),
+             "no setpoint of the stop is above the speed that was; a string whose torque isn't known is held"),
+    109: Row("Ctrl-Z; a program in the background asks its terminal", "QS", "143",
+             ("tests/cli/test_identify_end.py::test_each_signal_is_a_wish_to_stop_and_the_first_one_stays",
+              "tests/cli/test_identify_end.py::"
+              "test_a_program_in_the_background_is_not_stopped_by_its_terminal_while_a_shaft_turns",
+              f"{SESSION}test_confirm_speed.py::test_a_program_in_the_background_is_refused_not_stopped"),
+             "a wish to stop, as Ctrl-C; nothing freezes the loop"),
+    110: Row("a drive's lock is removed while a run holds it", "R for the second", "4",
+             (f"{SESSION}test_holder.py::test_a_lock_whose_file_was_removed_holds_all_the_same",),
+             "a name in the kernel holds it too (Linux)"),
+    111: Row("the terminal takes nothing (Ctrl-S) when it is asked in motion; an answer typed before the question",
+             "cycles and stop go on; no answer", "130, 4",
+             (f"{SESSION}test_confirm_speed.py::test_a_terminal_that_takes_nothing_holds_no_cycle_up",
+              f"{SESSION}test_confirm_speed.py::test_what_was_typed_before_the_question_is_no_answer"),
+             "another thread prints and waits; what was typed before is thrown away"),
+    112: Row("`tdhil stop`: the drive refuses what comes before the quick stop, or shows a state nobody knows",
+             "the word is written all the same", "0, 8",
+             ("tests/drivers/test_quick_stop.py::"
+              "test_whatever_the_drive_refuses_before_it_the_quick_stop_is_written",
+              "tests/drivers/test_modbus_quick_stop.py::"
+              "test_a_drive_that_refuses_speed_mode_gets_its_quick_stop_in_the_end",
+              "tests/drivers/test_modbus_quick_stop.py::"
+              "test_a_drive_that_shows_a_state_nobody_knows_is_asked_all_the_same"),
+             "at rest"),
+    113: Row("limits that hold nothing: a torque limit below one count of the drive, a quick stop of minutes", "R",
+             "2, 4",
+             ("tests/drivers/test_preflight.py::test_a_torque_limit_below_one_count_is_no_wider_one",
+              "tests/drivers/test_modbus_preflight.py::test_a_torque_limit_below_one_count_is_no_wider_one",
+              "tests/config/test_rig.py::test_what_is_refused"),
+             "named with what it would have to be; not rounded up"),
+}
+
+BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import sqlite3
@@ -12,6 +13,7 @@ import pytest
 
 from tdhil.service.states import NotThere, State, Status, now, way_to
 from tdhil.service.store import Audit, Index, Request, Store, summary_of, write_json, write_whole
+from tdhil.service.wire import lives, take_life
 
 
 @pytest.fixture
@@ -199,3 +201,16 @@ def test_many_threads_make_one_chain(store):
         thread.join()
     assert audit.verify() is None
     assert len(list(audit.entries())) == 20
+
+
+def test_a_run_of_which_nothing_can_be_known_is_not_given_up_for_dead(tmp_path, monkeypatch):
+    """No descriptor is left in the web's process, say."""
+    assert not lives(tmp_path)
+    os.close(take_life(tmp_path))
+    assert not lives(tmp_path)
+
+    def none_left(*_arguments, **_options):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(os, "open", none_left)
+    assert lives(tmp_path)
