@@ -228,6 +228,10 @@ class CanLink:
         with contextlib.suppress(Exception):       # not every interface can
             self._bus.flush_tx_buffer()
 
+    def try_again(self) -> None:
+        """Send all the same: for a stop of a drive that no watchdog stops, where an old setpoint is no worse."""
+        self._shut = ""
+
     def drain(self) -> None:
         """Handle all that has arrived, without waiting. Raises CommunicationLost if there is no end of it."""
         deadline_s, taken = time.monotonic() + LONGEST_DRAIN_S, 0

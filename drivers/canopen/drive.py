@@ -143,6 +143,7 @@ class Cia402Drive:
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
         self._ever_asked = False       # to be enabled
+        self._armed = True             # its watchdog, or nobody knows yet
         self._reported = Reported()
         self._sent_code = 0
         self._since_mode_sent = 0
@@ -253,6 +254,7 @@ class Cia402Drive:
             accept_none=limits.accept_no_watchdog,
         )
         self._life.keep_to(feed_s)
+        self._armed = feed_s > 0.0
         self._watch_settings(limits.watchdog_s if feed_s else 0.0)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
@@ -386,6 +388,8 @@ class Cia402Drive:
         if self._wish is not Wish.ENABLED or command.mode is not Mode.SPEED:
             offset_raw = 0
         self._ticks.wait(self._listen_until)
+        if self._wish is not Wish.ENABLED and not self._armed:
+            self._link.try_again()
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
         self._check()
         now_s = self.clock.now_s()

@@ -4,19 +4,23 @@ What is refused without it is `test_preflight`'s, `test_guarding`'s and `test_mo
 """
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 
+import can
 import pytest
 
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
-from drivers.drive import DriveLimits, Mode, Outcome
+from drivers.drive import Command, DriveLimits, Mode, Outcome
+from drivers.errors import CommunicationLost
 from drivers.modbus.drive import ModbusDrive
 from drivers.modbus.link import EmbeddedLink
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile
 from tests.drivers.drive_benches import Run
 from tests.drivers.modbus_bank import CONTROL, TIME_OUT, Bank
+from tests.drivers.power_machine import ENABLED, STOPPING
 from tests.drivers.profile_benches import S120Bench
 
 LIMITS = DriveLimits(
@@ -66,6 +70,31 @@ def canopen(wire, profile):
         return drive.preflight(limits)
 
     return preflight
+
+
+@pytest.mark.parametrize("kind", ["none", "heartbeat"])
+def test_a_full_queue_keeps_no_stop_back_where_no_watchdog_acts(wire, peer, profile, kind):
+    """With one armed nothing more is sent: it acts on the silence. Without one the quick stop is all that there is."""
+    none = {"kind": "none", "reaction": "none", "reaction_index": None, "reaction_value": None}
+    watchdog = profile.watchdog.model_copy(update=none if kind == "none" else {})
+    drive = Cia402Drive(wire, profile.model_copy(update={"watchdog": watchdog}), SteppedClock(), node=1)
+    drive.connect()
+    assert drive.preflight(LIMITS).refused == ()
+    drive.enable(Mode.SPEED)
+    for _ in range(10):
+        wire.put(0x701, b"\x05")
+        drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
+    assert peer.machine.state == ENABLED
+    wire.send_error = can.CanOperationError("transmit buffer full")
+    with pytest.raises(CommunicationLost):
+        drive.exchange(Command(Mode.SPEED, 1.0, 0.0))
+    wire.send_error = None
+    drive.quick_stop()
+    for _ in range(3):
+        wire.put(0x701, b"\x05")
+        with suppress(CommunicationLost):
+            drive.exchange(Command(Mode.SPEED, 0.0, 0.0))
+    assert peer.machine.state == (STOPPING if kind == "none" else ENABLED)
 
 
 def test_a_profile_without_a_watchdog(canopen, peer):

@@ -320,6 +320,10 @@ BETWEEN: dict[int, Row] = {
               "tests/drivers/test_modbus_preflight.py::test_a_torque_limit_below_one_count_is_no_wider_one",
               "tests/config/test_rig.py::test_what_is_refused"),
              "named with what it would have to be; not rounded up"),
+    114: Row("transmit queue full, or bus-off, on a drive without a watchdog (--accept-no-watchdog)", "QS is sent on",
+             "8", ("tests/drivers/test_no_watchdog.py::"
+                   "test_a_full_queue_keeps_no_stop_back_where_no_watchdog_acts",),
+             "nothing but the host can stop it, so the stop is tried in every cycle"),
 }
 
 BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN
