@@ -25,7 +25,7 @@ from tdhil.service.web import Web
 
 FAKE = Path(__file__).with_name("fake_run.py")
 URL = "http://127.0.0.1:8420"
-HANGS_S = 300.0
+HANGS_S = 600.0
 
 
 def wait_for(what: str, happens: Callable[[], Any], within_s: float = HANGS_S) -> Any:
@@ -67,8 +67,21 @@ def nobody_s_port() -> Iterator[int]:
         yield taken.getsockname()[1]
 
 
+def folder_of_locks(at: Path) -> str:
+    """Where anybody may make files, and nobody else does."""
+    at.mkdir(exist_ok=True)
+    at.chmod(0o1777)
+    return str(at)
+
+
 @pytest.fixture
-def rigs(tmp_path: Path, nobody_s_port: int) -> Path:
+def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the service does as long as nobody on this computer holds a drive, it does whatever else is tested on it."""
+    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (folder_of_locks(tmp_path / "locks"),))
+
+
+@pytest.fixture
+def rigs(tmp_path: Path, nobody_s_port: int, own_locks: None) -> Path:
     """Two simulated ones, a real one that may be moved, one that may not, one that can't be read."""
     folder = tmp_path / "rigs"
     folder.mkdir()

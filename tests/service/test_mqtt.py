@@ -29,9 +29,10 @@ CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 1, 2, 3, 4, 14        # MQTT 3.1
 class Heard:
     """The broker's end of the wire, by the specification: acknowledges, and notes down every packet."""
 
-    def __init__(self, port: int = 0, tls: ssl.SSLContext | None = None) -> None:
+    def __init__(self, port: int = 0, tls: ssl.SSLContext | None = None, at: socket.socket | None = None) -> None:
         self._tls = tls
-        self.listening = socket.create_server(("127.0.0.1", port))
+        self.listening = at or socket.create_server(("127.0.0.1", port))
+        self.listening.listen()
         self.port = self.listening.getsockname()[1]
         self.packets: list[tuple[int, int, bytes]] = []                # type, flags, body
         self._peers: list[socket.socket] = []
@@ -134,13 +135,15 @@ def test_states_and_results_are_told_as_they_change(service):
 
 
 def test_a_broker_that_is_away_delays_nothing_and_is_told_it_all_when_it_comes():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    taken = socket.socket()
+    taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    taken.bind(("127.0.0.1", 0))           # nobody listens there, and nobody else comes there meanwhile
+    port = taken.getsockname()[1]
     said: list[str] = []
     state = {"rigs/a/state": {"is": 1}, "rigs/b/state": {"is": 1}}
     with publishing(port, lambda: dict(state), said) as publisher:
         wait_for("the complaint", lambda: "can't be reached" in str(said))
-        heard = Heard(port)
+        heard = Heard(at=taken)
         wait_for("all", lambda: len(heard.last()) == 3)
         state["rigs/a/state"] = {"is": 2}
         wait_for("the change", lambda: heard.last()["site/1/rigs/a/state"] == '{"is": 2}')

@@ -25,7 +25,7 @@ from tdhil.service import AccountsFile, attend
 from tdhil.service.client import ServiceError
 from tdhil.service.serving import require_way
 from tdhil.service.store import Store
-from tests.service.conftest import HANGS_S, wait_for
+from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
 PATIENT = """run: {simulate: true}
 limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,
@@ -35,12 +35,22 @@ limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 
 QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, and of the cycles to compute
 
 
+SERVE = """
+import sys
+from tdhil.session import holder
+holder.FOLDERS = (sys.argv.pop(1),)        # a replay waits for whoever holds a drive: not for those of other tests
+from tdhil.__main__ import console
+console()
+"""
+
+
 class Server:
     def __init__(self, data: Path, *more: str, **client: Any) -> None:
         self.log = (data.parent / "serve.txt").open("a+")
         start = self.log.seek(0, os.SEEK_END)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tdhil", "serve", "--data", str(data), "--port", "0", *more], stderr=self.log)
+            [sys.executable, "-c", SERVE, folder_of_locks(data.parent / "locks"), "serve", "--data", str(data),
+             "--port", "0", *more], stderr=self.log)
         address = wait_for("the address", lambda: re.search(r"https?://\S+", self.said(start)))
         self.url = address.group(0)
         self.client = tdhil.Client(self.url, **client)

@@ -15,7 +15,7 @@ import pytest
 
 Open = Callable[..., can.BusABC]
 Tool = Callable[[str], str]
-WAIT = 5.0  # s; for what must come
+WAIT = 60.0  # s; for what must come
 QUIET = 0.2  # s; for what must not
 
 
@@ -152,7 +152,7 @@ def test_a_killed_process_falls_silent(open_bus: Open, vcan: str) -> None:
     with subprocess.Popen([sys.executable, "-c", SENDER, vcan]) as sender:
         try:
             seen: set[int] = set()
-            end = time.monotonic() + 6 * WAIT  # a guest starts Python slowly
+            end = time.monotonic() + WAIT  # a guest starts Python slowly
             while seen != {0x205, 0x77F} and time.monotonic() < end:
                 message = bus.recv(WAIT)
                 if message is not None:
