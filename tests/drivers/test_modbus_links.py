@@ -280,9 +280,9 @@ def test_the_adapter_is_unplugged():
 
 
 def test_nothing_listens():
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port = listener.getsockname()[1]
-    with pytest.raises(PreflightRefused, match="nothing listens") as caught:
+    with socket.socket() as taken, pytest.raises(PreflightRefused, match="nothing listens") as caught:
+        taken.bind(("127.0.0.1", 0))           # and nobody else listens there meanwhile
+        port = taken.getsockname()[1]
         TcpLink("127.0.0.1", port, MonotonicClock())
     assert str(port) in caught.value.where
     assert caught.value.next_step

@@ -163,11 +163,6 @@ def test_nobody_answers(tmp_path):
     assert SENTENCE in done.out
 
 
-def closed_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
-
-
 MODBUS_TCP = ("--host", "127.0.0.1", "--port")
 HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
 
@@ -179,11 +174,12 @@ HUB = ("-i", "socketcand", "-c", "can0", "--bus-kwargs", "host=127.0.0.1")
 ])
 def test_where_nobody_is_reached(dead, as_json, no_bus_of_the_user):
     """Whatever stands between here and the drive: 8 and the sentence, never a mere connection error."""
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        mute = listening.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listening, socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))           # and nobody else listens there meanwhile
+        mute, closed = listening.getsockname()[1], taken.getsockname()[1]
         line = {
-            "closed Modbus port": (*MODBUS_TCP, closed_port()), "silent Modbus host": (*MODBUS_TCP, mute),
-            "closed hub": (*HUB, f"port={closed_port()}"), "hub that says nothing": (*HUB, f"port={mute}"),
+            "closed Modbus port": (*MODBUS_TCP, closed), "silent Modbus host": (*MODBUS_TCP, mute),
+            "closed hub": (*HUB, f"port={closed}"), "hub that says nothing": (*HUB, f"port={mute}"),
             "no serial device": ("--serial", "/dev/there-is-none"),
         }[dead]
         done = tdhil("stop", *line, *as_json)

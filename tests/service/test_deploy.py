@@ -65,10 +65,11 @@ def test_so_is_a_shaft_that_nobody_saw_at_rest_until_somebody_signs(service, cap
     assert idle(service.store.folder) == ExitCode.OK
 
 
-def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys):
+def test_so_is_a_drive_that_a_terminal_has(tmp_path, capsys, nobody_s_port):
     assert holders() == []
-    with hold("modbus 127.0.0.1:1 unit 1"), hold("modbus 127.0.0.1:2 unit 1"):
-        assert holders() == [holder_of("modbus 127.0.0.1:1 unit 1"), holder_of("modbus 127.0.0.1:2 unit 1")]
+    one, other = (f"modbus 127.0.0.1:{nobody_s_port} unit {unit}" for unit in (1, 2))
+    with hold(one), hold(other):
+        assert sorted(map(str, holders())) == sorted(str(holder_of(address)) for address in (one, other))
         assert idle(tmp_path / "none") == ExitCode.REFUSED
         assert f"a drive is held by process {os.getpid()}" in capsys.readouterr().err
     assert idle(tmp_path / "none") == ExitCode.USAGE       # who misspelt it has asked nothing
