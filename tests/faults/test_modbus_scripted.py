@@ -19,7 +19,7 @@ from tests.path.path_runs import HANGS_S, Shaft, process, tdhil, wait_for
 IN_MOTION = "@speed+15s"       # at 4 rad/s
 PATIENT = (                    # against the wall clock a busy machine's pauses must not be taken for a fault
     "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
-    " watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+    " watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
 )
 NOTICED_S = 0.6                # half the watchdog's time, or all of it, and five cycles
 
@@ -63,7 +63,7 @@ CASES = (
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.row}-{case.fault}")
 def test_row(case, rehearse, tmp_path):
     rig = tmp_path / "warm.yaml"
-    rig.write_text(PATIENT.replace("watchdog_s: 2.0", "watchdog_s: 0.5, temperature_c: 110.0"))
+    rig.write_text(PATIENT.replace("watchdog_s: 5.0", "watchdog_s: 0.5, temperature_c: 110.0"))
     run = rehearse("--drive", "modbus", "--fault", case.fault, "--rig", rig)
     run.assert_ended(case.code, *case.words)
     assert f"scripted fault {case.fault}" in " ".join(run.done.err.split())

@@ -101,7 +101,7 @@ def test_while_a_run_of_ours_is_under_way(tmp_path):
     rig = tmp_path / "rig.yaml"        # a slow cycle and a long watchdog bear a loaded machine
     rig.write_text(
         "rate_hz: 4\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
-        " quick_stop_rad_s2: 2.0, watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+        " quick_stop_rad_s2: 2.0, watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
     )
     with peer(tmp_path, *REAL_TIME) as drive, host(tmp_path, *drive.options, "--rig", rig, "--yes") as running:
         assert running.wait_for_line("stage speed …"), running.err

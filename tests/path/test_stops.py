@@ -114,7 +114,7 @@ def test_ctrl_c_in_real_time(tmp_path):
     rig, trace = tmp_path / "rig.yaml", tmp_path / "shaft.csv"
     rig.write_text(
         "rate_hz: 4\nlimits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"
-        " quick_stop_rad_s2: 2.0, watchdog_s: 2.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
+        " quick_stop_rad_s2: 2.0, watchdog_s: 5.0, probe_torque_nm: 200.0, probe_travel_rad: 3.0}\n"
     )
     with host(tmp_path, "--simulate", "--real-time", "--seed", 1, "--trace", trace, "--rig", rig) as running:
         assert running.wait_for_line("stage speed …"), running.err

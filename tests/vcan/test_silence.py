@@ -18,13 +18,13 @@ from tests.path.path_runs import QUICK_STOP_RAD_S2, SETTLING_S, host, tdhil, wai
 from tests.vcan.candump_log import DRIVES, HOST_BEAT, HOSTS, RPDO1, SYNC, enables, watching
 from tests.vcan.vcan_runs import TURNING_RAD_S, assert_safe, simulated
 
-RATE_HZ, WATCHDOG_S = 20.0, 2.0
+RATE_HZ, WATCHDOG_S = 4.0, 5.0
 RIG = f"""\
 rate_hz: {RATE_HZ}
 limits: {{speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,
   quick_stop_rad_s2: {QUICK_STOP_RAD_S2}, watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}
 """
-STAMP_S = 0.05
+STAMP_S = 1.0 / RATE_HZ
 """How far the log's time of a sent frame may lie from the kernel's stamp of it, all but one in twenty: one cycle."""
 
 
