@@ -119,6 +119,22 @@ def rows(turns_from_rpm, trials, *, damping=0.2, hertz=0.13, **more):
     return table
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
+    # As a = 0.25 of the reference case has them, with what the loop's own disturbances leave of the speed.
+    table = rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2))
+    released = table[:, COLUMNS.index("phase")] == Phase.RELEASED
+    time_s = 0.1 * np.arange(released.sum())
+    speed = 7.0 + np.random.default_rng(seed).normal(0.0, 0.0067, len(time_s))
+    for hertz, damping, size, phase in ((0.103, 0.269, 3.1, 0.0), (0.160, 0.226, 2.2, 2.5)):
+        turn = 2.0 * np.pi * hertz * time_s
+        speed += size * np.exp(-damping * turn) * np.cos(np.sqrt(1.0 - damping**2) * turn + phase)
+    table[released, COLUMNS.index("top_rad_s")] = speed
+    found = evaluate(table, CASE, PROGRAM)
+    assert found.damping == pytest.approx(0.226, abs=0.01)
+    assert found.outcome is Outcome.AS_PREDICTED
+
+
 def test_critical_speed_and_damping_are_read_off_the_rows():
     found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.15), CASE, PROGRAM)
     assert found.outcome is Outcome.DIFFERS                   # by the damping, which is 0.15
