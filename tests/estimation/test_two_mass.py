@@ -30,6 +30,7 @@ from tdhil.estimation.result import Refusal
 from tdhil.estimation.spectrum import Line
 from tdhil.recording.recording import LagPrior, Pipe
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
+from tests.estimation.compliant_bench import Pipe as PipeBench
 
 S = 2j * np.pi * np.array(LINES)
 MILD = Noise(load_nm=55.0, sensor_rad_s=0.025)
@@ -219,11 +220,21 @@ def test_a_line_by_the_swing_that_the_mean_speeds_differ_at_counts_by_the_differ
     assert bad.rejected
     found = choose_unlike(bad, "two-mass", unlike(swing), constraint, (), {})
     assert (found.rejected, found.unlike_hz) == (False, (0.18,))
-    inertia = inertias(found.fit, 0.95)["inertia"]
-    assert inertia.low <= plant.motor <= inertia.high
+    assert found.fit.mechanical[0] == pytest.approx(plant.motor, rel=0.02)
     elsewhere = choose("two-mass", unlike(swing + 1), constraint, (), {})
     assert elsewhere.rejected
     assert choose_unlike(elsewhere, "two-mass", unlike(swing + 1), constraint, (), {}) is elsewhere
+
+
+def test_what_is_known_of_a_pipe_counts_as_equations():
+    """Four lines and two mean speeds: nine, for the eleven unknowns of a string behind lags."""
+    plant = PipeBench()
+    lines, constraint = synthetic(plant, 1, 5.0, (0.07, 0.2, 0.4, 0.7))
+    known = Pipe(plant.inertia, plant.stiffness, 0.03, "rig.yaml")
+    found = choose("auto", lines, constraint, (), {}, known)
+    assert found.pipe is known
+    assert found.fit.is_string
+    assert found.fit.mechanical[0] == pytest.approx(plant.motor, rel=0.05)
 
 
 def test_too_few_lines_are_counted_and_refused():

@@ -67,6 +67,7 @@ from tdhil.recording import Pipe
 _DOUBT = 0.3                 # of the residual test's p, above which a rigid shaft isn't doubted
 _MUCH = 9.0                  # of −2 ln L, for one parameter more than the rigid shaft's lags have
 _REPORTS = 3                 # unknown besides the shaft: two lags and the skew
+_BY_PIPE = 2                 # known where the pipe is: its inertia and its stiffness
 _SIGNIFICANT = 25.0          # |mean|² over its variance, as `Line.excited`
 _LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
 _NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
@@ -115,7 +116,7 @@ def choose(
     if refusal is not None:
         return refusal
 
-    if pipe is not None and model.piped and _refuse_count(STRING, lines, constraint, priors) is None:
+    if pipe is not None and model.piped and _refuse_count(STRING, lines, constraint, priors, _BY_PIPE) is None:
         near = fit_compliant(TwoMassShaft(), lines, constraint, priors, fixed)
         known = fit_compliant(KnownStringShaft(pipe), lines, constraint, priors, fixed, near)
         if not rejects(known.residual) and plausible(known):
@@ -235,10 +236,11 @@ def _refuse_count(
     lines: tuple[Line, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
+    known: int = 0,
 ) -> Refusal | None:
-    """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft."""
+    """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft; ``known`` of the load."""
     assert model.compliant is not None
-    equations = 2 * len(lines) + (constraint is not None) + len(priors)
+    equations = 2 * len(lines) + (constraint is not None) + len(priors) + known
     unknowns = len(model.compliant().names) + _REPORTS
     if equations >= unknowns:
         return None
