@@ -59,6 +59,12 @@ def test_help_of_a_command_comes_quickly(command):
     assert imported.isdisjoint({"scipy", "canopen", "mcap", "matplotlib"})
 
 
+def test_what_a_log_says_of_its_run_is_read_without_a_virtual_string():
+    done = run("-c", "import sys\nfrom tdhil.run import precondition_warnings, speed_warnings, stage_warnings\n"
+                     "print([name for name in sys.modules if name.startswith('tdhil.soft_torque.')])")
+    assert done.stdout == "[]\n", done.stderr
+
+
 def test_no_path_of_a_home_stands_in_the_tree():
     found = []
     for folder, folders, names in os.walk(ROOT):
