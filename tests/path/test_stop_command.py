@@ -33,11 +33,14 @@ class Master:
                            port=int(options["port"]), tcp_tune=True)
         self.link = CanLink(self.bus, MonotonicClock())
         self.objects = Objects(self.link, NODE)
+        self.patient = self.objects.answered_within(30.0)       # a drive on a busy computer answers when it can
 
     def __enter__(self):
+        self.patient.__enter__()
         return self
 
     def __exit__(self, *exc):
+        self.patient.__exit__(*exc)
         self.bus.shutdown()
 
     def turn(self, speed_lsb=400, option=6):
