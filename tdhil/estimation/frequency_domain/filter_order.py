@@ -7,8 +7,7 @@ lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be pref
     weight of the first-order fit = 1/(1 + e^((D/r − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0,
 
 and r the share by which −2 ln L rises and falls too much, since its weights are estimates themselves (`excess_rise`).
-That is for the value. J's interval rests on every structure between the two, by the same measure (`structures`, and
-`inference.weighed`); those of friction and lags, and a plan's of J, on the whole family always, whatever the weight.
+That is for the value. An interval rests on the whole family always, whatever the weight.
 
 The descents of the whole family begin near the first-order fit. Lower minima far from it exist now and then, in corners
 where filters of the two reports all but cancel; they are noise fitted, and following them costs both scatter and
@@ -18,7 +17,6 @@ coverage (tried on the plants of the coverage study).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -109,34 +107,6 @@ def fit_model(
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(fixed))
     weight = simple_weight(gain, len(open_structure), problem.numbers)
     return Fitted(problem, limits, fixed, simple, whole, weight, others)
-
-
-def structures(fitted: Fitted) -> list[tuple[Fit, Fixed, float]]:
-    """Every structure from first-order lags to the whole family: its fit, what it holds, and its weight; they sum to 1.
-
-    By Schwarz's measure: each parameter more must lower −2 ln L by more than ln n.
-    """
-    model, problem, limits = fitted.problem.model, fitted.problem, fitted.limits
-    opened = [index for index in model.structure if index not in fitted.fixed]
-    found: dict[tuple[int, ...], tuple[Fit, Fixed]] = {(): (fitted.simple, fitted.simple_held)}
-    for count in range(1, len(opened)):
-        for free in combinations(opened, count):
-            held = {index: value for index, value in fitted.simple_held.items() if index not in free}
-            fits = []
-            for shape, value in _SHAPES:
-                if model.at(shape) in free:
-                    less = found[tuple(index for index in free if index != model.at(shape))][0]
-                    start = less.theta.copy()
-                    start[model.at(shape)] = value
-                    fits += [less, minimise(problem, limits, start, held)]
-            found[free] = lowest(fits), held
-    found[tuple(opened)] = fitted.whole, fitted.fixed
-    rise = excess_rise(problem, len(fitted.free))
-    price = math.log(problem.numbers)
-    measure = np.array([fit.objective / rise + price * len(free) for free, (fit, _) in found.items()])
-    weight = np.exp(-0.5 * (measure - measure.min()))
-    shares = (weight / weight.sum()).tolist()
-    return [(fit, held, share) for (fit, held), share in zip(found.values(), shares, strict=True)]
 
 
 def simple_weight(gain: float, more: int, numbers: int) -> float:

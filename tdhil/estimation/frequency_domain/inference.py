@@ -7,12 +7,11 @@ bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-squa
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, structures, unit
+from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, minimise
 from tdhil.estimation.frequency_domain.shafts import INERTIA
@@ -164,8 +163,7 @@ def profile_edge(refit: Refit, limits: Box, best: Fit, index: int, step: float, 
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# The interval of one parameter of a fitted model: its profile over the whole family of lag structures. (J's own is
-# `weighed` below.)
+# The interval of one parameter of a fitted model: its profile over the whole family of lag structures.
 #
 # While first-order lags are the likelier answer, what lies within one standard deviation of theirs is part of it:
 # where the whole family's fit follows noise away from them, its own interval follows too. (Their whole interval would
@@ -206,101 +204,6 @@ def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0)
         if further < quantile**2:
             seen += _edges(fitted, rival, fitted.fixed, index, quantile, further)
     return Estimate(value, min(seen), max(seen))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# The interval of J: over the structures of the lags, each by its weight.
-#
-# Every structure has an estimate of its own, of Student's distribution about its best fit. How wide it is on either
-# side says the profile, of first-order lags and of the whole family; those between are stretched beyond the quadratic
-# approximation as that one of these two is which weighs more. The mixture's quantiles are the interval. Besides, what
-# lies within a standard deviation of the whole family's answer is part of it: Schwarz's price is high where a filter
-# is nearly first order. And it ends where the whole family's interval ends: what is open there stays open, and a run
-# that went on until that was as tight as asked for has it as tight.
-#
-# Against the whole family's alone the interval is a quarter narrower on random rigs, and misses as often, also where a
-# second pole is just not to be seen (docs/accuracy.md).
-
-
-_FELT = 1e-3      # of a weight: below it no profile is sought
-
-
-@dataclass(frozen=True)
-class _Part:
-    """An estimate with its standard deviations below and above, and its weight."""
-
-    value: float
-    below: float
-    above: float
-    weight: float
-
-
-def weighed(fitted: Fitted, confidence: float) -> Estimate:
-    """J and its interval over all structures of the lags; infinite on a side that the data leave open."""
-    told = estimate(fitted, INERTIA, confidence)
-    if INERTIA in fitted.fixed or fitted.simple is fitted.whole or not told.bounded:
-        return told
-    quantile = quantile_of(fitted, INERTIA, confidence)
-    if any(rival.objective - fitted.whole.objective < quantile**2 for rival in fitted.rivals):
-        return told
-    free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held]
-    _, dof = standard_deviation(fitted.problem, fitted.simple.theta, INERTIA, free)
-    rise = math.sqrt(excess_rise(fitted.problem, len(fitted.free)))
-    (simple, held, share), *between, (_, _, rest) = structures(fitted)
-
-    def part(fit: Fit, edges: tuple[float, float], weight: float) -> _Part:
-        own = float(fit.theta[INERTIA])
-        least = 1e-9 * abs(own)
-        below, above = (max(abs(edge - own) / quantile, least) * rise for edge in edges)
-        return _Part(own, below, above, weight)
-
-    whole = part(fitted.whole, (told.low, told.high), rest)
-    parts, likelier, sd = [whole], whole, _quadratic(fitted, fitted.whole, fitted.fixed) * rise
-    if share > _FELT:
-        parts.append(part(simple, _edges(fitted, simple, held, INERTIA, quantile, 0.0), share))
-        if share > rest:
-            likelier, sd = parts[-1], _quadratic(fitted, simple, held) * rise
-    below, above = max(1.0, likelier.below / sd), max(1.0, likelier.above / sd)
-    for fit, held, weight in between:
-        sd = _quadratic(fitted, fit, held) * rise
-        parts.append(_Part(float(fit.theta[INERTIA]), below * sd, above * sd, weight))
-    low, high = (_mixed(parts, dof, 0.5 + 0.5 * side * confidence) for side in (-1.0, 1.0))
-    return Estimate(
-        told.value,
-        max(told.low, min(low, told.value, whole.value - whole.below)),
-        min(told.high, max(high, told.value, whole.value + whole.above)),
-    )
-
-
-def _quadratic(fitted: Fitted, fit: Fit, held: Fixed) -> float:
-    free = [index for index in range(len(fit.theta)) if index not in held]
-    sd, _ = standard_deviation(fitted.problem, fit.theta, INERTIA, free)
-    return max(sd, 1e-12 * abs(float(fit.theta[INERTIA])))
-
-
-def _mixed(parts: list[_Part], dof: float, share: float) -> float:
-    """Below which value there is that share of the mixture; infinite where it isn't reached."""
-    from scipy.special import stdtr, stdtrit
-
-    centre = np.array([part.value for part in parts])
-    below, above = np.array([part.below for part in parts]), np.array([part.above for part in parts])
-    weight = np.array([part.weight for part in parts])
-    weight = weight / weight.sum()
-
-    def cumulated(x: float) -> float:
-        off = x - centre
-        return float(weight @ stdtr(dof, off / np.where(off < 0.0, below, above)))
-
-    side = below if share < 0.5 else above
-    felt = np.isfinite(side)
-    reach = float(np.max(np.abs(stdtrit(dof, 0.1 * min(share, 1.0 - share)) * np.where(felt, side, 0.0))))
-    low, high = float(np.min(centre)) - reach, float(np.max(centre)) + reach
-    if not cumulated(low) < share < cumulated(high):
-        return math.copysign(math.inf, share - 0.5)
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if cumulated(middle) < share else (low, middle)
-    return 0.5 * (low + high)
 
 
 def first_order_estimate(fitted: Fitted, index: int, confidence: float) -> Estimate:

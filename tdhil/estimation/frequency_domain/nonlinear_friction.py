@@ -20,7 +20,6 @@ from tdhil.estimation.frequency_domain.inference import (
     quantile_of,
     residual_of,
     student_quantile,
-    weighed,
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
@@ -370,7 +369,7 @@ def _result(
 ) -> RigidResult:
     """As of a rigid shaft; ``viscous`` is the slope of friction between the two mean speeds, Coulomb's is not told."""
     best = found[0]
-    own = weighed(best.fitted, confidence)
+    own = estimate(best.fitted, INERTIA, confidence)
     inertia = inertia_of(found, own, confidence)
     speed_lag, torque_lag, skew = lags_of(best.fitted, confidence)
     chord = constraint.slope - constraint.slope_per_inertia * inertia.value

@@ -15,7 +15,6 @@ from tdhil.estimation.frequency_domain.inference import (
     residual_of,
     standard_deviation,
     student_quantile,
-    weighed,
 )
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
@@ -195,10 +194,9 @@ def fit_rigid(
     torque_scale_rel_sd: float = 0.0,
 ) -> RigidResult:
     """Fit, test, and profile. ``fixed``: parameters of theta known for certain (see Model)."""
-    fitted, residual = _fitted(lines, constraint, priors, fixed)
+    inertia, residual, fitted = fit_inertia(lines, constraint, priors, fixed, confidence)
     if rejects(residual):
         return _bare(fitted, residual)
-    inertia = weighed(fitted, confidence)
     viscous = estimate(fitted, VISCOUS, confidence)
     speed_lag, torque_lag, skew = lags_of(fitted, confidence)
     return RigidResult(
@@ -222,23 +220,14 @@ def fit_inertia(
     fixed: Fixed,
     confidence: float,
 ) -> tuple[Estimate, ResidualTest | None, Fitted]:
-    """J of a rigid shaft, for a plan: over the whole family of filters alone, which is sooner told, and somewhat wider.
-
-    J without width where the data reject the model.
-    """
-    fitted, residual = _fitted(lines, constraint, priors, fixed)
+    """`fit_rigid` as far as J goes, which is a third of it; J without width where the data reject the model."""
+    problem = Likelihood(lines, Model(), constraint, priors)
+    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
+    residual = residual_of(fitted)
     if rejects(residual):            # then no interval will be shown, and none is sought
         value = float(fitted.whole.theta[INERTIA])
         return Estimate(value, value, value), residual, fitted
     return estimate(fitted, INERTIA, confidence), residual, fitted
-
-
-def _fitted(
-    lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...], fixed: Fixed
-) -> tuple[Fitted, ResidualTest | None]:
-    problem = Likelihood(lines, Model(), constraint, priors)
-    fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
-    return fitted, residual_of(fitted)
 
 
 def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
