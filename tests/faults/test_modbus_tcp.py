@@ -26,7 +26,7 @@ RIG = (
     "limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0, quick_stop_rad_s2: 2.0,"
     f" watchdog_s: {WATCHDOG_S}, probe_torque_nm: 200.0, probe_travel_rad: 3.0}}\n"
 )
-TURNING_RAD_S = 0.3
+TURNING_RAD_S = 1.0         # the sign probe stays below it, and ends at rest by itself
 QUICK_STOP_RAD_S2 = 2.0
 LATE_S = 0.3
 """A machine that is busy with other tests looks at its watchdog late."""
