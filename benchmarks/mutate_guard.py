@@ -64,7 +64,7 @@ _STOP = (
 )
 _RUNS = ("test_control_loop.py", "test_runner.py", "test_run_goes_wrong.py")
 SUBJECTS = {
-    "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py"),
+    "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py", "test_kept_within.py"),
     "stop": _run("stop", *_STOP),
     "string_release": _run("string_release", *_STOP),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
@@ -147,8 +147,9 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
     ("modbus/watchdog", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
     ("modbus/preflight", "            access.write(register, 0)\n", "            pass\n"),
-    ("hold", "max(min(ahead_nm + correction, limits.torque_nm), loop.guard.least_torque_nm)", "ahead_nm + correction"),
-    ("acquire", "max(min(torque_nm, limits.torque_nm), -limits.torque_nm)", "torque_nm"),
+    ("hold", "kept_within(ahead_nm + correction, loop.guard.least_torque_nm, limits.torque_nm)",
+     "ahead_nm + correction"),
+    ("acquire", "kept_within(torque_nm, -limits.torque_nm, limits.torque_nm)", "torque_nm"),
     ("acquire pulses", "while follower.time_s < end_s:", "while True:"),
     ("identify", "code = code or int(exit_code(error))", "pass"),
     ("identify", "        code = ExitCode.STOP_NOT_CONFIRMED\n", "        pass\n"),

@@ -81,6 +81,15 @@ PACE_S, LATE_SHARE = 2.0, 0.2
 """A loop that was late in this share of its cycles over this time can't hold its rate (row 8)."""
 
 
+def kept_within(setpoint: float, least: float, most: float) -> float:
+    """What a stage commands instead of a setpoint beyond its limits. NaN stays NaN, which the guard rejects.
+
+    Of two numbers that don't compare, `min` and `max` give the first: the setpoint has to stand there, or a limit would
+    be commanded for what is no number.
+    """
+    return max(min(setpoint, most), least)
+
+
 class Guard:
     """Holds the machine's limits over one run.
 

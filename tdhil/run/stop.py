@@ -34,6 +34,7 @@ from dataclasses import dataclass
 
 from drivers import Command, CommandRejected, Drive, Mode, Polled, PowerState, Sample, StopNotConfirmed, StopsFeeding
 from tdhil.run.control_loop import ControlLoop
+from tdhil.run.guard import kept_within
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
@@ -308,7 +309,7 @@ class StopSequence:
         seen = [one.speed_rad_s for one in (self._loop.last, self._loop.before) if one is not None]
         speed = min((one for one in seen if math.isfinite(one)), key=abs, default=0.0)
         most = self._limits.speed_max_rad_s
-        return max(-most, min(most, speed))
+        return kept_within(speed, -most, most)
 
     def _let_go(self, string: StringReleaseLimits) -> None:
         """Yield to what the string holds, until nothing is left or the bounds are reached."""

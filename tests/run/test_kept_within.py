@@ -11,10 +11,10 @@ from drivers.drive import Mode
 from drivers.errors import CommandRejected
 from tdhil.run.excitation import MotionLimits, RigGuess, SwingPlan
 from tdhil.run.excitation.pulses import CALM_S, Way
+from tdhil.run.guard import kept_within
 from tdhil.run.settings import ControlAssumptions
 from tdhil.run.stages.acquire import Follower, run_swings
 from tdhil.run.stages.hold import MeanSpeedControl, run_hold
-from tdhil.run.stages.torque import _within
 from tests.run.fake_drive import LIMITS, NAN, FakeDrive
 
 ROOM = MotionLimits(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
@@ -90,7 +90,7 @@ def test_a_reference_that_is_no_number_becomes_no_limit(world, mode, speed_rad_s
 
 
 def test_nor_does_the_seed_of_torque_mode():
-    assert math.isnan(_within(NAN, 400.0))
+    assert math.isnan(kept_within(NAN, 0.0, 400.0))
 
 
 def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):

@@ -15,6 +15,7 @@ from tdhil.recording import Excitation, Segment
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SwingPlan, Way
+from tdhil.run.guard import kept_within
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.hold import MeanSpeedControl
 
@@ -90,15 +91,14 @@ class Follower:
         self._step(*reference(self.time_s + self._loop.period_s - start_s))
 
     def _step(self, speed_rad_s: float, torque_nm: float) -> None:
-        # What is no number must stay none, for the guard: min and max give their first argument for it, so no limit.
         limits = self._limits
         if self._control is not None:
             torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
             torque_nm = max(torque_nm, self._loop.guard.least_torque_nm)
-        torque_nm = max(min(torque_nm, limits.torque_nm), -limits.torque_nm)
+        torque_nm = kept_within(torque_nm, -limits.torque_nm, limits.torque_nm)
         lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
         setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))
-        wanted = max(min(setpoint, limits.speed_max_rad_s), lowest)
+        wanted = kept_within(setpoint, lowest, limits.speed_max_rad_s)
         self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
 
     def saw(self, sample: Sample, wanted_rad_s: float) -> None:

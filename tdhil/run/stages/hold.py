@@ -7,7 +7,7 @@ from collections import deque
 from drivers import Command, LimitHit, Mode
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
-from tdhil.run.guard import LIGHTEN
+from tdhil.run.guard import LIGHTEN, kept_within
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -77,11 +77,11 @@ def run_hold(
     wanted = reported = start_rad_s
     timeout_s = TIMEOUT_S + abs(target_rad_s - start_rad_s) / rate
     for _ in range(loop.cycles(timeout_s)):
-        step = max(min(target_rad_s - wanted, rate * loop.period_s), -rate * loop.period_s)
+        step = kept_within(target_rad_s - wanted, -rate * loop.period_s, rate * loop.period_s)
         wanted += step
         correction = control.update(wanted - reported, loop.period_s)
         ahead_nm = model.steady_torque_nm(wanted) + model.inertia_kg_m2 * step / loop.period_s
-        torque = max(min(ahead_nm + correction, limits.torque_nm), loop.guard.least_torque_nm)      # NaN stays NaN
+        torque = kept_within(ahead_nm + correction, loop.guard.least_torque_nm, limits.torque_nm)
         sample = loop.cycle(Command(Mode.TORQUE, wanted, torque))
         reported = sample.speed_rad_s
         recent.append(reported)

@@ -19,6 +19,7 @@ from drivers import Command, Mode, Sample
 from tdhil.estimation import RoughInertia, rough_inertia
 from tdhil.recording import Level, Ramp
 from tdhil.run.control_loop import ControlLoop
+from tdhil.run.guard import kept_within
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.stages.brake_test import probe_braking, slow_speed
 from tdhil.run.stages.speed import SpeedResult
@@ -51,7 +52,7 @@ def run_torque(
     brake on a braking torque, and what the bench raises.
     """
     before = trace(slow)
-    flowing_nm = _within(float(before.torque_nm.mean()) - torque_offset_nm, limits.torque_nm)
+    flowing_nm = kept_within(float(before.torque_nm.mean()) - torque_offset_nm, 0.0, limits.torque_nm)
     keep_rad_s = slow_speed(limits, speed.wander_rad_s)
     # Seeded for a few cycles before the switch, so that the target is there when the mode is.
     samples = [*slow, *loop.hold(Command(Mode.SPEED, keep_rad_s, flowing_nm), 5.0 * loop.period_s)]
@@ -61,7 +62,7 @@ def run_torque(
         loop, limits, speed.model, assumptions, slow, flowing_nm, speed_resolution_rad_s, setpoint_where,
         speed.wander_rad_s,
     )
-    target_nm = _within(speed.model.steady_torque_nm(speed.high.speed_rad_s), limits.torque_nm)
+    target_nm = kept_within(speed.model.steady_torque_nm(speed.high.speed_rad_s), 0.0, limits.torque_nm)
     steps = max(1, loop.cycles(abs(target_nm - flowing_nm) / (SLOPE_SHARE_PER_S * limits.torque_nm)))
     start_s = loop.now_s
     samples += [
@@ -79,7 +80,3 @@ def run_torque(
         speed.rough.friction,
     )
     return TorqueResult(target_nm, Ramp(start_s, loop.now_s), rough, float(drift.speed_rad_s[-1]))
-
-
-def _within(torque_nm: float, limit_nm: float) -> float:
-    return max(min(torque_nm, limit_nm), 0.0)      # what is no number stays none, for the guard

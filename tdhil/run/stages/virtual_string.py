@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
+from tdhil.run.guard import kept_within
 from tdhil.run.settings import MachineLimits
 from tdhil.run.stages.steady import wait_until_steady
 from tdhil.soft_torque import (
@@ -120,7 +121,7 @@ def run_virtual_string(
     phase: Phase = host.phase
     clamped = False
     while host.phase is not Phase.DONE:
-        wanted = max(min(host.set_rad_s * ratio, limits.speed_max_rad_s), 0.0)     # NaN stays NaN, for the guard
+        wanted = kept_within(host.set_rad_s * ratio, 0.0, limits.speed_max_rad_s)
         command = Command(Mode.SPEED, wanted, 0.0, torque) if case.own_loop else Command(Mode.TORQUE, wanted, torque)
         sample = loop.cycle(command)
         torque = host.step(sample.time_s, sample.speed_rad_s if sample.fresh else None)
