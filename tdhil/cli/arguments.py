@@ -6,7 +6,8 @@ None as a default means: rig.yaml, else the profile, else the built-in default (
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from profiles import quantities
@@ -34,6 +35,12 @@ share = amount(SHARE)
 """``1%`` or ``0.01``."""
 
 TOLERANCE = "a share between 0 and 1, such as 1% or 0.01"
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """The question whether it is the one of ``known`` that is much like it, and a space; nothing where none is."""
+    close = difflib.get_close_matches(name[:40], list(known), n=1)
+    return f"Did you mean '{close[0]}'? " if close else ""
 
 
 # ---------------------------------------------------------------------------------------------------------------------

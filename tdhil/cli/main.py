@@ -112,11 +112,9 @@ def _chosen(arguments: Sequence[str]) -> str | None:
 
 
 def _no_command(name: str) -> UsageError:
-    from difflib import get_close_matches
+    from tdhil.cli.arguments import meant
 
-    close = get_close_matches(name[:40], _COMMANDS, n=1)
-    meant = f"Did you mean '{close[0]}'? " if close else ""
-    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant}See tdhil --help")
+    return UsageError(f"there is no command '{name[:40]}'", next_step=f"{meant(name, _COMMANDS)}See tdhil --help")
 
 
 _ELSEWHERE = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -338,13 +337,13 @@ def _list(studies: Mapping[str, Study], as_json: bool) -> int:
 
 
 def _unknown(name: str, studies: Mapping[str, Study]) -> Exception:
+    from tdhil.cli.arguments import meant
     from tdhil.errors import UsageError
 
     if name in (LIST, ALL):
         return UsageError(f"'{name}' stands alone", next_step=f"tdhil study {name}")
-    close = difflib.get_close_matches(name, [*studies, LIST, ALL], n=1)
-    meant = f"Did you mean '{close[0]}'? " if close else ""
-    return UsageError(f"there is no study '{name[:40]}'", next_step=f"{meant}tdhil study {LIST} names them")
+    hint = meant(name, (*studies, LIST, ALL))
+    return UsageError(f"there is no study '{name[:40]}'", next_step=f"{hint}tdhil study {LIST} names them")
 
 
 def _order(name: str) -> tuple[bool, str, int]:
