@@ -30,7 +30,6 @@ from tdhil.run.stages import speed
 from tests.path.path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
 from tests.vcan.vcan_runs import root_s_ip, run
 
-pytestmark = pytest.mark.real_time
 RUNS = 10
 FURTHER = ("vcan8",)
 SHORT = ("--mode", "speed", "--frequency", 1, "--periods", 12, "--offset", 5)
