@@ -1,4 +1,4 @@
-"""A report without lag is where descents could stand still: a short lag is felt through its square alone."""
+"""Where descents could stand still: without lag, where a short one is felt through its square alone; at bounds."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,8 @@ from scipy.optimize import least_squares
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import Model
-from tdhil.estimation.frequency_domain.optimiser import box, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.optimiser import box, descend, minimise, rough_inertia_of
+from tdhil.estimation.frequency_domain.shafts import INERTIA
 from tests.estimation.test_two_mass import synthetic
 
 AT = Model().at
@@ -43,3 +44,41 @@ def test_a_descent_that_begins_without_a_lag_finds_it(seed):
     without = minimise(problem, limits, truth, {AT(signal_filters.TORQUE_LAG): 0.0})
     found = minimise(problem, limits, without.theta, {})
     assert found.objective <= 2.0 * best.cost + 0.1      # an interval ends where it has risen by four
+
+
+class Rigid:
+    """104 kg·m² and 8 N·m·s/rad."""
+
+    def impedance(self, hz):
+        return 104.0 * 2j * np.pi * hz + 8.0
+
+
+@pytest.mark.parametrize("seed", range(4, 8))
+@pytest.mark.parametrize("share", [0.985, 1.015])
+def test_a_descent_along_bounds_gets_to_the_bottom(seed, share):
+    """J held off its best, as on the way to an edge; scipy, begun where the descent ended, is the oracle."""
+    lines, constraint = synthetic(Rigid(), seed, 0.3, (0.1, 0.2, 0.3, 0.5, 0.7, 1.0), lags=(0.4, 0.15))
+    problem = Likelihood(lines, Model(), constraint, ())
+    limits = box(problem, rough_inertia_of(problem))
+    start = np.zeros(Model().size)
+    start[:2] = 104.0, 8.0
+    start[AT(signal_filters.SPEED_LAG)], start[AT(signal_filters.TORQUE_LAG)] = 0.4, 0.15
+    start = minimise(problem, limits, start, {}).theta
+    start[INERTIA] *= share
+    start[AT(signal_filters.SPEED_SHAPE)] = 0.25
+    free = np.arange(len(start)) != INERTIA
+    found = descend(problem.at, start, free, limits)
+    inside = 1e-7 * limits.scale
+
+    def with_free(theta):
+        whole = start.copy()
+        whole[free] = theta
+        return whole
+
+    best = least_squares(
+        lambda theta: problem.residuals(with_free(theta)),
+        np.clip(found.theta, limits.low + inside, limits.high - inside)[free],
+        jac=lambda theta: problem.linearised(with_free(theta))[1][:, free],
+        bounds=(limits.low[free], limits.high[free]), x_scale=limits.scale[free], xtol=1e-13, ftol=1e-13, gtol=1e-13,
+    )
+    assert found.objective <= 2.0 * best.cost + 5e-4

@@ -206,6 +206,20 @@ def test_descent_against_scipy(seed):
     assert np.all((found.theta >= low) & (found.theta <= high))
 
 
+def test_an_edge_of_a_profile_is_one_for_two_poles_too():
+    """−2 ln L = x² with one pole, ρ = 0, and 1 + x²/4 with two: it rises by 4 at √12, not at 2."""
+    from tdhil.estimation.frequency_domain import profile_edge
+    from tdhil.estimation.frequency_domain.optimiser import Box, Fit
+
+    def refit(start, x):
+        return Fit(np.array([x, start[1]]), 1.0 + x * x / 4.0 if start[1] > 0.1 else x * x)
+
+    best = Fit(np.zeros(2), 0.0)
+    limits = Box(np.array([-10.0, 0.0]), np.array([10.0, 0.5]), np.ones(2))
+    for step in (-1.5, 1.5):
+        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, [1])) == pytest.approx(12.0**0.5, rel=0.01)
+        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, [])) == pytest.approx(2.0, rel=0.01)
+
 
 
 @settings(max_examples=50)

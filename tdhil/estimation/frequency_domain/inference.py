@@ -3,18 +3,22 @@
 The quadratic approximation fails where lags are matched, or at a bound: there the likelihood is flat along a curved
 valley. The profile P(x) = min over the other parameters of −2 ln L follows the valley, and needs no derivative at a
 bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-square would take the weights for known.
+
+The valley forks where a second pole sets in: the fit with one, refitted along the profile, stands at ρ = 0, and another
+with two lies beside it, lower further out. An edge is one only where that other fit contradicts it too.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, minimise
+from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, lowest, minimise, two_poles
 from tdhil.estimation.frequency_domain.shafts import INERTIA
+from tdhil.estimation.frequency_domain.signal_filters import SPEED_SHAPE, TORQUE_SHAPE
 from tdhil.estimation.result import REJECT_P, BudgetLine, Estimate, InertiaEstimate, ResidualTest
 from tdhil.estimation.spectrum import Line
 from tdhil.recording import FloatArray
@@ -128,10 +132,13 @@ Refit = Callable[[FloatArray, float], Fit]
 """The best fit with the parameter held at a value, from a start (P,) nearby."""
 
 
-def profile_edge(refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float) -> float:
+def profile_edge(
+    refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float, shapes: Sequence[int]
+) -> float:
     """Where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound, or ±inf, if it never does.
 
-    The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood.
+    The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood. ``shapes``: where in theta
+    the reports' free shapes ρ stand.
     """
     target = math.sqrt(max(rise, 0.0))
     if target == 0.0:
@@ -145,6 +152,9 @@ def profile_edge(refit: Refit, limits: Box, best: Fit, index: int, step: float, 
         x = min(x, bound) if step > 0.0 else max(x, bound)
         fit = refit(inside_theta, x)
         root = math.sqrt(max(fit.objective - best.objective, 0.0))
+        if root >= (1.0 - _CLOSE) * target:
+            fit = lowest([fit, *(refit(start, x) for start in two_poles(fit.theta, shapes))])
+            root = math.sqrt(max(fit.objective - best.objective, 0.0))
         if abs(root - target) <= _CLOSE * target:
             return x
         if root < target:
@@ -231,7 +241,8 @@ def _edges(
         return minimise(problem, limits, start, {**fixed, index: value})
 
     rise = quantile**2 - behind
-    low, high = (profile_edge(refit, limits, fit, index, side * step, rise) for side in (-1.0, 1.0))
+    shapes = [at for at in map(problem.model.at, (SPEED_SHAPE, TORQUE_SHAPE)) if at not in fixed and at != index]
+    low, high = (profile_edge(refit, limits, fit, index, side * step, rise, shapes) for side in (-1.0, 1.0))
     return low, high
 
 

@@ -3,9 +3,10 @@
 Written out because the profile of an interval asks for hundreds of small descents, each from a good start: a general
 solver's set-up costs more than the few steps that they take. scipy's `least_squares` is the oracle in the tests.
 
-A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound, and is cut
-at the bounds. λ falls with every success and rises with every failure; a start that is no minimum moves, one that is
-stays bit for bit.
+A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound. What it
+would take beyond a bound goes to the bound, and the rest is solved again (cut alone, the rest would go where they only
+belong if the one went on: λ rises until the step is short of the bound, and the next one is no better). λ falls with
+every success and rises with every failure; a start that is no minimum moves, one that is stays bit for bit.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -72,16 +73,15 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
         for _ in range(_MOST_TRIES):
             damped = normal.copy()
             damped.reshape(-1)[::several] += damping * size + floor
-            step = _solved(damped, downhill)
             trial = theta.copy()
-            trial[moving] = np.minimum(np.maximum(here + step * scale, least), most)
+            trial[moving] = there = _within(least, most, here, scale, damped, downhill)
             tried, slopes = at(trial)
             trial_cost = float(tried.dot(tried))
             if trial_cost < cost:
                 gain = cost - trial_cost
                 break
             damping *= 8.0
-            if max(map(abs, step.tolist())) < _SMALL_STEP:
+            if max(map(abs, ((there - here) / scale).tolist())) < _SMALL_STEP:
                 break
         if gain <= 0.0:
             break
@@ -90,6 +90,24 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
         if gain < _SMALL_GAIN * max(1.0, 1e-3 * cost):
             break
     return Fit(theta, cost)
+
+
+def _within(
+    least: FloatArray, most: FloatArray, here: FloatArray, scale: FloatArray, matrix: FloatArray, right: FloatArray
+) -> FloatArray:
+    """``here`` plus the step x of matrix x = right, in units of ``scale``; what would leave the bounds stops there."""
+    there = here + _solved(matrix, right) * scale
+    held = outside = (there < least) | (there > most)
+    while True in outside.tolist():
+        there = np.minimum(np.maximum(there, least), most)
+        free = ~held
+        if True not in free.tolist():
+            break
+        rest = right[free] - matrix[np.ix_(free, held)].dot((there[held] - here[held]) / scale[held])
+        there[free] = here[free] + _solved(matrix[np.ix_(free, free)], rest) * scale[free]
+        outside = free & ((there < least) | (there > most))
+        held = held | outside
+    return there
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -108,6 +126,7 @@ _STARTS = ((0.40, 0.15, 0.0), (0.15, 0.40, 0.0))
 _SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
 _PROPOSALS = 3
 _NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
+_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of ρ
 
 Fixed = dict[int, float]
 
@@ -172,6 +191,15 @@ def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iter
         begin[at(shape)] = 0.0
         begin[at(signal_filters.SKEW)] += sign * (begin[at(lag)] - theta[at(lag)])
         yield begin
+
+
+def two_poles(theta: FloatArray, shapes: Iterable[int]) -> Iterator[FloatArray]:
+    """Starts with two equal poles in one report, which has one pole or two unlike ones; ``shapes``: where ρ stands."""
+    for index in shapes:
+        if abs(float(theta[index]) - _EQUAL_POLES) > _NEAR_EQUAL:
+            begin = theta.copy()
+            begin[index] = _EQUAL_POLES
+            yield begin
 
 
 def best_fit(

@@ -235,7 +235,8 @@ def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) 
     def refit(start: FloatArray, value: float) -> Fit:
         return minimise(problem, start, {index: value})
 
-    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2) for side in (-1.0, 1.0))
+    shapes = [at for at in (SPEED_SHAPE, TORQUE_SHAPE) if at in problem.free and at != index]
+    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2, shapes) for side in (-1.0, 1.0))
     return Estimate(float(best.theta[index]), low, high)
 
 
