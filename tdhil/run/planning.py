@@ -65,11 +65,13 @@ class Planned:
 
     def said(self) -> str:
         """One line for whoever watches."""
-        if not math.isfinite(self.half_width):
-            return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
-        noise = f"noise {self.known.noise.source}"
-        share = f"±{100.0 * self.half_width:.2g} %"
-        expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
+        if math.isinf(self.half_width):
+            return NOTHING_TO_EXPECT
+        expected = NOT_PREDICTED
+        if math.isfinite(self.half_width):
+            noise = f"noise {self.known.noise.source}"
+            share = f"±{100.0 * self.half_width:.2g} %"
+            expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
         if self.stopping is None or self.stopping.reachable:
             return expected
         return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"
@@ -247,6 +249,8 @@ def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, al
         advice="" if enough else _advice(evidence, working, request.tolerance, known),
     )
     after_pilot = plan.extension_s(periods - pilot) if periods > pilot else 0.0
+    if math.isnan(chosen.half_width):      # a rigid shaft's would be too good for a string
+        half = math.nan
     return Planned(plan, known, half, chosen.usual_half_width, stopping, plan.duration_s + after_pilot)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -53,6 +54,8 @@ class StagePlanner:
                 next_step=f"The shaft was stopped. {LIGHTEN}",
             )
         room = Guard.room(limits, task.assumptions, free)
+        if speed.swing is not None:     # it may hide how the shaft brakes, which then isn't asked for
+            room = replace(room, least_torque_nm=loop.guard.least_torque_nm)
         course = speed.course if mode is Mode.SPEED else None
         last = loop.last
         speed_now = max(0.0, last.speed_rad_s) if last else 0.0
@@ -61,7 +64,8 @@ class StagePlanner:
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
         theta = Knowledge(assumed, prior).theta(model)
 
-        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course, left_s)
+        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
+                       left_s, limits.load == "string")
         try:
             planned = loop.compute(work, keep)
         except PlanRefused as error:
@@ -137,9 +141,10 @@ def _reckon(
     theta: FloatArray,
     course: Course | None,
     left_s: float,
+    swings: bool,
 ) -> Planned:
     """The arithmetic: plain data in and out, so that it can be done anywhere."""
-    known = Knowledge(measured_noise(steady, theta, assumed), prior)
+    known = Knowledge(measured_noise(steady, theta, assumed), prior, swings)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)
     seen, within = as_followed(model, room, course, known.speed_lag_s)

@@ -1,11 +1,17 @@
 """The excitation that is chosen: within the limits, as wished, never worse than the usual one, and as good as said."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tdhil.estimation.frequency_domain.likelihood import Likelihood
+from tdhil.estimation.frequency_domain.model import Model
+from tdhil.estimation.frequency_domain.shafts import StringShaft
+from tdhil.estimation.friction_levels import ViscousConstraint
 from tdhil.estimation.samples import Samples
+from tdhil.estimation.spectrum import Line
 from tdhil.recording.recording import LagPrior
 from tdhil.run.design import (
     Knowledge,
@@ -23,6 +29,7 @@ from tdhil.run.excitation import ExcitationWish, MotionLimits, PlanRefused, RigG
 from tdhil.run.guard import Guard
 from tdhil.run.planning import plan_acquisition
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest
+from tdhil.run.stages.speed import STRING_ERROR
 from tdhil.studies.coverage.bound import density
 from tdhil.studies.coverage.plants import FLEET
 
@@ -166,6 +173,76 @@ def test_with_a_tolerance_the_plan_that_meets_it_soonest_is_taken():
     assert all(one.settle_periods * one.reference.period_s >= 8.0 for one in planned.plan.segments)
     fixed = plan_acquisition(replace(asked, frequency_hz=0.2), "torque", LIMITS, GUESS, KNOWN, left_s).plan
     assert fixed.segments[0].reference.lines_hz[0] == pytest.approx(0.2)
+
+
+# -- with a drill string --------------------------------------------------------------------------------------
+
+
+STRING_LIMITS = MotionLimits(0.5, 10.0, 4000.0, FORESIGHT_S)
+STRING_GUESS = RigGuess(1950.0, 23.0, 100.0, STRING_ERROR)
+
+
+def hung(**options):
+    return replace(KNOWN, swings=True), ExcitationWish(**options)
+
+
+def test_with_a_string_lines_of_equal_torque_reach_from_below_its_swing_to_above_the_second_one():
+    known, wish = hung()
+    chosen, usual = choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95), make_plan(STRING_LIMITS, STRING_GUESS)
+    assert math.isnan(chosen.half_width)
+    assert chosen.plan.duration_s < 1.05 * usual.duration_s
+    reference = chosen.plan.segments[0].reference
+    torques = np.array(reference.lines_hz) * np.array(reference.amplitudes_rad_s)
+    assert torques == pytest.approx(torques[0])
+    assert reference.lines_hz[0] < 0.1 and reference.lines_hz[-1] > 0.75
+    assert motor_sd(chosen.plan) < 0.2 * motor_sd(usual)
+
+
+def motor_sd(plan):
+    """The bound of the shipped string's J_r, reports through filters of two poles and averages; per unit of noise."""
+    shaft, m = StringShaft(), np.array([1500.0, 23.5, 588.5, 0.959, 1e-3, 15.5, 0.3645, 0.74])
+    reference = plan.segments[0].reference
+    hertz = np.array(reference.lines_hz)
+    s, phi = 2j * np.pi * hertz, np.array([0.4, 0.0, 0.15, 0.0, 0.0, 0.0])
+    g = Model(shaft).impedance(np.concatenate([m, phi]), s)
+    pushed = 2.0 * np.pi * hertz * 1950.0 * np.array(reference.amplitudes_rad_s)
+    speed = pushed / shaft.impedance(m, s) / (1.0 + 0.4 * s)
+    counts = np.array([float(one.periods - one.settle_periods) for one in plan.segments])
+    variance = 4.0 * 20.0 * plan.segments[0].reference.period_s**-1.0
+    lines = tuple(
+        Line(hz, np.full(2, w), np.full(2, gain * w), counts, variance / abs(gain) ** 2, 0.0, 0j, counts.sum() - 2.0)
+        for hz, w, gain in zip(hertz, speed, g, strict=True)
+    )
+    problem = Likelihood(lines, Model(shaft), ViscousConstraint(23.5, 0.0, 1.0, 20.0), ())
+    whole, _ = problem.information(np.concatenate([m, phi]))
+    sure = np.array([0.0] * 6 + [0.5, 0.5, 0.0, 0.5, 0.0, 0.5, 0.0, 0.0])      # about the bounds of shares and shapes
+    whole += np.diag(np.where(sure > 0.0, 1.0 / np.maximum(sure, 1e-9) ** 2, 0.0))
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    return float(np.sqrt(np.linalg.inv(whole * np.outer(scale, scale))[0, 0]) * scale[0])
+
+
+def test_with_a_string_a_fixed_wish_rules_and_too_little_time_leaves_the_usual_choice():
+    known, wish = hung(frequency_hz=0.2)
+    assert choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95).plan == make_plan(STRING_LIMITS, STRING_GUESS, wish)
+    known, wish = hung()
+    plan = choose(STRING_LIMITS, STRING_GUESS, wish, known, 0.95, 120.0).plan
+    assert plan.duration_s <= 120.0
+
+
+def test_a_string_s_tolerance_keeps_its_lines_and_promises_nothing():
+    known, _ = hung()
+    planned = plan_acquisition(ExcitationRequest(tolerance=0.01), "torque", STRING_LIMITS, STRING_GUESS, known, 900.0)
+    assert planned.plan.segments[0].reference.lines_hz[0] == pytest.approx(0.08)
+    assert math.isnan(planned.half_width)
+    assert "not predicted" in planned.said()
+
+
+def test_where_braking_can_t_be_had_the_motion_asks_for_none():
+    bitten = RigGuess(1950.0, 50.0, 1000.0, STRING_ERROR)
+    free, held = (make_plan(limits, bitten, ExcitationWish(offsets_rad_s=(4.0, 6.0)))
+                  for limits in (STRING_LIMITS, replace(STRING_LIMITS, least_torque_nm=1000.0)))
+    assert free.torque_min_nm < 1000.0
+    assert held.torque_min_nm == pytest.approx(1000.0)
 
 
 def test_longer_at_the_last_mean_speed_alone():

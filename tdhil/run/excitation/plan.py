@@ -252,6 +252,8 @@ class _Fit:
             ((usable - steady) / (self.torque_up * torque_factor), "torque limit"),
             ((usable + steady) / (self.torque_down * torque_factor), "torque limit"),
         ]
+        if self.mode == "torque":
+            candidates.append(((steady - self.limits.least_torque_nm) / self.torque_down, "no braking torque"))
         candidates.append((self.ramp_room, f"the drive's speed ramp ({self.limits.acceleration_rad_s2:.3g} rad/s²)"))
         most = min(candidates, key=lambda candidate: candidate[0])
         if self.mode == "speed" or self._never_backwards(offset_rad_s, most[0]):

@@ -62,7 +62,8 @@ class MotionLimits:
 
     ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
     what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
-    lets through, where it was seen to hold the shaft back (speed mode only).
+    lets through, where it was seen to hold the shaft back (speed mode only). ``least_torque_nm``: a torque mode's
+    torque stays above it, where braking can't be had.
     """
 
     speed_low_rad_s: float
@@ -70,6 +71,7 @@ class MotionLimits:
     torque_limit_nm: float
     foresight_s: float = 0.0
     acceleration_rad_s2: float = math.inf
+    least_torque_nm: float = -math.inf
 
     def __post_init__(self) -> None:
         values = (self.speed_low_rad_s, self.speed_high_rad_s, self.torque_limit_nm)
