@@ -93,7 +93,7 @@ def decide(recording: Recording, rule: Stopping, plan: Plan, left_s: float, look
             limit = min(limit, math.floor(MOST_BEHIND * found.periods / at + 1e-6))
         return min(limit, max(least, wanted)), f"more periods {where}"
 
-    found = looked(seen)
+    found = None if rule.by_interval else looked(seen)
     if found is None:
         return _by_interval_alone(recording, rule, counted / segments, room, seen)
     asked, now = f"±{100.0 * rule.tolerance:.3g} %", f"±{100.0 * found.half_width_now:.3g} %"

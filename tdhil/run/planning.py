@@ -65,13 +65,11 @@ class Planned:
 
     def said(self) -> str:
         """One line for whoever watches."""
-        if math.isinf(self.half_width):
-            return NOTHING_TO_EXPECT
-        expected = NOT_PREDICTED
-        if math.isfinite(self.half_width):
-            noise = f"noise {self.known.noise.source}"
-            share = f"±{100.0 * self.half_width:.2g} %"
-            expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
+        if not math.isfinite(self.half_width):
+            return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
+        noise = f"noise {self.known.noise.source}"
+        share = f"±{100.0 * self.half_width:.2g} %"
+        expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
         if self.stopping is None or self.stopping.reachable:
             return expected
         return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"
@@ -227,6 +225,13 @@ def _swings(
 def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float) -> Planned:
     """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
     assert request.tolerance is not None
+    if math.isnan(chosen.half_width):     # a string: a rigid shaft's scatter says nothing of it, beforehand or behind
+        plan = chosen.plan
+        counted = plan.segments[0].periods - plan.segments[0].settle_periods
+        stopping = Stopping(
+            request.tolerance, request.confidence, pilot_dof(plan), counted, counted, allowed_s, True, by_interval=True
+        )
+        return Planned(plan, known, math.nan, math.nan, stopping, plan.duration_s)
     theta = known.theta(chosen.plan.guess)
     least = chosen.plan.with_counted(LEAST_COUNTED)
     evidence = predicted(least, theta, known.noise, known.prior)
@@ -249,8 +254,6 @@ def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, al
         advice="" if enough else _advice(evidence, working, request.tolerance, known),
     )
     after_pilot = plan.extension_s(periods - pilot) if periods > pilot else 0.0
-    if math.isnan(chosen.half_width):      # a rigid shaft's would be too good for a string
-        half = math.nan
     return Planned(plan, known, half, chosen.usual_half_width, stopping, plan.duration_s + after_pilot)
 
 

@@ -169,6 +169,13 @@ def test_what_the_scatter_can_t_judge_is_judged_by_its_interval(monkeypatch, int
     assert found.plain()["interval"] == (interval if np.isfinite(interval) else None)
 
 
+def test_of_a_string_a_rigid_shaft_s_scatter_is_not_asked(monkeypatch):
+    monkeypatch.setattr(enough_room, "look", lambda *_: pytest.fail("looked at"))
+    monkeypatch.setattr(enough_room, "interval_of", lambda *_: 0.009)
+    found = decide(recording(), replace(RULE, by_interval=True), PLAN, 900.0, 0, 0)
+    assert (found.periods, found.interval) == (0, 0.009)
+
+
 def test_what_the_scatter_says_is_missing_is_run_where_the_shaft_is(monkeypatch):
     monkeypatch.setattr(enough_room, "look", lambda *_: Look(12.0, 0.012, 1.3, 0.0095, True, at_last=True))
     found = decide(recording(), RULE, PLAN, 400.0, 0, 0)

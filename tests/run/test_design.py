@@ -234,6 +234,8 @@ def test_a_string_s_tolerance_keeps_its_lines_and_promises_nothing():
     planned = plan_acquisition(ExcitationRequest(tolerance=0.01), "torque", STRING_LIMITS, STRING_GUESS, known, 900.0)
     assert planned.plan.segments[0].reference.lines_hz[0] == pytest.approx(0.08)
     assert math.isnan(planned.half_width)
+    assert planned.stopping.by_interval
+    assert planned.plan == choose(STRING_LIMITS, STRING_GUESS, ExcitationWish(), known, 0.95).plan
     assert "not predicted" in planned.said()
 
 

@@ -67,6 +67,7 @@ class Stopping:
     """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
 
     ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
+    ``by_interval``: the scatter of a rigid shaft says nothing here, and the interval itself is looked at.
     """
 
     tolerance: float
@@ -77,6 +78,7 @@ class Stopping:
     allowed_s: float
     reachable: bool
     advice: str = ""
+    by_interval: bool = False
 
     def working(self, seen: int) -> float:
         """Of the interval that is looked at after ``seen`` others."""
