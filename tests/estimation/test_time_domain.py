@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tdhil.estimation import Options, ResidualTest, Verdict, identify
 from tdhil.estimation.frequency_domain import Fit
 from tdhil.estimation.samples import Samples, usable_samples
+from tdhil.estimation.time_domain import fit as fitting
 from tdhil.estimation.time_domain import solve as solving
-from tdhil.estimation.time_domain.equation import PARAMETERS, evaluate
+from tdhil.estimation.time_domain.equation import PARAMETERS, SPEED_LAG, TORQUE_LAG, evaluate
 from tdhil.estimation.time_domain.fit import search
 from tdhil.estimation.time_domain.solve import solve
 from tdhil.estimation.time_domain.taylor import flat_top
@@ -17,7 +19,7 @@ from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure,
 from tdhil.recording.recording import LagPrior
 from tdhil.studies.coverage import plants
 from tdhil.studies.coverage.simulate import simulate as simulate_plan
-from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Report, simulate
+from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, Machine, Reading, Report, simulate
 
 pytestmark = pytest.mark.one_worker
 
@@ -167,6 +169,54 @@ def test_where_the_wide_band_leaves_the_inertia_open_the_narrow_one_speaks(monke
     solved = solve(bins, placed, (), float(np.ptp(recording.torque_nm)), 0.95)
     assert solved.bins == len(narrow.problem.bins)
     assert solved.inertia.bounded
+
+
+def test_the_rounds_leave_a_place_without_lags(monkeypatch):
+    """A skew takes a short lag's delay back, so that descents stand still there: reversing ramps had been refused."""
+    recording = simulate(FIELD, "torque pulses", [3])[0]
+    bins = bins_of(recording)
+    right = search(bins, (), float(np.ptp(recording.torque_nm)))[-1]
+    noise = fitting.guessed(bins, 104.0)
+    every = replace(right.problem, bins=bins, variance=noise.variance)
+    keep = bins.hertz < 0.8
+    part = replace(every, bins=bins.chosen(keep), variance=noise.variance[keep])
+    without = fitting.minimise(part, right.fit.theta, {SPEED_LAG: 0.0, TORQUE_LAG: 0.0})
+    stuck = fitting.minimise(part, without.theta)
+    assert stuck.theta[SPEED_LAG] < 1e-3
+    assert stuck.theta[0] > 1.1 * 104.0
+    monkeypatch.setattr(fitting, "from_residuals", lambda *_: noise)
+    monkeypatch.setattr(fitting, "_CLEAR", 0.0)
+    monkeypatch.setattr(fitting, "_highest", lambda *_: 0.8)
+    settled = fitting._settled(every, keep, stuck, 1.2)
+    assert settled.fit.theta[SPEED_LAG] == pytest.approx(0.40, abs=0.1)
+    assert settled.fit.theta[0] == pytest.approx(104.0, rel=0.02)
+
+
+def test_a_slow_strong_load_is_no_scatter_over_time():
+    """It is at the lowest frequencies, which count for little; cut by blocks of time it had passed for twice
+    the noise's variance.
+    """
+    clean = simulate(quiet(FIELD), "torque pulses", [3], Reading(25.0))[0]
+    truth = np.zeros(PARAMETERS)
+    truth[:5], truth[7] = (104.0, 8.0, 0.40, 0.15, 0.0), 60.0
+    right = search(bins_of(clean), (), float(np.ptp(clean.torque_nm)))[-1]
+    keep = bins_of(clean).hertz < 1.0
+    rng, step, ratios, loads = np.random.default_rng(5), float(np.median(np.diff(clean.time_s))), [], []
+    keeps = np.exp(-step / 8.0)
+    for _ in range(8):
+        white = 12.0 * np.sqrt(1.0 - keeps**2) * rng.standard_normal(len(clean.time_s) + 5000)
+        load = lfilter([1.0], [1.0, -keeps], white)[5000:] + 2.0 * rng.standard_normal(len(clean.time_s))
+        loads.append(replace(clean, torque_nm=clean.torque_nm + load))
+    every = [bins_of(loaded).chosen(keep) for loaded in loads]
+    power = np.mean([np.abs(evaluate(truth, bins).error) ** 2 for bins in every], axis=0)
+    for loaded, bins in zip(loads, every, strict=True):
+        problem = replace(right.problem, bins=bins, variance=power, free=(0, 1, SPEED_LAG, 7))
+        spread, _ = fitting.covariance(problem, truth, problem.free)
+        direction = np.zeros(PARAMETERS)
+        direction[list(problem.free)] = spread[0]
+        scores = solving.block_scores(problem, windows_of(loaded), truth)
+        ratios.append(solving.sandwich(scores, direction).variance / spread[0, 0])
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.35)
 
 
 # -- coverage, a few seeds of many (the rest: benchmarks/record_route_coverage.py) ----------------------------

@@ -5,6 +5,7 @@ e²/v.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -229,6 +230,7 @@ def covariance(problem: Problem, theta: FloatArray, free: tuple[int, ...]) -> tu
 
 _STARTS = ((0.0, 0.0, 0.0), (0.40, 0.15, 0.0), (0.15, 0.40, 0.0), (0.1, 0.1, 0.0))
 _ROUNDS = 5
+_NO_LAG = 0.1            # rad at the highest frequency
 _CLEAR = 20.0            # power of what is explained over the residual's
 _NARROW = 0.05           # of the frequency: where excitation is lines, what stands beside one need not stand clear
 _PHASE, _WIDE_PHASE = 1.2, 3.0     # rad
@@ -289,11 +291,27 @@ def _settled(every: Problem, keep: BoolArray, fit: Fit, phase: float) -> Found |
             return None
         keep = stands & (bins.hertz <= _highest(_plain(problem, fit), bins.hertz[stands], phase))
         problem = _part(every, keep)
-        fit = minimise(problem, fit.theta)
+        fits = [minimise(problem, start) for start in _starts_from(problem, fit.theta)]
+        fit = min(fits, key=lambda one: one.objective)
     if unseen := _unseen_levels(problem, fit.theta):
         problem = replace(problem, free=tuple(index for index in problem.free if index not in unseen))
         fit = minimise(problem, _levelled(every, fit.theta, unseen))
     return Found(problem, fit, clear, keep)
+
+
+def _starts_from(problem: Problem, theta: FloatArray) -> Iterator[FloatArray]:
+    """Theta, and where it has no lag to speak of on one signal the first lags once more.
+
+    At no lag descents stand still, a minimum or not: the skew takes a short lag's delay back, and its square, which is
+    left, has no slope there. What the first guess of the noise led there, the noise that was found may lead away again.
+    """
+    yield theta
+    fastest = float(np.max(np.abs(problem.bins.s)))
+    if SKEW in problem.free and min(theta[SPEED_LAG], theta[TORQUE_LAG]) * fastest < _NO_LAG:
+        for lags in _STARTS[1:]:
+            start = theta.copy()
+            start[[SPEED_LAG, TORQUE_LAG, SKEW]] = lags
+            yield start
 
 
 def _unseen_levels(problem: Problem, theta: FloatArray) -> tuple[int, ...]:

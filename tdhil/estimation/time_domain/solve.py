@@ -14,7 +14,6 @@ from tdhil.estimation.frequency_domain import (
     student_quantile,
 )
 from tdhil.estimation.result import BudgetLine, Estimate, ResidualTest, doubtful
-from tdhil.estimation.samples import Samples
 from tdhil.estimation.time_domain.equation import (
     BACK,
     BEND,
@@ -29,8 +28,7 @@ from tdhil.estimation.time_domain.equation import (
     evaluate,
 )
 from tdhil.estimation.time_domain.fit import Found, Problem, covariance, minimise, search
-from tdhil.estimation.time_domain.taylor import flat_top, times
-from tdhil.estimation.time_domain.windows import Bins, Window, seen_through
+from tdhil.estimation.time_domain.windows import Bins, Window
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -83,19 +81,21 @@ def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTe
 # ---------------------------------------------------------------------------------------------------------------------
 # Is the scatter the same at all times? Errors of time stamps, rounding and friction come with the motion.
 #
-# The fit's score is a sum over test functions; cut by smooth blocks u_b that add up to one, φ = Σ_b u_b φ, it is a sum
-# over stretches of time too,
+# The fit's score is a sum over bins, and by Parseval one over time too: with ε and δ the signals whose lines are the
+# residuals e_m/√v_m and their slopes ∂e_m/√v_m,
 #
-#     g_b = Σ_m 2 Re(∂e_m* e_mb)/v_m,      Σ_b g_b = 0 at the best fit,
+#     Σ_m 2 Re(∂e_m* e_m)/v_m = 1/T ∫ δ ε dt = Σ_b g_b,      Σ_b g_b = 0 at the best fit,
 #
-# and Σ g_b g_bᵀ with its neighbours (weight ½) estimates the score's covariance whatever the noise does over time and
-# across frequencies: H⁻¹ (Σ …) H⁻¹ is the covariance of theta that needs no noise model ("sandwich").
+# g_b a block of time's share, and Σ g_b g_bᵀ with its neighbours (weight ½) estimates the score's covariance whatever
+# the noise does over time: H⁻¹ (Σ …) H⁻¹ is the covariance of theta that needs no noise that is alike at all times
+# ("sandwich"). Divided by √v both are about white. Were e itself cut by blocks, what a slow load leaves at the lowest
+# frequencies would spread over the others, where so much is not expected, and the sandwich come out several times too
+# large.
 
 
 _BLOCK_S = 4.0
 _BLOCKS = 40
 _LEAST_BLOCKS = 10
-_WHITE = 0.89         # γ₀ + γ₁ of overlapping blocks over the whole variance γ₀ + 2γ₁, for white noise
 
 
 @dataclass(frozen=True)
@@ -110,19 +110,23 @@ def block_scores(problem: Problem, placed: tuple[Window, ...], theta: FloatArray
     """g_b (blocks, 10), in the order of time."""
     total = sum(window.hop_s for window in placed)
     length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
-    whole = evaluate(theta, problem.bins)
-    weight = np.where(problem.bins.hertz > 0.0, 2.0, 1.0) / problem.variance
+    bins = problem.bins
+    whole = evaluate(theta, bins)
+    # the mean of a product of two real signals is half that of their lines, but at frequency zero
+    white = np.where(bins.hertz > 0.0, 2.0, 1.0) / np.sqrt(problem.variance)
+    both = np.column_stack([whole.error, whole.slopes]) * white[:, None]
     scores = []
     for window in placed:
-        mine = problem.bins.window == float(window.number)
+        mine = bins.window == float(window.number)
         if not np.any(mine):
             continue
-        own = problem.bins.chosen(mine)
-        pull = whole.slopes[mine].conj() * weight[mine, None]
-        for part, shape in _blocks(window, length):
-            error = evaluate(theta, seen_through(window, part, shape, own.s)).error
-            scores.append((pull * error[:, None]).real.sum(axis=0))
-    return np.array(scores).reshape(-1, len(theta))
+        turns = bins.hertz[mine] * window.hop_s
+        blocks = max(1, round(window.hop_s / length))
+        points = blocks * math.ceil((2.0 * float(turns.max()) + 1.0) / blocks)
+        signals = (np.exp(2j * math.pi / points * np.outer(np.arange(points), turns)) @ both[mine]).real
+        each = signals[:, 1:] * signals[:, :1] / points
+        scores.append(each.reshape(blocks, -1, len(theta)).sum(axis=1))
+    return np.concatenate(scores) if scores else np.zeros((0, len(theta)))
 
 
 def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
@@ -134,22 +138,7 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
     neighbours = float(each[1:] @ each[:-1])
     count = square**2 / max(float(np.sum(each**4)), 1e-300)
     # each block's share has lost what the fit took from it: about one part in their effective number
-    return Blocks(max(square + neighbours, 0.5 * square) / _WHITE * count / max(count - 1.0, 1.0), count)
-
-
-def _blocks(window: Window, length: float) -> list[tuple[Samples, FloatArray]]:
-    """The window cut by blocks, half of each shared with either neighbour."""
-    count = max(1, round(window.length_s / length))
-    hop = window.length_s / count
-    found = []
-    for number in range(count + 1):
-        begin, end = (number - 1) * hop, (number + 1) * hop
-        part = window.part(begin, end)
-        if len(part) < 3:
-            continue
-        time = part.time_s - window.start_s
-        found.append((part, times(flat_top(time - begin, 2.0 * hop, hop), window.shape(time))))
-    return found
+    return Blocks(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

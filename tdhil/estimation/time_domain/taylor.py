@@ -27,16 +27,6 @@ def flat_top(time: FloatArray, length: float, taper: float) -> FloatArray:
     return found
 
 
-def times(u: FloatArray, w: FloatArray) -> FloatArray:
-    """The product of two windows by Leibniz's rule, (N, 4)."""
-    return np.stack([
-        u[:, 0] * w[:, 0],
-        u[:, 1] * w[:, 0] + u[:, 0] * w[:, 1],
-        u[:, 2] * w[:, 0] + 2.0 * u[:, 1] * w[:, 1] + u[:, 0] * w[:, 2],
-        u[:, 3] * w[:, 0] + 3.0 * u[:, 2] * w[:, 1] + 3.0 * u[:, 1] * w[:, 2] + u[:, 0] * w[:, 3],
-    ], axis=1)
-
-
 def _smoothstep(x: FloatArray, length: float) -> FloatArray:
     inside = np.clip(x, 0.0, 1.0)
     return np.stack([slope(inside) / length**order for order, slope in enumerate(_SLOPES)], axis=1)
