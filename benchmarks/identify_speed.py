@@ -23,7 +23,7 @@ import numpy as np
 from tdhil.estimation import Options, identify
 from tdhil.recording.recording import Excitation, Recording, Segment
 
-MOST_FITS, MOST_RECORDS = 20.0, 3.0
+MOST_FITS, MOST_RECORDS = 10.0, 3.0
 PERIOD_S, OFFSETS = 20.0, (2.2, 5.0)
 LINES = (0.05, 0.1, 0.15, 0.25, 0.35, 0.5)
 AMPLITUDES = (0.25, 0.25, 0.25, 0.38, 0.33, 0.20)

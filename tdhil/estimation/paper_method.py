@@ -10,7 +10,7 @@ raw rate (difference of neighbouring samples, torque of the later one) noise and
 by 1 + var(noise of α)/var(α): it depends on the sampling rate, and collapses.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -28,32 +28,33 @@ Pairs = tuple[FloatArray, FloatArray]
 
 def paper_estimate(parts: tuple[Samples, ...]) -> PaperEstimate | None:
     """Both fits over all parts together; None if the speed never changes or there are too few steps."""
-    stepped = [_steps(part) for part in parts]
-    first = _fit_blocks(lambda: iter(stepped))
-    second = _fit_blocks(lambda: _raw(parts))
+    first, second = _fit_blocks(map(_steps, parts)), _fit_blocks(_raw(parts))
     return None if first is None or second is None else PaperEstimate(stepped=first, raw_rate=second)
 
 
-def _fit_blocks(blocks: Callable[[], Iterator[Pairs]]) -> LineFit | None:
-    """`line_fit` over blocks of (α, torque), which are made twice: once for the means, once for the moments.
+def _fit_blocks(blocks: Iterable[Pairs]) -> LineFit | None:
+    """`line_fit` over blocks of (α, torque), each seen once: moments about means, put together as Chan et al. do.
 
-    R² is (Σ a t)²/(Σ a² Σ t²), which is 1 − Σ (t − slope a)²/Σ t² at the least-squares slope.
+    With d the difference of two parts' means, the moments about the common one are those about their own plus
+    d² n₁ n₂/(n₁ + n₂). R² is (Σ a t)²/(Σ a² Σ t²), which is 1 − Σ (t − slope a)²/Σ t² at the least-squares slope.
     """
-    count, alpha_sum, torque_sum = 0, 0.0, 0.0
-    for alpha, torque in blocks():
-        count += len(alpha)
-        alpha_sum += float(np.sum(alpha))
-        torque_sum += float(np.sum(torque))
-    if count < 3:
-        return None
-    alpha_mean, torque_mean = alpha_sum / count, torque_sum / count
+    count, alpha_mean, torque_mean = 0, 0.0, 0.0
     power = cross = total = 0.0
-    for alpha, torque in blocks():
-        a, t = alpha - alpha_mean, torque - torque_mean
-        power += float(a @ a)
-        cross += float(a @ t)
-        total += float(t @ t)
-    if power <= 0.0 or not np.isfinite(power):
+    for alpha, torque in blocks:
+        own = len(alpha)
+        if own == 0:
+            continue
+        alpha_own, torque_own = float(np.mean(alpha)), float(np.mean(torque))
+        a, t = alpha - alpha_own, torque - torque_own
+        further_a, further_t, both = alpha_own - alpha_mean, torque_own - torque_mean, count + own
+        share = count * own / both
+        power += float(a @ a) + further_a * further_a * share
+        cross += float(a @ t) + further_a * further_t * share
+        total += float(t @ t) + further_t * further_t * share
+        alpha_mean += further_a * own / both
+        torque_mean += further_t * own / both
+        count = both
+    if count < 3 or power <= 0.0 or not np.isfinite(power):
         return None
     slope = cross / power
     r2 = slope * cross / total if total > 0.0 else 0.0

@@ -122,6 +122,7 @@ ComplexArray = NDArray[np.complex128]
 _SIGNIFICANT = 25.0       # |mean|² over its variance: a line less clear than 5 sd is not excited
 _BLOCK = 8192             # samples worked on at once
 _FLOOR = 1e-14            # relative variance below which scatter is rounding of the arithmetic
+_SAME = 4.0 * float(np.finfo(np.float64).eps)      # of a frequency: a sum of two that is the third
 
 
 @dataclass(frozen=True)
@@ -214,23 +215,36 @@ def _fit(period: Samples, start_s: float, lines_hz: tuple[float, ...]) -> tuple[
     count = len(lines_hz)
     time = period.time_s
     middle = 0.5 * (time[0] + time[-1])
-    omega = 2.0 * np.pi * np.asarray(lines_hz)
     # normal equations: the columns are nearly orthogonal, so nothing is lost and much time is won; in blocks, so that
     # a long period never stands in memory as a whole table
     normal, right = np.zeros((1 + 2 * count, 1 + 2 * count)), np.zeros((1 + 2 * count, 3))
     for first in range(0, len(time), _BLOCK):
         block = slice(first, first + _BLOCK)
-        angle = np.multiply.outer(time[block] - start_s, omega)
-        design = np.empty((len(angle), 1 + 2 * count))
+        turned = _turned(time[block] - start_s, lines_hz)
+        design = np.empty((turned.shape[1], 1 + 2 * count))
         design[:, 0] = 1.0
-        np.cos(angle, out=design[:, 1 : 1 + count])
-        np.sin(angle, out=design[:, 1 + count :])
+        design[:, 1 : 1 + count], design[:, 1 + count :] = turned.real.T, turned.imag.T
         signals = np.column_stack([period.speed_rad_s[block], period.torque_nm[block], time[block] - middle])
         normal += design.T @ design
         right += design.T @ signals
     solution = np.linalg.solve(normal, right)
     lines: ComplexArray = (solution[1 : 1 + count] - 1j * solution[1 + count :]).T
     return solution[0], lines
+
+
+def _turned(time_s: FloatArray, lines_hz: tuple[float, ...]) -> ComplexArray:
+    """e^(jωt) of every line, (K, N). A line at the sum of two before it is their product, ten times as quick."""
+    found: ComplexArray = np.empty((len(lines_hz), len(time_s)), dtype=np.complex128)
+    for k, hertz in enumerate(lines_hz):
+        pair = next(((a, b) for a in range(k) for b in range(a, k)
+                     if abs(lines_hz[a] + lines_hz[b] - hertz) <= _SAME * hertz), None)
+        if pair is not None:
+            np.multiply(found[pair[0]], found[pair[1]], out=found[k])
+        else:
+            angle = (2.0 * np.pi * hertz) * time_s
+            np.cos(angle, out=found[k].real)
+            np.sin(angle, out=found[k].imag)
+    return found
 
 
 def pooled_lines(

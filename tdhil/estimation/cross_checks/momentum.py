@@ -212,8 +212,10 @@ def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
         time, cells, longest = _cells(samples.time_s, part)
         if longest > _LONGEST_GAP_S:
             return None
-        weight = np.minimum((time - first.start_s) / first.length_s, (second.end_s - time) / second.length_s)
-        weight = np.clip(weight, 0.0, 1.0) * cells
+        weight = cells
+        if not first.end_s <= time[0] <= time[-1] <= second.start_s:
+            ramps = np.minimum((time - first.start_s) / first.length_s, (second.end_s - time) / second.length_s)
+            weight = np.clip(ramps, 0.0, 1.0) * cells
         totals += np.sum(weight), weight @ samples.speed_rad_s[part], weight @ samples.torque_nm[part]
     if None in readings or not float(totals[0]) > 0.0:
         return None
