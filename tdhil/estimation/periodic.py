@@ -147,7 +147,7 @@ def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
 def _settled(case: PeriodicCase) -> PeriodicCase:
     """The case without what a shaft that swings still does of its own (`transient`)."""
     slope = case.constraint.slope if case.constraint is not None else 0.0
-    every = settled_lines(case.fits, slope, case.levels.warming.own)
+    every = settled_lines(case.fits, case.stretches, slope, case.levels.warming.own)
     usable = usable_lines(every, _LEAST_NU)
     return replace(case, every=every, usable=usable) if usable else case
 

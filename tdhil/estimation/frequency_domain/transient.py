@@ -4,14 +4,16 @@ A string that an excitation sets swinging takes minutes to repeat itself: damped
 the lines of its tenth period still differ from those of its first by more than all noise. Left in, this is a bias that
 is the same in every line's mean, and a scatter that makes everything unsure.
 
-But it is no noise. What is left of a linear system's beginning dies away in its own modes, so that lines of one segment
-go from period to period as
+But it is no noise. What is left of a linear system's beginning dies away in its own modes, x(t) = Re a e^(σt), with σ
+shared by both signals and all segments, and a of each its own. A period that begins at t = pP has, in its line at
+ω = 2π n/P,
 
-    X_p = X + Σ_n A_n z_n^p,      z_n = e^(s_n P), |z_n| < 1,
+    X = (2/P) ∫ x e^(−jωt) dt = (1/P) {a e^(σpP) (e^(σP) − 1)/(σ − jω) + the same of σ*, a*},
 
-with z_n shared by all lines, both signals and all segments, and A_n of each alone. Given z_n, X and A_n are linear
-(variable projection), and X's covariance is that of the residuals times c = [(VᴴV)⁻¹]₀₀, V = (1, z_n^p): the mean of
-1/c periods. Modes are added one by one, as long as their parameters gain more than Schwarz's ln n each.
+and its net change, which is taken off the lines of speed as a ramp (`spectrum`), takes j/ω (1/P) {a e^(σpP) (e^(σP) −
+1) + …} off them, and B times that off those of torque. So all lines together tell the few a, also where a line lies so
+near a mode that it alone could not be told from it. Given σ, lines and a are linear (variable projection). Modes are
+added one by one, as long as they gain more than Schwarz's ln n for each of their parameters.
 """
 
 from __future__ import annotations
@@ -21,74 +23,140 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tdhil.estimation.samples import Stretch
 from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines, pooled_lines, torque_lines
 from tdhil.recording import FloatArray
 
-MOST_MODES = 2
-_LEAST_LEFT = 3              # periods of a segment, beyond what is fitted to them
-_SLOWEST = 0.9               # |z|: slower than this is drift, which ends of periods are corrected for
-_RADII = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
-_TURNS = 16
+MOST_MODES = 3
+_LEAST_PERIODS = 5
+_OF_A_MODE = 4               # real numbers in a segment: the a of speed and that of torque
+_PER_OCTAVE = 12
+_BEYOND = (0.3, 1.3)         # where modes are looked for, of the lowest and the highest line
+_DECAYS = (0.05, 0.15, 0.4, 1.0, 2.0)
+_LEAST_DECAY = 0.02          # of ln x over a period: what dies away slower is drift, which ends of periods correct for
+_STEPS = (0.2, 0.03)         # of the logarithm of a decay, of a frequency over the lowest line's: a descent's first
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class _Swing:
+    """The modes' share of a segment: ``left`` of the signals, (2, P, K), and how the lines' means depend on it.
+
+    ``mean`` (2, K): of the signals without it. ``uncertain`` (2, K): by how much the variance of a mean is larger for
+    it, in variances of one period; ``fitted`` (2, K): complex degrees of freedom that it takes.
+    """
+
+    left: ComplexArray
+    mean: ComplexArray
+    uncertain: FloatArray
+    fitted: FloatArray
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """Lines of P periods, speed beside torque, (P, 2K), each divided by its scatter; ``number`` (P,) of the periods."""
+    """Lines of P periods, speed and torque, (2, P, K), each divided by its scatter, (2, K)."""
 
-    values: ComplexArray
-    number: FloatArray
+    signals: ComplexArray
+    scatter: FloatArray
+    begin_s: FloatArray      # of its periods, (P,)
+    period_s: float
+    omega: FloatArray        # (K,)
+    viscous: float
 
-    def basis(self, modes: Sequence[complex]) -> ComplexArray:
-        """(P, 1 + modes)."""
-        constant = np.ones_like(self.number, dtype=np.complex128)
-        return np.stack([constant, *(mode**self.number for mode in modes)], axis=1)
+    def without(self, modes: Sequence[complex]) -> ComplexArray:
+        """What modes and means leave, (2, P, K)."""
+        return _centred(self.signals) if not modes else self._fitted(modes)[0]
 
-    def left(self, modes: Sequence[complex]) -> ComplexArray:
-        """(P, 2K): what the best of them leave."""
-        v = self.basis(modes)
-        q, _ = np.linalg.qr(v)
-        rest: ComplexArray = self.values - q @ (q.conj().T @ self.values)
-        return rest
+    def swing(self, modes: Sequence[complex]) -> _Swing:
+        """What the modes do here."""
+        left, amplitudes, inverse, columns = self._fitted(modes)
+        means, about = columns.mean(axis=1), _centred(columns)
+        variance = np.maximum(np.mean(np.abs(left) ** 2, axis=1), _ROUNDING)
+        parts = (about.real, about.imag)
+        middle = np.sum([np.einsum("ipkm,ik,ipkn->mn", part, 0.5 * variance, part) for part in parts], axis=0)
+        covariance = inverse @ middle @ inverse
+        at_mean = (means.real, means.imag)
+        uncertain = np.sum([np.einsum("ikm,mn,ikn->ik", part, covariance, part) for part in at_mean], axis=0)
+        fitted = np.sum([np.einsum("ipkm,mn,ipkn->ik", part, 0.5 * inverse, part) for part in parts], axis=0)
+        return _Swing(left, self.signals.mean(axis=1) - means @ amplitudes, uncertain / variance, fitted)
+
+    def _fitted(self, modes: Sequence[complex]) -> tuple[ComplexArray, FloatArray, FloatArray, ComplexArray]:
+        """What is left, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
+        columns = np.concatenate([self._columns(mode) for mode in modes], axis=-1)
+        about, signals = _centred(columns), _centred(self.signals)
+        size = about.shape[-1]
+        table, wanted = about.reshape(-1, size), signals.ravel()
+        normal = (table.conj().T @ table).real
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.inv(normal * np.outer(scale, scale) + _ROUNDING * np.eye(size)) * np.outer(scale, scale)
+        amplitudes: FloatArray = inverse @ (table.conj().T @ wanted).real
+        return signals - about @ amplitudes, amplitudes, inverse, columns
+
+    def _columns(self, mode: complex) -> ComplexArray:
+        """(2, P, K, 4): the lines of a mode of speed with a = 1 and a = j, then of torque."""
+        of_speed, of_torque, of_both = [], [], []
+        for sigma in (mode, mode.conjugate()):
+            change = np.exp(sigma * self.begin_s)[:, None] * (np.exp(sigma * self.period_s) - 1.0) / self.period_s
+            own, ramp = change / (sigma - 1j * self.omega), change * 1j / self.omega
+            of_speed.append(own - ramp)
+            of_both.append(-self.viscous * ramp)
+            of_torque.append(own)
+        nothing = np.zeros_like(of_torque[0])
+        turned = [((one + other), 1j * (one - other)) for one, other in (of_speed, of_both, of_torque)]
+        speed, both, torque = turned
+        table: ComplexArray = np.stack([
+            np.stack([*speed, nothing, nothing], axis=-1), np.stack([*both, *torque], axis=-1),
+        ])
+        return table / self.scatter[:, None, :, None]
+
+
+def _centred(values: ComplexArray) -> ComplexArray:
+    """About the mean over the periods."""
+    about: ComplexArray = values - values.mean(axis=1, keepdims=True)
+    return about
 
 
 def settled_lines(
-    fits: tuple[PeriodLines, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
+    fits: tuple[PeriodLines, ...], cut: tuple[Stretch, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
 ) -> tuple[Line, ...]:
-    """As `pooled_lines`, without what dies away; those very lines where nothing does."""
+    """As `pooled_lines`, without what dies away; those very lines where nothing does. ``fits`` of the stretches."""
     plain = pooled_lines(fits, viscous, warming_nm_s)
     rates = warming_nm_s or (0.0,) * len(fits)
-    if not fits or len({fit.lines_hz for fit in fits}) != 1 or min(len(fit.speed) for fit in fits) < _LEAST_LEFT + 2:
+    if not fits or len({fit.lines_hz for fit in fits}) != 1 or min(len(fit.speed) for fit in fits) < _LEAST_PERIODS:
         return plain
-    torques = [torque_lines(fit, viscous, rate) for fit, rate in zip(fits, rates, strict=True)]
-    segments = [_scaled(np.concatenate([fit.speed, torque], axis=1)) for fit, torque in zip(fits, torques, strict=True)]
+    segments = [
+        _segment(fit, torque_lines(fit, viscous, rate), stretch, viscous)
+        for fit, stretch, rate in zip(fits, cut, rates, strict=True)
+    ]
     modes = _modes(segments)
     if not modes:
         return plain
-    return tuple(
-        _line(hertz, column, fits, torques, segments, modes) for column, hertz in enumerate(fits[0].lines_hz)
+    swings = [segment.swing(modes) for segment in segments]
+    return tuple(_line(hertz, column, segments, swings, len(modes)) for column, hertz in enumerate(fits[0].lines_hz))
+
+
+def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: float) -> _Segment:
+    values = np.stack([fit.speed, torque])
+    scatter = np.sqrt(np.mean(np.abs(_centred(values[:, values.shape[1] // 2 :])) ** 2, axis=1))
+    scatter = np.maximum(scatter, _ROUNDING * np.max(np.abs(values), axis=(1, 2))[:, None])
+    period_s = stretch.segment.period_s
+    begin_s = period_s * (np.array(stretch.index, dtype=np.float64) - stretch.index[0])
+    return _Segment(
+        values / scatter[:, None, :], scatter, begin_s, period_s, 2.0 * np.pi * np.array(fit.lines_hz), viscous
     )
-
-
-def _scaled(values: ComplexArray) -> _Segment:
-    late = values[len(values) // 2 :]
-    scatter = np.sqrt(np.mean(np.abs(late - late.mean(axis=0)) ** 2, axis=0))
-    floor = 1e-12 * float(np.max(np.abs(values)))
-    return _Segment(values / np.maximum(scatter, floor), np.arange(len(values), dtype=np.float64))
 
 
 def _modes(segments: Sequence[_Segment]) -> tuple[complex, ...]:
     """Those that are worth their parameters."""
     found: tuple[complex, ...] = ()
     now = _misfit(segments, found)
-    numbers = 2.0 * sum(segment.values.size for segment in segments)
-    columns = sum(segment.values.shape[1] for segment in segments)
-    periods = min(len(segment.number) for segment in segments)
-    while len(found) < MOST_MODES and periods - len(found) - 2 >= _LEAST_LEFT:
-        more = _refined(segments, min(
-            ((*found, mode) for mode in _grid()), key=lambda modes: _misfit(segments, modes)
-        ))
+    numbers = 2.0 * sum(segment.signals.size for segment in segments)
+    price = (2.0 + _OF_A_MODE * len(segments)) * float(np.log(numbers))
+    grid = _grid(segments[0])
+    while len(found) < MOST_MODES:
+        more = _refined(segments, min(((*found, mode) for mode in grid), key=lambda modes: _misfit(segments, modes)))
         then = _misfit(segments, more)
-        if now - then <= (2.0 * columns + 2.0) * np.log(numbers):
+        if now - then <= price:
             break
         found, now = more, then
     return found
@@ -98,54 +166,60 @@ def _misfit(segments: Sequence[_Segment], modes: Sequence[complex]) -> float:
     """−2 ln L with every line's variance concentrated out, but for a constant."""
     total = 0.0
     for segment in segments:
-        squares = np.mean(np.abs(segment.left(modes)) ** 2, axis=0)
-        total += 2.0 * len(segment.number) * float(np.sum(np.log(np.maximum(squares, 1e-20))))
+        left = segment.without(modes)
+        squares = np.mean(np.abs(left) ** 2, axis=1)
+        total += 2.0 * left.shape[1] * float(np.sum(np.log(np.maximum(squares, 1e-20))))
     return total
 
 
-def _grid() -> list[complex]:
-    return [complex(radius * np.exp(2j * np.pi * turn / _TURNS)) for radius in _RADII for turn in range(_TURNS)]
+def _grid(segment: _Segment) -> list[complex]:
+    low, high = _BEYOND[0] * segment.omega.min(), _BEYOND[1] * segment.omega.max()
+    turns = np.geomspace(low, high, round(_PER_OCTAVE * np.log2(high / low)))
+    return [complex(-decay / segment.period_s, turn) for turn in turns for decay in _DECAYS]
 
 
 def _refined(segments: Sequence[_Segment], modes: tuple[complex, ...]) -> tuple[complex, ...]:
     from scipy.optimize import minimize
 
+    period_s, omega = segments[0].period_s, float(segments[0].omega.min())
+
     def unpacked(x: FloatArray) -> tuple[complex, ...]:
-        z = x[0::2] + 1j * x[1::2]
-        size = np.abs(z)
-        return tuple(complex(one) for one in z * np.minimum(1.0, _SLOWEST / np.maximum(size, 1e-9)))
+        return tuple(
+            complex(-(_LEAST_DECAY + np.exp(decay)) / period_s, turn * omega)
+            for decay, turn in zip(x[0::2], x[1::2], strict=True)
+        )
 
     def misfit(x: FloatArray) -> float:
         return _misfit(segments, unpacked(x))
 
-    start = np.array([part for mode in modes for part in (mode.real, mode.imag)])
+    start = np.array([part for mode in modes for part in (
+        float(np.log(max(-mode.real * period_s - _LEAST_DECAY, 1e-3))), mode.imag / omega
+    )])
+    simplex = np.vstack([start, start + np.diag(np.tile(_STEPS, len(modes)))])
     best = minimize(
         misfit, start, method="Nelder-Mead",
-        options={"xatol": 1e-4, "fatol": 1e-3, "maxiter": 200 * len(start)},
+        options={"xatol": 1e-4, "fatol": 1e-3, "maxiter": 200 * len(start), "initial_simplex": simplex},
     )
     return unpacked(np.asarray(best.x, dtype=np.float64))
 
 
 def _line(
-    hertz: float, column: int, fits: Sequence[PeriodLines], torques: Sequence[ComplexArray],
-    segments: Sequence[_Segment], modes: tuple[complex, ...],
+    hertz: float, column: int, segments: Sequence[_Segment], swings: Sequence[_Swing], modes: int
 ) -> Line:
-    nu = s_ww = s_tt = 0.0
-    s_tw = 0.0 + 0.0j
-    speeds, means, counts = [], [], []
-    for fit, torque, segment in zip(fits, torques, segments, strict=True):
-        v = segment.basis(modes)
-        inverse = np.linalg.inv(v.conj().T @ v)
-        both = np.stack([fit.speed[:, column], torque[:, column]], axis=1)
-        solved = inverse @ (v.conj().T @ both)
-        left = both - v @ solved
-        nu += len(v) - v.shape[1]
-        s_ww += float(np.sum(np.abs(left[:, 0]) ** 2))
-        s_tt += float(np.sum(np.abs(left[:, 1]) ** 2))
-        s_tw += complex(np.sum(left[:, 1] * left[:, 0].conj()))
-        speeds.append(solved[0, 0])
-        means.append(solved[0, 1])
-        counts.append(1.0 / float(inverse[0, 0].real))
-    # z is fitted as well: two real numbers a mode, shared by all lines and both signals.
-    nu = max(1.0, nu - len(modes) / (2.0 * len(fits[0].lines_hz)))
-    return Line(hertz, np.array(speeds), np.array(means), np.array(counts), s_ww / nu, s_tt / nu, s_tw / nu, nu)
+    nu, means, counts = 0.0, [], []
+    scatter = np.zeros((2, 2), dtype=np.complex128)
+    for segment, swing in zip(segments, swings, strict=True):
+        periods, size = len(segment.begin_s), segment.scatter[:, column]
+        left = swing.left[:, :, column] * size[:, None]
+        scatter += left @ left.conj().T
+        means.append(swing.mean[:, column] * size)
+        counts.append(1.0 / (1.0 / periods + float(np.max(swing.uncertain[:, column]))))
+        nu += periods - 1.0 - float(np.max(swing.fitted[:, column]))
+    # σ is fitted as well: two real numbers a mode, shared by all lines and both signals.
+    nu = max(1.0, nu - modes / (2.0 * len(segments[0].omega)))
+    speed, torque = np.array(means).T
+    covariance = scatter / nu
+    return Line(
+        hertz, speed, torque, np.array(counts), float(covariance[0, 0].real), float(covariance[1, 1].real),
+        complex(covariance[1, 0]), nu,
+    )
