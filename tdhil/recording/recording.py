@@ -180,6 +180,7 @@ class Recording:
     stepped_setpoint: SteppedSetpoint | None = None     # in speed mode
     impedance: ImpedanceInput | None = None             # where the drive's own impedance was measured
     torque_answer: TorqueAnswer | None = None           # in torque mode, where it was looked at
+    winds_up: bool = False                 # a load that winds up hangs on the shaft, as rig.yaml says (load: string)
     pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did

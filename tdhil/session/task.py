@@ -156,6 +156,7 @@ def facts(bench: Rig) -> dict[str, Any]:
         "gear_ratio": bench.gear.ratio,
         "torque_scale_rel_sd": ASSUMED_TORQUE_SCALE_REL_SD if scale is None else scale,
         "lag_prior": lag_prior(bench),
+        "winds_up": bench.load.kind == "string",
         "pipe": pipe_of(bench),
     }
 

@@ -43,6 +43,13 @@ def test_the_clock_may_start_anywhere(plain, shift):
     assert found.paper.stepped.inertia_kg_m2 == pytest.approx(plain.paper.stepped.inertia_kg_m2, rel=5e-3)
 
 
+def test_of_a_string_that_is_not_seen_a_rigid_shafts_inertia_is_said_to_be_of_all_that_turns(plain):
+    found = identify(replace(closed_form(), winds_up=True))
+    assert found.inertia == plain.inertia
+    assert set(found.warnings) - set(plain.warnings) == {warning for warning in found.warnings if "together" in warning}
+    assert len(found.warnings) == len(plain.warnings) + 1
+
+
 def test_rotation_may_be_either_way(plain):
     recording = closed_form()
     found = identify(replace(recording, speed_rad_s=-recording.speed_rad_s, torque_nm=-recording.torque_nm))

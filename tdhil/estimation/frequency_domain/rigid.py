@@ -284,7 +284,7 @@ def rigid_finding(
     as_paper = not shaft_model(case.options.model).lags
     lines = fitted_points(result.fitted, case.options.confidence)
     bare = Finding(case.options.model if as_paper else RIGID, _words(result, as_paper, what), result.residual,
-                   lines=lines, warnings=_caveats(result, as_paper))
+                   lines=lines, warnings=_caveats(result, as_paper, case.recording.winds_up))
     if bare.rejected:
         return bare
     found = replace(bare, inertia=result.inertia, conditions=_conditions(result, case), viscous_nm_s_rad=result.viscous,
@@ -338,8 +338,11 @@ def of_reports(prior: LagPrior) -> list[str]:
     return found
 
 
-def _caveats(result: RigidResult, as_paper: bool) -> tuple[str, ...]:
+def _caveats(result: RigidResult, as_paper: bool, winds_up: bool) -> tuple[str, ...]:
     found = []
+    if winds_up:
+        found.append("the rig's load is a string, but at these lines all turns as one: J is that of motor, string and "
+                     "what hangs below it together, not the motor's alone")
     if result.fitted.problem.constraint is None:
         found.append("only one mean speed: viscous friction rests on the lines, not on levels")
     if not as_paper and not result.first_order:
