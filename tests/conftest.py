@@ -12,6 +12,8 @@ And Ctrl-C as usual: a shell that starts the tests in the background has it igno
 Nothing that collection makes is garbage: it is looked through for some neither while it is made (a fifth of the time
 that this takes) nor ever after. And what is compiled is kept, for the programs that are started by the hundred: where
 the environment forbids it (PYTHONDONTWRITEBYTECODE), each of them would compile all of ours anew.
+
+Linear algebra has one thread: beside another worker of pytest two of them wait for each other, for twice the time.
 """
 
 import gc
@@ -33,6 +35,9 @@ settings.load_profile("fuzz" if os.environ.get("TDHIL_FUZZ") else "same")
 
 if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+for library in ("OPENBLAS", "OMP", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")        # numpy asks when it is imported, which nobody has yet
 
 gc.disable()        # until everything is collected
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
