@@ -250,7 +250,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
             where="load.length_m in rig.yaml",
             next_step="Use --excitation multisine",
         )
-    if limits.load != "string":
+    if not limits.winds_up:
         return
     if not excitation_kind(request.kind).with_string:
         raise PreflightRefused(
@@ -271,7 +271,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
 def refuse_with_string(limits: MachineLimits, request: ExcitationRequest, preflight: Preflight) -> None:
     """PreflightRefused where torque could be lost while a string is wound up, or a string is missed."""
     refuse_by_plan(limits, request, lets_go=False)      # the drive itself is asked, after its watchdog
-    if limits.load != "string":
+    if not limits.winds_up:
         return
     if not preflight.watched:
         raise PreflightRefused(

@@ -290,7 +290,7 @@ class Runner:
                 limits.speed_max_rad_s, limits.torque_nm, limits.quick_stop_rad_s2, limits.watchdog_s,
                 limits.accept_no_watchdog, limits.accept_wider, limits.accept_shared_watchdog,
                 limits.temperature_c,
-                string=limits.load == "string",
+                string=limits.winds_up,
                 torque_offset=task.request.impedance == "offset"
                 or (task.evaluation is not None and task.evaluation.own_loop),
             )

@@ -30,6 +30,11 @@ class MachineLimits:
     accept_speed_unit: bool = False    # the operator takes the profile's unit of speed unseen (--accept-speed-unit)
     accept_wider: frozenset[str] = frozenset()     # own limits of the drive that the operator lets the run widen
 
+    @property
+    def winds_up(self) -> bool:
+        """Does a drill string hang on the shaft?"""
+        return self.load == "string"
+
 
 @dataclass(frozen=True)
 class ExcitationRequest:

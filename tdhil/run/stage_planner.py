@@ -65,7 +65,7 @@ class StagePlanner:
         theta = Knowledge(assumed, prior).theta(model)
 
         work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
-                       left_s, limits.load == "string")
+                       left_s, limits.winds_up)
         try:
             planned = loop.compute(work, keep)
         except PlanRefused as error:
@@ -141,10 +141,10 @@ def _reckon(
     theta: FloatArray,
     course: Course | None,
     left_s: float,
-    swings: bool,
+    winds_up: bool,
 ) -> Planned:
     """The arithmetic: plain data in and out, so that it can be done anywhere."""
-    known = Knowledge(measured_noise(steady, theta, assumed), prior, swings)
+    known = Knowledge(measured_noise(steady, theta, assumed), prior, winds_up)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)
     seen, within = as_followed(model, room, course, known.speed_lag_s)

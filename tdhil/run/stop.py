@@ -230,7 +230,7 @@ class StopSequence:
         self._quick_stop_in_torque_mode = quick_stop_in_torque_mode
         self._watched = watched
         self._string = None
-        if limits.load == "string":
+        if limits.winds_up:
             self._string = StringReleaseLimits(
                 torque_nm=limits.torque_nm,
                 speed_rad_s=limits.speed_max_rad_s,

@@ -141,7 +141,7 @@ def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tu
     guess, figures = _guess(bench, limits)
     stated = bench.expected.load_noise_nm
     noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
-    known = Knowledge(noise, lag_prior(bench), limits.load == "string")
+    known = Knowledge(noise, lag_prior(bench), limits.winds_up)
     return guess, known, (
         *figures,
         Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),

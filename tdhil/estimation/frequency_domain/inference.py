@@ -147,14 +147,18 @@ def profile_edge(
     bound = float(limits.high[index] if step > 0.0 else limits.low[index])
     inside, inside_root, inside_theta = centre, 0.0, best.theta
     outside: tuple[float, float] | None = None
+
+    def root_of(fit: Fit) -> float:
+        return math.sqrt(max(fit.objective - best.objective, 0.0))
+
     x = centre + step
     for _ in range(_TRIES):
         x = min(x, bound) if step > 0.0 else max(x, bound)
         fit = refit(inside_theta, x)
-        root = math.sqrt(max(fit.objective - best.objective, 0.0))
+        root = root_of(fit)
         if root >= (1.0 - _CLOSE) * target:
             fit = lowest([fit, *(refit(start, x) for start in two_poles(fit.theta, shapes))])
-            root = math.sqrt(max(fit.objective - best.objective, 0.0))
+            root = root_of(fit)
         if abs(root - target) <= _CLOSE * target:
             return x
         if root < target:

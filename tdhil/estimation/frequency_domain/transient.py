@@ -102,8 +102,7 @@ class _Segment:
             of_both.append(-self.viscous * ramp)
             of_torque.append(own)
         nothing = np.zeros_like(of_torque[0])
-        turned = [((one + other), 1j * (one - other)) for one, other in (of_speed, of_both, of_torque)]
-        speed, both, torque = turned
+        speed, both, torque = ((one + other, 1j * (one - other)) for one, other in (of_speed, of_both, of_torque))
         table: ComplexArray = np.stack([
             np.stack([*speed, nothing, nothing], axis=-1), np.stack([*both, *torque], axis=-1),
         ])

@@ -147,7 +147,7 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
 # The profile P(x) = min over all other parameters of −2 ln L, the filters' shapes κ among them, follows the valley in
 # which inertia and lags make up for each other. The interval is {x: P(x) ≤ P_min + (i t)²}: t is Student's quantile
 # for as many degrees of freedom as the scatter was measured with, i ≥ 1 how much more the parameter scatters over
-# time than the noise model says (`moments`).
+# time than the noise model says (`sandwich`).
 
 
 _LEAST_DOF = 3.0
@@ -168,7 +168,7 @@ class Spread:
 
 
 def spread(problem: Problem, fit: Fit, scores: FloatArray, index: int, confidence: float) -> Spread:
-    """How uncertain a parameter is; ``scores`` of the blocks of time at this fit (`moments`)."""
+    """How uncertain a parameter is; ``scores`` of the blocks of time at this fit (`block_scores`)."""
     found, _ = covariance(problem, fit.theta, problem.free)
     at = problem.free.index(index)
     sd = math.sqrt(max(float(found[at, at]), 0.0))

@@ -217,7 +217,7 @@ class Knowledge:
 
     noise: Noise
     prior: LagPrior
-    swings: bool = False      # a drill string hangs on the shaft
+    winds_up: bool = False    # a drill string hangs on the shaft
 
     def theta(self, guess: RigGuess) -> FloatArray:
         """The rigid model's parameters to be reckoned with, (8,)."""
@@ -272,7 +272,7 @@ def choose(
         found = width(usual)
         return Choice(usual, found, found)
     allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
-    if known.swings:
+    if known.winds_up:
         try:
             return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
         except PlanRefused:        # too long for the time there is, say
@@ -311,10 +311,10 @@ def choose_soonest(
     """The plan that is expected to meet a tolerance soonest if extended as it needs, with as few periods as may be.
 
     None where no candidate fits into ``time_s``, what the user fixes leaves nothing to choose, or a string asks for
-    lines of its own. As in `choose` the
-    information matrix picks for each slope, and the estimator's own interval has the last word.
+    lines of its own. As in `choose` the information matrix picks for each slope, and the estimator's own interval has
+    the last word.
     """
-    if _fixed(wish) or known.swings:
+    if _fixed(wish) or known.winds_up:
         return None
     theta, wish = known.theta(guess), replace(wish, settle_s=SETTLE_SOON_S)
     rated: list[tuple[float, int, Plan]] = []

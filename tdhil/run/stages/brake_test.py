@@ -197,7 +197,7 @@ def plan_pulse(
 
 def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, period_s: float) -> int:
     """Cycles of a ramp down or up, none without a string; both, and a cycle between, take ``longest_s`` at most."""
-    if limits.load != "string":
+    if not limits.winds_up:
         return 0
     wanted_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
     room = (_whole(longest_s, period_s) - 1) // 2
@@ -331,7 +331,7 @@ def slow_down(
         loop.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
     command = Command(Mode.SPEED, target, 0.0)
     tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
-    if limits.load == "string":
+    if limits.winds_up:
         calmed = calm_string(loop, limits, target, tolerance)
         return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if calmed.swing.restless(limits) else CALM_S) :])
     loop.hold(command, assumptions.largest_speed_lag_s)
@@ -352,7 +352,7 @@ def probe_braking(
     samples: list[Sample] = []
     unclear = ""
     # Under speed control the torque shows what the string does; behind the switch it is what is commanded.
-    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.load == "string" else 0.0
+    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.winds_up else 0.0
     steady = steady[-loop.cycles(STEADY_S) :]
     for _ in range(TRIES):
         noise = speed_noise_rad_s(steady, speed_resolution_rad_s)

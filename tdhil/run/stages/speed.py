@@ -131,7 +131,7 @@ def run_speed(
     unit_check.ramp(speed_now, low_rad_s, rate)
     low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, unit_check.level).level
     unit_check.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
-    good_enough = STRING_ERROR if limits.load == "string" else GOOD_ENOUGH
+    good_enough = STRING_ERROR if limits.winds_up else GOOD_ENOUGH
     for _ in range(TRIES):
         ramped = _ramp(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
@@ -140,7 +140,7 @@ def run_speed(
         moved = trace([*low_samples, *between, *high_samples])
         rough = rough_inertia(
             moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level,
-            swinging=limits.load == "string",
+            swinging=limits.winds_up,
         )
         if rough is not None and rough.rel_error <= good_enough:
             break
@@ -160,7 +160,7 @@ def run_speed(
         raise DriveFault(
             f"no plausible inertia could be read off the speed ramp ({found})",
             where="stage speed",
-            next_step=_TOO_RESTLESS if limits.load == "string" else _WRONG_TORQUE,
+            next_step=_TOO_RESTLESS if limits.winds_up else _WRONG_TORQUE,
         )
     if high_held.swing is not None:
         loop.guard.disturbed = high_held.swing.told
@@ -256,7 +256,7 @@ def _settle_and_hold(
 ) -> _Held:
     """Settle, let the reporting lags run out, then the level. The top of a drill string yields all the while."""
     lags_s = 2.0 * assumptions.largest_speed_lag_s
-    if limits.load == "string":
+    if limits.winds_up:
         calmed = calm_string(loop, limits, speed_rad_s, tolerance_rad_s)
         later, asked_later = hold_damped(loop, calmed.damper, lags_s)
         before_level()
