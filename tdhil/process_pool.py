@@ -45,8 +45,10 @@ _KILLS: Final = 5
 _ASK_S: Final = 0.2             # how often somebody is asked whether to stop
 _START_S: Final = 60.0          # a process may take to begin, on a machine that is busy
 _STARTS: Final = 3              # processes in a row that end before they take a task: something is wrong with all
-_ALONE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""One core a process; and sums are added in the same order whatever the machine, so that rows are the same."""
+ONE_CORE: Final = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Environment of a process beside others: one core for linear algebra, so that sums are added in the same order on any
+machine, and rows are the same.
+"""
 
 
 @dataclass(frozen=True)
@@ -197,7 +199,7 @@ class _Worker:
         group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _PROGRAM.format(path=sys.path, memory=limits.memory_bytes)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | _ALONE, **group,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | ONE_CORE, **group,
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None

@@ -9,6 +9,7 @@ it is killed.
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from threading import Event, Lock, Thread
 from typing import IO, Any, Generic, TypeVar
+
+from tdhil.process_pool import ONE_CORE
 
 T = TypeVar("T")
 
@@ -55,7 +58,8 @@ class Reckoner:
         self._answering = Lock()
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", program],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **_out_of_the_way(),
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            env=os.environ | ONE_CORE, **_out_of_the_way(),      # the other cores are the control loop's
         )
         assert self._process.stdin is not None
         assert self._process.stdout is not None

@@ -121,6 +121,12 @@ def test_the_plan_is_the_one_that_a_thread_makes(world, reckoner, monkeypatch, w
     assert pickle.dumps(there.plan.segments) == pickle.dumps(here.plan.segments)
 
 
+def test_its_linear_algebra_keeps_to_one_core_so_that_the_control_loop_has_the_others(monkeypatch, request):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    reckoner = request.getfixturevalue("reckoner")      # begins now
+    assert reckoner.ask(functools.partial(os.getenv, "OPENBLAS_NUM_THREADS")) == "1"
+
+
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
 def test_where_it_dies_in_the_midst_of_work_a_thread_does_it_and_the_log_says_so(live, tmp_path, end):
     begun = tmp_path / "begun"
