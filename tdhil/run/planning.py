@@ -12,6 +12,7 @@ from typing import Any
 
 from tdhil.run.design import (
     MARGIN,
+    SOON_COUNTED,
     Choice,
     Evidence,
     Knowledge,
@@ -132,11 +133,11 @@ def plan_acquisition(
         chosen = choose(limits, guess, wish, known, request.confidence, allowed_s)
     planned = _with_pilot(request, chosen, known, allowed_s)
     assert request.tolerance is not None
-    working = interval_confidence(request.confidence, pilot_dof(chosen.plan.with_counted(LEAST_COUNTED)), 0)
+    working = interval_confidence(request.confidence, pilot_dof(chosen.plan.with_counted(min(SOON_COUNTED))), 0)
     soonest = choose_soonest(limits, guess, wish, known, working, request.tolerance / MARGIN, allowed_s)
     if soonest is None:
         return planned
-    sooner = _with_pilot(request, replace(chosen, plan=soonest), known, allowed_s)
+    sooner = _with_pilot(request, replace(chosen, plan=soonest), known, allowed_s, soonest.counted)
     return sooner if sooner.stopping is not None and sooner.stopping.reachable else planned
 
 
@@ -222,26 +223,28 @@ def _swings(
     return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
 
 
-def _with_pilot(request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float) -> Planned:
+def _with_pilot(
+    request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float, fewest: int = LEAST_COUNTED
+) -> Planned:
     """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
     assert request.tolerance is not None
     if math.isnan(chosen.half_width):     # a string: a rigid shaft's scatter says nothing of it, beforehand or behind
         plan = chosen.plan
-        counted = plan.segments[0].periods - plan.segments[0].settle_periods
         stopping = Stopping(
-            request.tolerance, request.confidence, pilot_dof(plan), counted, counted, allowed_s, True, by_interval=True
+            request.tolerance, request.confidence, pilot_dof(plan), plan.counted, plan.counted, allowed_s, True,
+            by_interval=True,
         )
         return Planned(plan, known, math.nan, math.nan, stopping, plan.duration_s)
     theta = known.theta(chosen.plan.guess)
-    least = chosen.plan.with_counted(LEAST_COUNTED)
+    least = chosen.plan.with_counted(fewest)
     evidence = predicted(least, theta, known.noise, known.prior)
     working = interval_confidence(request.confidence, pilot_dof(least), 0)
-    most = max(LEAST_COUNTED, counted_in(chosen.plan, allowed_s))
+    most = max(fewest, counted_in(chosen.plan, allowed_s))
     scale, half, enough = least_scale(
-        lambda times: half_width(longer(evidence, times), working), request.tolerance / MARGIN, most / LEAST_COUNTED
+        lambda times: half_width(longer(evidence, times), working), request.tolerance / MARGIN, most / fewest
     )
-    periods = min(most, math.ceil(scale * LEAST_COUNTED - 1e-6))
-    pilot = max(LEAST_COUNTED, math.floor(_PILOT_SHARE * periods))
+    periods = min(most, math.ceil(scale * fewest - 1e-6))
+    pilot = max(fewest, math.floor(_PILOT_SHARE * periods))
     plan = chosen.plan.with_counted(pilot)
     stopping = Stopping(
         tolerance=request.tolerance,

@@ -1,8 +1,8 @@
 """What to ask of the shaft: lines, amplitudes, mean speeds and periods for the tightest interval, and when to stop."""
 
 from tdhil.run.design.choice import (
-    Choice as Choice, Knowledge as Knowledge, choose as choose, choose_soonest as choose_soonest,
-    refuse_unfit as refuse_unfit,
+    SOON_COUNTED as SOON_COUNTED, Choice as Choice, Knowledge as Knowledge, choose as choose,
+    choose_soonest as choose_soonest, refuse_unfit as refuse_unfit,
 )
 from tdhil.run.design.prediction import (
     Evidence as Evidence, Noise as Noise, assumed_noise as assumed_noise,

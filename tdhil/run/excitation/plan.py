@@ -161,6 +161,11 @@ class Plan:
             return np.ones(len(hertz), dtype=np.complex128)
         return following.shaft(hertz)
 
+    @property
+    def counted(self) -> int:
+        """Periods that count at each mean speed."""
+        return self.segments[0].periods - self.segments[0].settle_periods
+
     def with_counted(self, periods: int) -> "Plan":
         """The same motion with so many periods that count at each mean speed, settling on top."""
         segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
