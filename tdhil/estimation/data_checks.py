@@ -24,7 +24,8 @@ from tdhil.recording import Excitation, FloatArray, Recording, Segment
 # tenth if the crest has a dip of just a step. Noise of the size of q thins the last step out to less than the one
 # before. So, where samples near the top wobble by noise, or leave it steeply, three times the share of the step below
 # is suspect; where they don't, twenty times. A top cut off by less than that is cut off by less than about a step, or
-# in the noise: it bends nothing.
+# in the noise: it bends nothing. Nor does one that lasts for a sample or two each time: where there are few samples in
+# a period, at the same instants in each, the crest is as many times at one value as there are periods.
 
 
 LIMIT_SHARE = 0.005       # of the excited samples that may be at a limit: they bend the line fit by about as much
@@ -34,6 +35,8 @@ _NOISY_RATIO, _SMOOTH_RATIO = 3.0, 20.0
 _NOISY = 0.8              # steps of second difference on the mean, of the samples that are so many steps from the top:
 _NEAR = 4.5               # a slow crest's are a step or none
 _PILE = 0.01              # share at the extreme that is worth a look at all
+_LASTS = 3.0              # samples that it is there each time, on the mean, ...
+_APART = 5                # ... of times that lie more samples apart than these
 _STEP = 1.5               # steps below the extreme that are one step below
 _LOOKED_AT = 50_000       # of them at most
 _ADVICE = "use less amplitude, or more torque if the machine allows it"
@@ -85,9 +88,10 @@ def flat_share(signal: FloatArray, quantum: float) -> float | None:
 
 
 def _pile(signal: FloatArray, top: float, quantum: float) -> float | None:
-    at = int(np.count_nonzero(signal == top))
+    there = np.flatnonzero(signal == top)
+    at = len(there)
     share = at / len(signal)
-    if at < _LEAST_FLAT or share < _PILE:
+    if at < _LEAST_FLAT or share < _PILE or at < _LASTS * (1 + np.count_nonzero(np.diff(there) > _APART)):
         return None
     reach = float(np.ptp(signal))
     distance = np.abs(signal - top)

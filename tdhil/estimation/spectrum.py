@@ -63,56 +63,61 @@ class Edge:
 # ---------------------------------------------------------------------------------------------------------------------
 # Rounding that repeats with the motion isn't in the scatter between periods, and no number of periods averages it.
 #
-# A signal rounded to q is off by q²/12 in square. With ρ_p(t) what a period's samples are off its segment's mean wave,
-# the part of it that comes again is how two periods in a row go together at the same phase,
+# A signal rounded to q is off by q²/12 in square. Of N samples with errors of their own, a line's is 4 q²/(12 N)
+# (complex: E|·|²). Where the signal takes many samples for one step these have one error together: it changes sign
+# twice on a step, so N is at most twice the steps of a period, and the error's lines reach up to half of that.
 #
-#     r² = mean ρ_p(t) ρ_(p+1)(t),      0 ≤ r² ≤ q²/12:
+# How much of it comes again depends on where the samples lie on the wave: in every period at the same instants, in
+# every second one, or elsewhere in each. It is seen at the harmonics h that nobody excited. Of P periods' lines there
 #
-# noise, and instants that lie otherwise in each period, have no part in it. Where noise of deviation σ goes before the
-# rounding, it can't be more than the sawtooth of rounding smoothed by it, Σ_k e^(−4π²k²σ²/q²) q²/(2π²k²): a thousandth
-# for σ = 0.4 q, which settles it where ρ is mostly noise.
+#     E|mean|² = σ_h²/P + what comes again,      σ_h² their scatter,
 #
-# Of N samples with errors of their own, a line's is 4 r²/N (complex: E|·|²). Where the signal takes many samples for
-# one step these have one error together: it changes sign twice on a step, so N is at most twice the steps of a period.
+# and the error of rounding is as large at one line as at the next. What else comes again (friction's own harmonics) is
+# bounded by the whole. Where noise of deviation σ goes before the rounding, it can't be more than the sawtooth of
+# rounding smoothed by it, Σ_k e^(−4π²k²σ²/q²) q²/(2π²k²): a thousandth for σ = 0.4 q, which settles it where the
+# residuals are mostly noise.
 
 
 _HARMONICS = np.arange(1.0, 9.0)
 _SURE = 1.25            # of q²/12: so much of the residuals' square may be rounding
 _LOOKED_AT = 40_000     # samples, in whole periods
+_LOOKED_FOR = 32        # harmonics that nobody excited
+_FEWEST = 3             # of them; fewer tell nothing
 _UNDETECTED = 0.01      # of the scatter of a segment's mean: less isn't looked at further
 
 
 def repeating_rounding(
-    periods: tuple[FloatArray, ...], times: tuple[FloatArray, ...], begins: list[float], start_s: float,
+    periods: tuple[FloatArray, ...], times: tuple[FloatArray, ...], period_s: float, start_s: float,
     lines_hz: tuple[float, ...], wave: NDArray[np.complex128], scatter: float, quantum: float,
 ) -> float:
     """E|·|² of what rounding to ``quantum`` leaves in the mean of a line, over periods' samples and their times.
 
-    ``begins``: when each period began, s; ``wave`` (K,): the mean lines; ``scatter``: the least variance of a period's.
+    ``wave`` (K,): the mean lines, from ``start_s`` on; ``scatter``: the least variance of a period's.
     """
-    if not quantum > 0.0 or not periods:
+    if not quantum > 0.0:
         return 0.0
     count = min(len(periods[0]), 2.0 * float(np.sum(np.abs(np.diff(periods[0])))) / quantum)
     whole = 4.0 * quantum**2 / 12.0 / max(count, 1.0)
     if whole * len(periods) < _UNDETECTED * scatter:
         return 0.0
-    omega = 2.0 * np.pi * np.asarray(lines_hz)
     few = slice(max(2, _LOOKED_AT // len(periods[0])))
-    phases = [time - begin for time, begin in zip(times[few], begins[few], strict=True)]
+    angles = [2.0 * np.pi * (time - start_s) for time in times[few]]
     rests = [
-        signal - (np.exp(1j * np.multiply.outer(time - start_s, omega)) @ wave).real
-        for signal, time in zip(periods[few], times[few], strict=True)
+        signal - (np.exp(1j * np.multiply.outer(angle, lines_hz)) @ wave).real
+        for signal, angle in zip(periods[few], angles, strict=True)
     ]
     rests = [rest - rest.mean() for rest in rests]
-    half = 0.5 * float(np.median(np.diff(phases[0])))
-    again = 0.0
-    for first, second, phase, other in zip(rests[:-1], rests[1:], phases[:-1], phases[1:], strict=True):
-        nearest = np.minimum(np.searchsorted(other, phase - half), len(other) - 1)
-        again += float(np.mean(first * second[nearest])) / (len(rests) - 1)
     noise = max(float(np.mean([np.var(rest) for rest in rests])) - _SURE * quantum**2 / 12.0, 0.0)
     smoothed = np.exp(-4.0 * np.pi**2 * _HARMONICS**2 * noise / quantum**2) / _HARMONICS**2
-    most = float(np.sum(smoothed) / np.sum(1.0 / _HARMONICS**2))
-    return whole * min(max(again / (quantum**2 / 12.0), 0.0), most)
+    most = whole * float(np.sum(smoothed) / np.sum(1.0 / _HARMONICS**2))
+    first, last = round(period_s * max(lines_hz)) + 1.0, 0.5 * count
+    if last < first + _FEWEST:
+        return most
+    harmonics = np.unique(np.round(np.geomspace(first, last, _LOOKED_FOR)))    # most of them near the lines
+    unexcited = np.array([2.0 * np.exp(-1j * np.multiply.outer(harmonics / period_s, angle)) @ rest / len(rest)
+                          for rest, angle in zip(rests, angles, strict=True)])
+    again = np.abs(unexcited.mean(axis=0)) ** 2 - np.var(unexcited, axis=0, ddof=1) / len(unexcited)
+    return min(max(float(np.mean(again)), 0.0), most)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -186,8 +191,9 @@ def period_lines(stretch: Stretch, samples: Samples, quanta: tuple[float, float]
     speed = table[:, 0] - drift[:, None] * table[:, 2]
     times = tuple(period.time_s for period in stretch.periods)
     rounding = [
-        repeating_rounding(signals, times, begins, segment.start_s, lines, seen.mean(axis=0), _least(seen), quantum)
-        if len(signals) > 1 else 0.0
+        repeating_rounding(
+            signals, times, segment.period_s, segment.start_s, lines, seen.mean(axis=0), _least(seen), quantum
+        ) if len(signals) > 1 else 0.0
         for signals, seen, quantum in (
             (tuple(period.speed_rad_s for period in stretch.periods), speed, quanta[0]),
             (tuple(period.torque_nm for period in stretch.periods), table[:, 1], quanta[1]),
