@@ -1,10 +1,11 @@
-"""Where descents could stand still: without lag, where a short one is felt through its square alone; at bounds."""
+"""Where descents could stand still: without lag, where a short one is felt through its square alone; ridges."""
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from tdhil.estimation.frequency_domain import signal_filters
+from tdhil.estimation.frequency_domain import fit_inertia, signal_filters
+from tdhil.estimation.frequency_domain.inference import quantile_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import Model
 from tdhil.estimation.frequency_domain.optimiser import box, descend, minimise, rough_inertia_of
@@ -82,3 +83,28 @@ def test_a_descent_along_bounds_gets_to_the_bottom(seed, share):
         bounds=(limits.low[free], limits.high[free]), x_scale=limits.scale[free], xtol=1e-13, ftol=1e-13, gtol=1e-13,
     )
     assert found.objective <= 2.0 * best.cost + 5e-4
+
+
+class ThreePoles:
+    """A rigid shaft whose speed and torque are both shown through three poles."""
+
+    def impedance(self, hz):
+        s = 2j * np.pi * hz
+        poles = [np.prod([1.0 + lag * s for lag in lags], axis=0) for lags in ((0.22, 0.15, 0.1), (0.1, 0.06, 0.04))]
+        return (104.0 * s + 8.0) * poles[0] / poles[1]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_beyond_a_ridge_no_answer_lies_lower_at_an_edge(seed):
+    """One pole, or two and an average: a descent that begins with the one doesn't get to the other."""
+    lines, constraint = synthetic(ThreePoles(), seed, 0.3, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), lags=(0.0, 0.0))
+    inertia, _, fitted = fit_inertia(lines, constraint, (), {}, 0.95)
+    rise = quantile_of(fitted, INERTIA, 0.95) ** 2
+    rng = np.random.default_rng(seed)
+    for edge in (inertia.low, inertia.high):
+        for _ in range(20):
+            start = fitted.whole.theta.copy()
+            start[INERTIA] = edge
+            start[2:] = rng.uniform((0.0, 0.0, 0.0, 0.0, -0.3, -0.3), (0.6, 0.5, 0.4, 0.5, 0.3, 0.3))
+            other = minimise(fitted.problem, fitted.limits, start, {INERTIA: edge})
+            assert other.objective > fitted.whole.objective + 0.9 * rise

@@ -221,11 +221,14 @@ def test_an_edge_of_a_profile_is_one_for_two_poles_too():
     def refit(start, x):
         return Fit(np.array([x, start[1]]), 1.0 + x * x / 4.0 if start[1] > 0.1 else x * x)
 
+    def with_two(fit, x):
+        return [refit(np.array([x, 0.25]), x)]
+
     best = Fit(np.zeros(2), 0.0)
     limits = Box(np.array([-10.0, 0.0]), np.array([10.0, 0.5]), np.ones(2))
     for step in (-1.5, 1.5):
-        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, [1])) == pytest.approx(12.0**0.5, rel=0.01)
-        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, [])) == pytest.approx(2.0, rel=0.01)
+        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, with_two)) == pytest.approx(12.0**0.5, rel=0.01)
+        assert abs(profile_edge(refit, limits, best, 0, step, 4.0, lambda *_: [])) == pytest.approx(2.0, rel=0.01)
 
 
 

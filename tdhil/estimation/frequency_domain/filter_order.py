@@ -28,7 +28,6 @@ from tdhil.estimation.frequency_domain.optimiser import (
     Fixed,
     best_fit,
     box,
-    lowest,
     minimise,
     rough_inertia_of,
 )
@@ -96,14 +95,12 @@ def fit_model(
     others = tuple(minimise(problem, limits, start, fixed) for start in (rivals_of(simple.theta) if rivals_of else []))
     if not open_structure:
         return Fitted(problem, limits, fixed, simple, simple, 1.0, others)
-    fits = [simple]
+    begin = [simple.theta]
     for shape, value in _SHAPES:
-        start = simple.theta.copy()
         if model.at(shape) not in fixed:
-            start[model.at(shape)] = value
-            fits.append(minimise(problem, limits, start, fixed))
-    fits.append(minimise(problem, limits, simple.theta, fixed))
-    whole = lowest(fits, apart)
+            begin.append(simple.theta.copy())
+            begin[-1][model.at(shape)] = value
+    whole = best_fit(problem, limits, fixed, begin, apart, [simple])
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(fixed))
     weight = simple_weight(gain, len(open_structure), problem.numbers)
     return Fitted(problem, limits, fixed, simple, whole, weight, others)

@@ -9,16 +9,15 @@ with two lies beside it, lower further out. An edge is one only where that other
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
-from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, lowest, minimise, two_poles
+from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, lowest, minimise, other_poles
 from tdhil.estimation.frequency_domain.shafts import INERTIA
-from tdhil.estimation.frequency_domain.signal_filters import SPEED_SHAPE, TORQUE_SHAPE
 from tdhil.estimation.result import REJECT_P, BudgetLine, Estimate, InertiaEstimate, ResidualTest
 from tdhil.estimation.spectrum import Line
 from tdhil.recording import FloatArray
@@ -131,14 +130,16 @@ def standard_deviation(problem: Likelihood, theta: FloatArray, index: int, free:
 Refit = Callable[[FloatArray, float], Fit]
 """The best fit with the parameter held at a value, from a start (P,) nearby."""
 
+Others = Callable[[Fit, float], Iterable[Fit]]
+"""Other fits with the parameter held at a value, which may lie lower than one that was found there."""
+
 
 def profile_edge(
-    refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float, shapes: Sequence[int]
+    refit: Refit, limits: Box, best: Fit, index: int, step: float, rise: float, others: Others
 ) -> float:
     """Where the profile has risen by ``rise`` on the side of ``step``'s sign; a bound, or ±inf, if it never does.
 
-    The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood. ``shapes``: where in theta
-    the reports' free shapes ρ stand.
+    The root of √(P − P_best) is sought, which is a straight line for a quadratic likelihood.
     """
     target = math.sqrt(max(rise, 0.0))
     if target == 0.0:
@@ -156,11 +157,12 @@ def profile_edge(
         x = min(x, bound) if step > 0.0 else max(x, bound)
         fit = refit(inside_theta, x)
         root = root_of(fit)
-        if root >= (1.0 - _CLOSE) * target:
-            fit = lowest([fit, *(refit(start, x) for start in two_poles(fit.theta, shapes))])
-            root = root_of(fit)
         if abs(root - target) <= _CLOSE * target:
-            return x
+            fit = lowest([fit, *others(fit, x)])
+            root = root_of(fit)
+            if root >= (1.0 - _CLOSE) * target:
+                return x
+            outside = None           # that was of the higher valley
         if root < target:
             if x == bound:
                 return bound
@@ -248,8 +250,12 @@ def _edges(
         return minimise(problem, limits, start, {**fixed, index: value})
 
     rise = quantile**2 - behind
-    shapes = [at for at in map(problem.model.at, (SPEED_SHAPE, TORQUE_SHAPE)) if at not in fixed and at != index]
-    low, high = (profile_edge(refit, limits, fit, index, side * step, rise, shapes) for side in (-1.0, 1.0))
+    def others(fit: Fit, value: float) -> Iterator[Fit]:
+        held = {**fixed, index: value}
+        for start in other_poles(problem, fit.theta, held):
+            yield minimise(problem, limits, start, held, fit.objective)
+
+    low, high = (profile_edge(refit, limits, fit, index, side * step, rise, others) for side in (-1.0, 1.0))
     return low, high
 
 

@@ -9,6 +9,7 @@ belong if the one went on: λ rises until the step is short of the bound, and th
 every success and rises with every failure; a start that is no minimum moves, one that is stays bit for bit.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,8 @@ _MOST_STEPS = 200
 _MOST_TRIES = 12
 _SMALL_GAIN = 1e-6        # of −2 ln L, absolute: an interval's edge is where it has risen by about 4
 _SMALL_STEP = 1e-9        # of the natural scale
+_CREEPING, _LOOKED_BACK = 0.01, 20         # of −2 ln L, gained in so many steps: along the floor of a flat valley
+_FAR, _LOOKS_TO_TELL = 5.0, 4              # above what it is to beat, after twice as many: it won't; looks for a trend
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,11 @@ class Box:
     scale: FloatArray
 
 
-def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
-    """From ``start`` (P,) down; only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent."""
+def descend(at: At, start: FloatArray, free: BoolArray, box: Box, goal: float = math.inf) -> Fit:
+    """From ``start`` (P,) down; only ``free`` (P,) parameters move. Arithmetic that overflows ends the descent.
+
+    ``goal``: what it is to beat; where that is far off after a while, it is left.
+    """
     theta = np.where(free, np.clip(start, box.low, box.high), start)
     r, slopes = at(theta)
     cost = float(r.dot(r))
@@ -54,7 +60,12 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
     every = np.flatnonzero(free)
     lowest, highest, scales = box.low[every], box.high[every], box.scale[every]
     bounds = list(zip(lowest.tolist(), highest.tolist(), strict=True))
-    for _ in range(_MOST_STEPS):
+    course = [cost]
+    for number in range(_MOST_STEPS):
+        if number and number % _LOOKED_BACK == 0:
+            course.append(cost)
+            if _leads_nowhere(course, goal):
+                break
         moving, here, least, most, scale = every, theta[every], lowest, highest, scales
         scaled = slopes()[:, every] * scales
         downhill = -r.dot(scaled)
@@ -92,6 +103,19 @@ def descend(at: At, start: FloatArray, free: BoolArray, box: Box) -> Fit:
     return Fit(theta, cost)
 
 
+def _leads_nowhere(course: Sequence[float], goal: float) -> bool:
+    """Is a descent, seen now and then, at its end, or where it will end above ``goal``?
+
+    Along the floor of a flat valley what is gained falls by the same share from look to look; the first is left out.
+    """
+    if course[-2] - course[-1] < _CREEPING:
+        return True
+    if len(course) < _LOOKS_TO_TELL:
+        return len(course) > 2 and course[-1] > goal + _FAR
+    before, last = course[-3] - course[-2], course[-2] - course[-1]
+    return course[-1] > goal and last < before and course[-1] - last * last / (before - last) > goal
+
+
 def _within(
     least: FloatArray, most: FloatArray, here: FloatArray, scale: FloatArray, matrix: FloatArray, right: FloatArray
 ) -> FloatArray:
@@ -127,6 +151,8 @@ _SKEWS = (-0.2, -0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1, 0.2)
 _PROPOSALS = 3
 _NO_LAG, _SOME_LAG = 0.1, 0.6      # radians at the fastest line
 _EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of ρ
+_FOR_ONE_POLE = 4.0 ** (1.0 / 3.0)         # of its delay, that of two equal poles in its place
+_BY_AVERAGE = 12.0 * (0.5 * _FOR_ONE_POLE**2 - 1.0) / (_FOR_ONE_POLE**2 - 1.0)    # u, of what the delay's square gains
 
 Fixed = dict[int, float]
 
@@ -154,25 +180,29 @@ def rough_inertia_of(problem: Likelihood) -> float:
     return float(np.median(ratio))
 
 
-def minimise(problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed) -> Fit:
+def minimise(
+    problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed, goal: float = math.inf
+) -> Fit:
     """A descent, and another from beside a lag of zero; the parameters in ``fixed`` keep the value that stands there.
 
     At no lag at all descents stand still, a minimum or not: a short lag whose delay the skew takes back is felt through
     its square only, ln F = −ln(1 + τ s) + τ s = τ² s²/2 − …, and the slope of that is zero at τ = 0.
     """
-    fit = _descent(problem, limits, start, fixed)
+    fit = _descent(problem, limits, start, fixed, goal)
     for begin in _beside_no_lag(problem, fit.theta, fixed):
-        other = _descent(problem, limits, begin, fixed)
+        other = _descent(problem, limits, begin, fixed, goal)
         fit = other if other.objective < fit.objective else fit
     return fit
 
 
-def _descent(problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed) -> Fit:
+def _descent(
+    problem: Likelihood, limits: Box, start: FloatArray, fixed: Fixed, goal: float = math.inf
+) -> Fit:
     free = np.ones(len(start), dtype=np.bool_)
     begin = np.array(start, dtype=np.float64)
     for index, value in fixed.items():
         free[index], begin[index] = False, value
-    return descend(problem.at, begin, free, limits)
+    return descend(problem.at, begin, free, limits, goal)
 
 
 def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
@@ -193,20 +223,41 @@ def _beside_no_lag(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iter
         yield begin
 
 
-def two_poles(theta: FloatArray, shapes: Iterable[int]) -> Iterator[FloatArray]:
-    """Starts with two equal poles in one report, which has one pole or two unlike ones; ``shapes``: where ρ stands."""
-    for index in shapes:
-        if abs(float(theta[index]) - _EQUAL_POLES) > _NEAR_EQUAL:
-            begin = theta.copy()
-            begin[index] = _EQUAL_POLES
-            yield begin
+def other_poles(problem: Likelihood, theta: FloatArray, fixed: Fixed) -> Iterator[FloatArray]:
+    """Starts with two equal poles in one report that has one, or two unlike ones; and with one where it has two.
+
+    In the logarithm's series one pole's third term is 2 τ³, of two equal ones τ³/2: these stand for it where their
+    delay is 4^(1/3) of its. What the second term differs by then, τ² to τ²/2, an average may make up for (u/12), and
+    the skew for the delay; between the two lies a ridge, which no descent crosses that sets out from the old delay.
+    """
+    at, fastest = problem.model.at, float(np.max(np.abs(problem.s)))
+    for lag, shape, sign in (
+        (at(signal_filters.SPEED_LAG), at(signal_filters.SPEED_SHAPE), 1.0),
+        (at(signal_filters.TORQUE_LAG), at(signal_filters.TORQUE_SHAPE), -1.0),
+    ):
+        if lag in fixed or shape in fixed or theta[lag] * fastest <= _NO_LAG:
+            continue
+        two = abs(float(theta[shape]) - _EQUAL_POLES) <= _NEAR_EQUAL
+        begin = theta.copy()
+        begin[shape] = 0.0 if two else _EQUAL_POLES
+        if two or theta[shape] < _EQUAL_POLES:
+            begin[lag] *= _FOR_ONE_POLE ** (-1.0 if two else 1.0)
+            begin[at(signal_filters.SKEW)] += sign * (begin[lag] - theta[lag])
+            alike = begin.copy()
+            alike[at(signal_filters.AVERAGE)] += sign * _BY_AVERAGE * (begin[lag] ** 2 - theta[lag] ** 2)
+            yield alike
+        yield begin
 
 
 def best_fit(
-    problem: Likelihood, limits: Box, fixed: Fixed, starts: Iterable[FloatArray], apart: Apart | None = None
+    problem: Likelihood, limits: Box, fixed: Fixed, starts: Iterable[FloatArray], apart: Apart | None = None,
+    known: Sequence[Fit] = (),
 ) -> Fit:
-    """The `lowest` of several descents."""
-    return lowest([minimise(problem, limits, start, fixed) for start in starts], apart)
+    """The `lowest` of several descents, of those beside no lag from the lowest of them, and of what is ``known``."""
+    fits = [*known, *(_descent(problem, limits, start, fixed) for start in starts)]
+    best = min(fits, key=lambda fit: fit.objective)
+    fits += [_descent(problem, limits, start, fixed) for start in _beside_no_lag(problem, best.theta, fixed)]
+    return lowest(fits, apart)
 
 
 def lowest(fits: Sequence[Fit], apart: Apart | None = None) -> Fit:

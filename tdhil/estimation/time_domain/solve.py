@@ -1,6 +1,7 @@
 """From bins to numbers: J and all else with intervals, the shares in J's uncertainty, and the test of the model."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,6 +153,7 @@ def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
 
 _LEAST_DOF = 3.0
 _SHAPE_STARTS = ((0.02, 0.02), (0.3, 0.1), (0.1, 0.3))
+_EQUAL_POLES, _NEAR_EQUAL = 0.25, 0.1      # of κ
 
 
 @dataclass(frozen=True)
@@ -225,7 +227,16 @@ def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) 
         return minimise(problem, start, {index: value})
 
     shapes = [at for at in (SPEED_SHAPE, TORQUE_SHAPE) if at in problem.free and at != index]
-    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2, shapes) for side in (-1.0, 1.0))
+
+    def others(fit: Fit, value: float) -> Iterator[Fit]:
+        """With two equal poles in a report that has one, or two unlike ones."""
+        for at in shapes:
+            if abs(float(fit.theta[at]) - _EQUAL_POLES) > _NEAR_EQUAL:
+                start = fit.theta.copy()
+                start[at] = _EQUAL_POLES
+                yield refit(start, value)
+
+    low, high = (profile_edge(refit, problem.box, best, index, side * step, reach**2, others) for side in (-1.0, 1.0))
     return Estimate(float(best.theta[index]), low, high)
 
 

@@ -129,7 +129,8 @@ def slopes_of_unknown(plant: CoveragePlant, hertz: FloatArray) -> tuple[ComplexA
     for report, sign in ((plant.speed_report, 1.0), (plant.torque_report, -1.0)):
         polynomial = np.prod([1.0 + lag * s for lag in report.lags_s], axis=0) * one
         columns += [sign * s / polynomial, sign * s * s / polynomial]
-        sd += [_PLAUSIBLE, _PLAUSIBLE_SHAPE * max(sum(report.lags_s), _SHORTEST_S) ** 2]
+        delay_s = max(sum(report.lags_s) + 0.5 * report.average_s, _SHORTEST_S)
+        sd += [_PLAUSIBLE, _PLAUSIBLE_SHAPE * delay_s**2]
     average_s = max(plant.speed_report.average_s, plant.torque_report.average_s, _SHORTEST_S)
     half = np.minimum(0.5 * np.abs(s) * average_s, 0.9 * np.pi)
     columns += [0.125 * np.abs(s) ** 2 * (half / np.tan(half) - 1.0) / half**2, -s]
