@@ -1,7 +1,7 @@
 """The plan of stage 5, and of when it ends: from what is asked for and what stages 2 and 3 have shown. Pure.
 
 Without a tolerance the motion is planned for a fixed time. With one, a pilot is planned from what the noise leads to
-expect, and everything after it is decided by its scatter (`design.stopping`).
+expect, and everything after it is decided by its scatter (`design.stopping_rule`).
 """
 
 from __future__ import annotations

@@ -322,7 +322,7 @@ def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confi
 def _budget(
     fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
-    """As `budget.py` has it for a rigid shaft: set free one group after another, each its share in squares."""
+    """As `budget_of` of a rigid shaft: set free one group after another, each its share in squares."""
     at = fit.fitted.problem.model.at
     lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
     friction = (VISCOUS, DAMPING, LOAD_VISCOUS)

@@ -155,7 +155,7 @@ def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The same shaft with one of its parameters replaced by another that is asked for: the total inertia, the stiffness, a
-# resonance. Its interval is then a profile like any other (`interval.estimate`), bounds and curved valleys included.
+# resonance. Its interval is then a profile like any other (`inference.estimate`), bounds and curved valleys included.
 #
 # The parameter m_i gives way to u with m_i = h(u, the others); the rest keep their places. By the chain rule
 # ∂Z/∂u = ∂Z/∂m_i ∂h/∂u, and every other slope gains ∂Z/∂m_i ∂h/∂m_j.
@@ -171,7 +171,7 @@ class View:
 
 
 def _light(m: FloatArray) -> float:
-    """1 − 2η/3, the share of the load that swings (`string_shaft.py`); 1 of two lumps."""
+    """1 − 2η/3, the share of the load that swings (`shafts.py`); 1 of two lumps."""
     return 1.0 - 2.0 / 3.0 * float(m[STRING_SHARE]) if len(m) > STRING_SHARE else 1.0
 
 

@@ -1,8 +1,9 @@
 """First-order lags or not: both answers fitted, and how much each weighs.
 
-The reports' family (reports.py) is fitted twice: with first-order lags alone, and whole. The first is the sharper where
-it is true and biased where it isn't; the second is right in both cases and less sharp. Its three parameters more must
-lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be preferred; about there, both count:
+The reports' family (signal_filters.py) is fitted twice: with first-order lags alone, and whole. The first is the
+sharper where it is true and biased where it isn't; the second is right in both cases and less sharp. Its three
+parameters more must lower −2 ln L by more than Schwarz's 3 ln n, n real numbers fitted, to be preferred; about there,
+both count:
 
     weight of the first-order fit = 1/(1 + e^((D/r − 3 ln n)/2)),    D = −2 ln L_first + 2 ln L_whole ≥ 0,
 

@@ -5,7 +5,7 @@ valley. The profile P(x) = min over the other parameters of −2 ln L follows th
 bound. The interval is {x: P(x) ≤ P_min + t²}, t Student's quantile: chi-square would take the weights for known.
 
 The valley forks where a second pole sets in: the fit with one, refitted along the profile, stands at ρ = 0, and another
-with two lies beside it, lower further out. An edge is one only where that other fit contradicts it too.
+with two lies beyond a ridge, lower further out. An edge is one only where no such other fit lies lower.
 """
 
 import math

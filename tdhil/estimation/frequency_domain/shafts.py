@@ -169,9 +169,8 @@ class RigidShaft:
 #     q = tanh √x / √x,    x = a b,
 #
 # and the motor Z = J_r s + B_r + Z_s. Without drag √(b/a) is the characteristic impedance I √(Gρ) = √(J_s k), √(ab) =
-# s T with the delay T = L √(ρ/G) = √(J_s/k). A string that weighs nothing (b = 0, q = 1) leaves two masses,
-# `two_mass.py`, and that is how it is parametrised: with the load J_L = J_s + J_e and the string's share of it, η =
-# J_s/J_L,
+# s T with the delay T = L √(ρ/G) = √(J_s/k). A string that weighs nothing (b = 0, q = 1) leaves two masses, and that
+# is how it is parametrised: with the load J_L = J_s + J_e and the string's share of it, η = J_s/J_L,
 #
 #     m = J_r, B, J_L, ω_a, c, B_L, η, δ     k = ω_a² J_L (1 − 2η/3),    J_s = η J_L,    J_e = (1 − η) J_L,
 #

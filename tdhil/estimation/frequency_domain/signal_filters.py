@@ -13,7 +13,7 @@ excitation shows T_rep/ω_rep = (T/ω)·F_T/F_w. With s = jω,
 
 Every structure that drives are known to have is a point of this family, and it is smooth there: u passes through zero,
 ρ = 0 is a plain bound. First order on both is ρ_w = ρ_T = u = 0. So the structure is not chosen before the fit; what
-the data leave open of it goes into the interval like any other unknown (see rigid_result.py).
+the data leave open of it goes into the interval like any other unknown (see inference.py).
 
 What is plausible of a drive enters softly, as Gaussians about zero: lags of about a second at most, averages of about a
 second (`PLAUSIBLE`). Data overrule that easily where they speak; where they don't, it keeps the fit out of corners in

@@ -55,7 +55,7 @@ from tdhil.run.excitation import (
 # A quick figure for the search: the Cramér-Rao bound of J, the structure of the lags being open.
 #
 # The lines' information about the rigid model's theta = (J, B; τ_w, ρ_w, τ_T, ρ_T, u, d), whose last six are the
-# family of `identify.reports`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are
+# family of `signal_filters`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are
 # bounded rather than unknown; here they count as known to about their bounds. So a high line buys little: what it
 # says of J it first has to say of the structure.
 
@@ -145,7 +145,7 @@ class Proposal:
 
 
 def highest_line_hz(longest_lag_s: float) -> float:
-    """Above a quarter of 1/τ what nobody can know of a lag τ matters too much: the notes of `identify.reports`."""
+    """Above a quarter of 1/τ what nobody can know of a lag τ matters too much: the notes of `signal_filters`."""
     return float(np.clip(HIGHEST_TURN / max(longest_lag_s, 1e-3), *LINES_LIMIT_HZ))
 
 

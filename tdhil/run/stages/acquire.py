@@ -120,7 +120,7 @@ def run_acquire(
     A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
     ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
     more is wanted so many periods more at its mean speed and then, unless that is enough, settled anew at the others.
-    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`protocol.dither`).
+    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`).
     """
     begun_s = loop.now_s
     dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
