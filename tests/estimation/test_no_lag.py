@@ -97,7 +97,7 @@ class ThreePoles:
 @pytest.mark.parametrize("seed", range(6))
 def test_beyond_a_ridge_no_answer_lies_lower_at_an_edge(seed):
     """One pole, or two and an average: a descent that begins with the one doesn't get to the other."""
-    lines, constraint = synthetic(ThreePoles(), seed, 0.3, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), lags=(0.0, 0.0))
+    lines, constraint = synthetic(ThreePoles(), seed, 0.8, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6), lags=(0.0, 0.0))
     inertia, _, fitted = fit_inertia(lines, constraint, (), {}, 0.95)
     rise = quantile_of(fitted, INERTIA, 0.95) ** 2
     rng = np.random.default_rng(seed)
