@@ -1,4 +1,4 @@
-"""Where descents could stand still: without lag, where a short one is felt through its square alone; ridges."""
+"""Where descents could stand still: without lag, where a short one is felt by its square alone; at bounds; ridges."""
 
 import numpy as np
 import pytest
