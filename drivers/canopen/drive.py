@@ -151,6 +151,7 @@ class Cia402Drive:
         self._contradictions = 0
         self._ticks = Ticks(clock, self.period_s)
         self._watch.host_stood_still = self._stood_still
+        self._watch.host_late = self.host_late
         self._cycles = self._missed = self._late = 0
 
     def _new_feedback(self) -> Feedback:

@@ -100,6 +100,8 @@ class Watch:
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
         self.host_stood_still: Callable[[], str] = lambda: ""
         """What is to be said of this host first, where it was away itself; empty: it wasn't."""
+        self.host_late: Callable[[], str] = lambda: ""
+        """The same, where it was away or late again and again: what a drive's watchdog acts on."""
 
     def on_heartbeat(self, data: bytes) -> None:
         """700h + node: the NMT state, or 0 for boot-up."""
@@ -142,7 +144,7 @@ class Watch:
                 HOST_SILENT,
                 CommunicationLost(
                     f"the drive's watchdog has acted: {emcy_text(code)}",
-                    where=f"node {self._node}",
+                    where=f"host or bus, as node {self._node} tells it",
                     next_step="This host was silent for too long (frozen, asleep, overloaded) or its frames were lost",
                 ),
             )
@@ -205,7 +207,7 @@ class Watch:
             )
         if self._troubles:
             kind, trouble = self._troubles.pop(0)
-            raise self._of_host(trouble) if kind in OF_A_SILENT_HOST else trouble
+            raise self._of_host(kind, trouble) if kind in OF_A_SILENT_HOST else trouble
 
     @property
     def overdue(self) -> bool:
@@ -213,14 +215,16 @@ class Watch:
         silent_s = 0.0 if self._heard_s is None else self._clock.now_s() - self._heard_s
         return 0.0 < self.allowed_silence_s < silent_s
 
-    def _of_host(self, trouble: TdhilError) -> TdhilError:
-        """The same, where this host was away: that comes first, and may be all there is to it."""
-        away = self.host_stood_still()
+    def _of_host(self, kind: str, trouble: TdhilError) -> TdhilError:
+        """The same, where this host was away: that comes first, and may be all there is to it.
+
+        The drive's watchdog also acts on many cycles that are late, of which none is long.
+        """
+        away = self.host_late() if kind == HOST_SILENT else self.host_stood_still()
         if not away:
             return trouble
-        return CommunicationLost(
-            f"{away}; after that: {trouble.what}", where=f"host; {trouble.where}", next_step=LOWER_THE_RATE
-        )
+        where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
+        return CommunicationLost(f"{away}; after that: {trouble.what}", where=where, next_step=LOWER_THE_RATE)
 
     def start(self, allowed_silence_s: float) -> None:
         """From now on silence, boot-up, EMCY and foreign NMT commands are trouble."""

@@ -104,6 +104,29 @@ def test_a_short_stall_is_told_before_a_heartbeat_that_is_missing(drive, peer, w
     assert e.value.next_step == LOWER_THE_RATE
 
 
+def test_a_watchdog_that_acted_on_many_late_cycles_is_told_with_them(drive, wire, fake_time):
+    """None of them is long; it is their sum that lets the drive's watchdog run out."""
+    with pytest.raises(CommunicationLost) as caught:
+        for cycle in range(200):
+            if cycle % 4 == 0:
+                fake_time.sleep(0.02)
+            if cycle == 40:
+                wire.put(0x081, bytes.fromhex("3081110000000000"))
+            drive.exchange(TURN)
+    assert caught.value.what.startswith("host or adapter late ("), caught.value.what
+    assert "8130h" in caught.value.what
+    assert caught.value.where == "host or bus, as node 1 tells it"
+    assert caught.value.next_step == LOWER_THE_RATE
+
+
+def test_a_watchdog_that_acted_though_the_loop_was_in_time_is_the_hosts_or_the_buss(drive, wire):
+    """The frames were sent; whether they came through nobody here can tell, but it isn't the drive's doing."""
+    wire.put(0x081, bytes.fromhex("3081110000000000"))
+    with pytest.raises(CommunicationLost, match=r"^host or bus, as node 1 tells it: the drive's watchdog has acted"):
+        for _ in range(5):
+            drive.exchange(TURN)
+
+
 def test_a_heartbeat_that_is_missing_is_the_drives_where_the_loop_was_in_time(drive):
     with pytest.raises(CommunicationLost, match=r"node 1, 1017h: the drive's heartbeat") as caught:
         for _ in range(200):
