@@ -127,10 +127,10 @@ def recording(counted=6):
         (0.030, 0.0200, 2.0, 0.0095, 0, 0, 400.0, 6, 0),      # the scatter says how much
         (0.008, 0.0120, 1.2, 0.0095, 0, 0, 400.0, 2, 0),      # never by a narrow interval alone, nor too little
         (0.0101, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 6, 1),     # too wide all the same: once more here, another look
-        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 12, 1),     # … by how much it is too wide, at most as much again
+        (0.030, 0.0080, 1.0, 0.0080, 0, 0, 400.0, 18, 1),     # … by how much it is too wide, at most three times all
         (0.030, 0.0080, 1.0, 0.0080, 0, 0, 70.0, 7, 1),
         (0.008, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 0, 1),
-        (0.030, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 12, 2),
+        (0.030, 0.0080, 1.0, 0.0080, 1, 1, 400.0, 18, 2),
         (0.030, 0.0080, 1.0, 0.0080, 0, 0, 15.0, 0, 0),
         (0.030, 0.0080, 1.0, 0.0080, 4, 2, 400.0, 0, 2),      # no more looks
         (0.030, 0.0200, 2.0, 0.0095, 4, 0, 400.0, 0, 0),
@@ -150,10 +150,10 @@ def test_decisions(monkeypatch, interval, now, scale, then, looks, seen, left_s,
 
 @pytest.mark.parametrize(("interval", "looks", "left_s", "periods", "after"), [
     (0.008, 0, 400.0, 0, 0),
-    (0.0105, 0, 900.0, 4, 1),             # six periods at ±1.05 %: (1.05·1.05·1.13)² − 1 = 0.55 times as many more
+    (0.0105, 0, 900.0, 5, 1),             # six periods at ±1.05 %: (1.05·1.05·1.17)² − 1 = 0.68 times as many more
     (0.0099999, 0, 900.0, 0, 0),
-    (0.010001, 0, 900.0, 3, 1),           # the next interval that is looked at has a wider quantile
-    (0.100, 0, 900.0, 6, 1),              # never longer than all before, which the next one's confidence counts on
+    (0.010001, 0, 900.0, 4, 1),           # the next interval that is looked at has a wider quantile
+    (0.100, 0, 900.0, 18, 1),             # three times all before at most: the next one's confidence rests on it
     (0.100, 0, 100.0, 4, 1),              # what there is time for
     (0.011, 4, 900.0, 0, 0),
     (0.011, 0, 50.0, 0, 0),               # no time for two

@@ -23,8 +23,9 @@ made. That any does is P(I₁ misses) + P(I₂ misses and I₁ doesn't) + … , 
 they add up to α. Where the k-th misses the (k − 1)-th mostly does too, since it holds a share r of the same data: an
 interval misses where the signed root z of its likelihood ratio at the true J is too large, and such roots of data that
 grow have normal increments, so that z_k and z_(k − 1) are correlated with √r (Lan and DeMets' spending). An extension
-behind an interval is never longer than all before it: r ≥ ½ is reckoned with. Most runs pay a few percent of width for
-it, those that need a second look an eighth.
+behind an interval is at most three times as long as all before it: r ≥ ¼ is reckoned with. Most runs pay a few percent
+of width for it, those that need a second look a sixth; were it at most as long (r ≥ ½, an eighth), runs whose lags are
+told apart late would need a third look and a fourth, which cost far more.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from tdhil.run.design.prediction import LEAST_NU, Evidence, Fitted, fit, half_wi
 
 LOOKS = 4                 # extensions at most
 FIRST_SHARE = 0.7         # of the probability to miss that is left, spent on the next interval that is looked at
-MOST_BEHIND = 1.0         # of all before, that an extension behind an interval may be long: r ≥ ½
+MOST_BEHIND = 3.0         # of all before, that an extension behind an interval may be long: r ≥ ¼
 AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
 MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
 _WORTH_SHARE = 0.1        # of the interval at the end of the time: what is nearer than this needs no more time
