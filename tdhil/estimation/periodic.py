@@ -39,6 +39,10 @@ from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1
 _LEAST_NU = 2.0     # complex degrees of freedom of the weights; fewer and the interval means nothing
+_BEFORE_ECHO_HELPS = (
+    "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight off"
+    " it, or excite with more amplitude or for longer"
+)
 _ONE_LINE = Refusal(
     "one excited line can't test the paper's assumption that the reported signals are not filtered",
     "excite with more lines (a multisine)",
@@ -115,7 +119,9 @@ def identify_lines(case: PeriodicCase) -> Finding:
         finding = rigid_finding(rigid, case)
         finding = identify_compliant(_settled(case), finding) if doubted else finding
     if isinstance(finding, Refusal):
-        raise Refused(finding.reason, finding.advice)
+        raise Refused(finding.reason, _BEFORE_ECHO_HELPS if _drowned(case) else finding.advice)
+    if _drowned(case):
+        finding = replace(finding, words=replace(finding.words, if_wide=_BEFORE_ECHO_HELPS))
     # A load that swings leaves residuals that a bend takes up, too: only where swinging was looked for it may.
     hardly = finding.rejected or (asked.widened and finding.compliant is None and doubtful(finding.residual))
     if hardly and rigid is not None and asked.lags:
@@ -131,17 +137,21 @@ def _before_echo(case: PeriodicCase) -> bool:
 
 def _too_few(case: PeriodicCase, what: str, advice: str) -> Refused:
     """Of the lines that stand clear; above a drill string whose pipe is known it is said what drowned the others."""
-    weak = [line for line in case.every if not line.excited]
-    if case.recording.pipe is None or not weak:
+    if not _drowned(case):
         return Refused(what, advice)
+    weak = [line for line in case.every if not line.excited]
     best = max(weak, key=lambda line: float(np.max(np.abs(line.speed))) / math.sqrt(max(line.s_ww, 1e-300)))
     moved, scatter = float(np.max(np.abs(best.speed))), math.sqrt(best.s_ww)
     return Refused(
         f"{what}: at {best.hertz:.3g} Hz the excitation moves the speed by ±{moved:.2g} rad/s, and the string below by"
         f" ±{scatter:.2g} rad/s, another way in each period",
-        "use --excitation prbs, which asks only for the time before an echo; or lift the bit off bottom, take weight"
-        " off it, or excite with more amplitude or for longer",
+        _BEFORE_ECHO_HELPS,
     )
+
+
+def _drowned(case: PeriodicCase) -> bool:
+    """Are there lines that a drill string drowned, whose pipe is known, so that another excitation would tell more?"""
+    return case.recording.pipe is not None and any(not line.excited for line in case.every)
 
 
 def _settled(case: PeriodicCase) -> PeriodicCase:

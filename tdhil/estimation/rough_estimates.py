@@ -31,6 +31,19 @@ class RoughFriction:
     coulomb_nm: float
     level_sd_nm: float
 
+    def opposing(self, speed_rad_s: float) -> "RoughFriction":
+        """The same torque at this speed, from parts that both oppose a forward rotation.
+
+        A line through friction that falls with speed, or through two levels that a restless string shakes, has a part
+        that pushes; left out alone it would leave the other one too large by all that it takes away.
+        """
+        torque_nm = max(0.0, self.coulomb_nm + self.viscous_nm_s_rad * speed_rad_s)
+        if self.viscous_nm_s_rad < 0.0:
+            return RoughFriction(0.0, torque_nm, self.level_sd_nm)
+        if self.coulomb_nm < 0.0:
+            return RoughFriction(torque_nm / speed_rad_s, 0.0, self.level_sd_nm)
+        return self
+
 
 @dataclass(frozen=True)
 class RoughInertia:

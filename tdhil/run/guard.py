@@ -276,9 +276,12 @@ class Guard:
         limits = self._limits
         if speed_rad_s > limits.speed_max_rad_s or (limits.allow_reverse and speed_rad_s < -limits.speed_max_rad_s):
             raise LimitHit(
-                f"speed {speed_rad_s:.3f} rad/s is beyond the limit of {limits.speed_max_rad_s:g} rad/s",
+                self._besides(
+                    f"speed {speed_rad_s:.3f} rad/s is beyond the limit of {limits.speed_max_rad_s:g} rad/s"
+                ),
                 where=where,
-                next_step="The shaft was stopped. Was the load lost? Check limits.speed_max_rad_s in rig.yaml",
+                next_step="The shaft was stopped. "
+                + self._helps("Was the load lost? Check limits.speed_max_rad_s in rig.yaml"),
             )
         if not limits.allow_reverse and speed_rad_s < -self._reverse_rad_s:
             raise LimitHit(

@@ -179,3 +179,16 @@ def test_lines_that_the_string_drowns_name_it(strongest_nm):
     found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
     assert found.verdict is Verdict.NOT_IDENTIFIABLE
     assert "the string below by ±" in found.reason and "--excitation prbs" in found.advice
+
+
+@pytest.mark.parametrize(("torque_nm", "verdict"), ((200.0, Verdict.NOT_IDENTIFIABLE), (300.0, Verdict.VALID_WIDE)))
+def test_where_the_string_drowns_some_lines_and_the_others_tell_little_it_says_what_would_tell_more(torque_nm, verdict):
+    multiples = np.array([1, 2, 3, 4, 6, 8, 10, 13, 16, 20])
+    torques = torque_nm * np.exp(2j * np.pi * np.random.default_rng(1).random(10))
+    lines_hz = tuple(0.05 * multiples)
+    weak = records(replace(PLANT, bit_noise_nm=500.0, answered=False), [1], lines_hz, torques, PERIOD_S, 8)[0]
+    found = identify(replace(weak, excitation=replace(weak.excitation, kind="multisine")))
+    assert found.verdict is verdict
+    assert found.advice.startswith("use --excitation prbs")
+    unknown = identify(replace(weak, pipe=None, excitation=replace(weak.excitation, kind="multisine")))
+    assert "prbs" not in unknown.advice

@@ -89,3 +89,19 @@ def test_above_a_restless_string_the_time_before_the_echo_tells(bottom):
     assert np.mean([one.inertia_kg_m2 for one in told]) == pytest.approx(plant.motor, rel=0.2)
     assert all(0.3 <= one.rel_error < 0.8 for one in told)
     assert found(0, starts[:1]) is None
+
+
+@pytest.mark.parametrize(
+    ("viscous", "coulomb", "at_rad_s", "opposing"),
+    [
+        (8.0, 60.0, 5.0, (8.0, 60.0)),
+        (-100.0, 5800.0, 20.0, (0.0, 3800.0)),     # falls with speed: the torque there, whatever the speed
+        (30.0, -60.0, 4.0, (15.0, 0.0)),           # pushes at standstill
+        (-100.0, 100.0, 4.0, (0.0, 0.0)),
+        (0.0, -60.0, 4.0, (0.0, 0.0)),
+    ],
+)
+def test_friction_that_would_push_keeps_its_torque_where_it_was_seen(viscous, coulomb, at_rad_s, opposing):
+    found = RoughFriction(viscous, coulomb, 1.0).opposing(at_rad_s)
+    assert (found.viscous_nm_s_rad, found.coulomb_nm) == pytest.approx(opposing)
+    assert found.level_sd_nm == 1.0

@@ -386,7 +386,7 @@ def test_a_string_under_load_moves_no_limit(speed, torque, commanded):
     assert said[0] == said[1]
 
 
-@pytest.mark.parametrize(("speed", "commanded"), ((0.4, 60.0), (9.9, 400.0)))
+@pytest.mark.parametrize(("speed", "commanded"), ((0.4, 60.0), (9.9, 400.0), (10.1, 60.0)))
 def test_it_is_named_where_its_swing_takes_the_shaft_out_of_the_window(speed, commanded):
     held = guard()
     held.model, held.disturbed = MODEL, "the string below swings by ±1200 N·m every 5.3 s"

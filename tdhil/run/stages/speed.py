@@ -164,10 +164,11 @@ def run_speed(
         )
     if high_held.swing is not None:
         loop.guard.disturbed = high_held.swing.told
+    friction = rough.friction.opposing(0.5 * (low.speed_rad_s + high.speed_rad_s))
     model = RigGuess(
         rough.inertia_kg_m2,
-        max(0.0, rough.friction.viscous_nm_s_rad),
-        max(0.0, rough.friction.coulomb_nm),
+        friction.viscous_nm_s_rad,
+        friction.coulomb_nm,
         min(0.8, max(good_enough, rough.rel_error)),
     )
     loop.guard.model = model
