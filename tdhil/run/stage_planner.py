@@ -8,12 +8,13 @@ from functools import partial
 from typing import Any
 
 from drivers import Command, LimitHit, Mode, PreflightRefused
+from tdhil.config import told_before_echo
 from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
-from tdhil.run.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan
+from tdhil.run.excitation import ECHOES_S, MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan
 from tdhil.run.guard import LIGHTEN, Guard
 from tdhil.run.planning import Planned, as_followed, plan_acquisition
 from tdhil.run.settings import ExcitationRequest
@@ -91,6 +92,13 @@ class StagePlanner:
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
         )
         self._tell(planned.said())
+        if speed.swing is not None and not told_before_echo(request.kind) and (
+            ECHOES_S[0] <= limits.echo_s <= ECHOES_S[1]
+        ):
+            self._tell(
+                "the string below will drown some of these lines; --excitation prbs asks only for the time before an"
+                " echo, and tells more of J above a bit"
+            )
         self._log.configure(plan=planned.plain())
         if planned.stopping is not None:
             self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})

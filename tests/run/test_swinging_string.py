@@ -222,6 +222,17 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
     assert "speed loop" not in str(hit.value)
 
 
+@pytest.mark.parametrize(("echo_s", "kind", "told"), [(1.4, "multisine", 1), (1.4, "prbs", 0), (0.0, "multisine", 0)])
+def test_above_a_restless_string_it_is_said_before_stage_5_what_would_tell_more(echo_s, kind, told):
+    limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, echo_s=echo_s)
+    here = World(FakeDrive(), limits)
+    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(300.0, 0.5, 5.3, 0.9))
+    said = []
+    planner = StagePlanner(here.bench, here.log, here.display, said.append)
+    planner.plan(Task(limits, ExcitationRequest(kind=kind), {}), speed, Mode.TORQUE, LagPrior())
+    assert sum("--excitation prbs asks only for the time before an echo" in one for one in said) == told
+
+
 class KeepingLog(FakeLog):
     """Keeps what a recording is made of."""
 
