@@ -155,6 +155,20 @@ def test_auto_finds_two_masses_and_says_so(recording):
     assert np.sqrt(squares) == pytest.approx(half, rel=0.05)
 
 
+@pytest.mark.heavy
+def test_where_a_string_isn_t_excluded_and_widens_most_it_is_asked_what_swings():
+    """At 0.4 Hz: a string that weighs as much as the load has its second swing above all lines."""
+    stiffer = run(replace(TwoMass(), stiffness=4.0 * 473.0, damping=2.0 * 23.2), [3])[0]
+    found = identify(stiffer, Options(tolerance=0.01))
+    assert found.verdict is Verdict.VALID_WIDE
+    assert found.inertia.low <= 1500.0 <= found.inertia.high
+    assert found.advice.startswith("say what swings")
+    told = identify(stiffer, Options(model="two-mass", tolerance=0.001))
+    assert told.verdict is Verdict.VALID_WIDE
+    assert told.advice.startswith("state the drive's")
+    assert told.inertia.high - told.inertia.low < found.inertia.high - found.inertia.low
+
+
 def test_a_model_that_is_asked_for_is_the_one_that_is_fitted(recording):
     two = identify(recording, Options(model="two-mass"))
     assert two.model == "two-mass"

@@ -258,7 +258,10 @@ def _refuse_count(
 
 @dataclass(frozen=True)
 class CompliantResult:
-    """``inertia``: J_r, infinite on a side that the data leave open. ``viscous``, ``coulomb``: of both ends."""
+    """``inertia``: J_r, infinite on a side that the data leave open. ``viscous``, ``coulomb``: of both ends.
+
+    ``by_model``: most of its interval, in squares, is owed to a string that isn't excluded beside two masses.
+    """
 
     inertia: Estimate
     shaft: Compliant
@@ -268,6 +271,7 @@ class CompliantResult:
     torque_lag_s: Estimate
     skew_s: Estimate
     budget: tuple[BudgetLine, ...]
+    by_model: bool
 
 
 def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_rel_sd: float) -> CompliantResult:
@@ -291,6 +295,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
         torque_lag_s=torque_lag,
         skew_s=skew,
         budget=_budget(chosen.fit, alone.inertia, fixed.inertia, confidence, torque_scale_rel_sd),
+        by_model=fixed.inertia.high - fixed.inertia.low > math.sqrt(2.0) * (alone.inertia.high - alone.inertia.low),
     )
 
 
@@ -354,6 +359,10 @@ _OPEN = Refusal(
     "excite with more amplitude, for longer, on both sides of the resonance",
 )
 _WIDE = "state the drive's speed and torque filters, or excite with more amplitude above the resonance"
+_WHICH = (
+    "say what swings, since a spring that weighs something isn't excluded: --model two-mass for a coupling or a shaft"
+    " that weighs next to nothing, --model string for a drill string; or excite with more amplitude above the resonance"
+)
 
 
 def identify_compliant(case: PeriodicCase, rigid: Finding | Refusal | None = None) -> Finding | Refusal:
@@ -413,7 +422,8 @@ def _stands(chosen: Chosen, told: CompliantResult, case: PeriodicCase, rigid: Fi
     elif rigid is not None:
         finding = replace(finding, remark=", much better than the lags of a rigid shaft do")
     if told.inertia.bounded:
-        return replace(finding, inertia=told.inertia, budget=told.budget)
+        words = replace(finding.words, if_wide=_WHICH) if told.by_model else finding.words
+        return replace(finding, inertia=told.inertia, budget=told.budget, words=words)
     together = _together(told.shaft.total_inertia)
     return replace(finding, refusal=Refusal(
         f"{finding.explained}, but the motor's inertia can't be told from the load's{together}",
