@@ -260,7 +260,7 @@ def _refuse_count(
 class CompliantResult:
     """``inertia``: J_r, infinite on a side that the data leave open. ``viscous``, ``coulomb``: of both ends.
 
-    ``by_model``: most of its interval, in squares, is owed to a string that isn't excluded beside two masses.
+    ``by_model``: nothing widens it more than a string that isn't excluded beside two masses.
     """
 
     inertia: Estimate
@@ -279,6 +279,8 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     alone = intervals(chosen.fit, confidence)
     fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
+    *own, by_model = _budget(chosen.fit, alone.inertia, fixed.inertia, confidence)
+    by_model_kg_m2 = by_model.half_width_kg_m2
     return CompliantResult(
         inertia=fixed.inertia,
         shaft=Compliant(
@@ -294,8 +296,11 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
         speed_lag_s=speed_lag,
         torque_lag_s=torque_lag,
         skew_s=skew,
-        budget=_budget(chosen.fit, alone.inertia, fixed.inertia, confidence, torque_scale_rel_sd),
-        by_model=fixed.inertia.high - fixed.inertia.low > math.sqrt(2.0) * (alone.inertia.high - alone.inertia.low),
+        budget=(
+            *own, *([by_model] if by_model_kg_m2 > 0.0 else []),
+            torque_scale_line(fixed.inertia.value, torque_scale_rel_sd, confidence),
+        ),
+        by_model=by_model_kg_m2 > max(line.half_width_kg_m2 for line in own),
     )
 
 
@@ -324,10 +329,10 @@ def _coulomb(levels: Levels, fit: CompliantFit, fixed: CompliantIntervals, confi
     return Estimate(value, value - half, value + half) if math.isfinite(half) else None
 
 
-def _budget(
-    fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float, torque_scale_rel_sd: float
-) -> tuple[BudgetLine, ...]:
-    """As `budget_of` of a rigid shaft: set free one group after another, each its share in squares."""
+def _budget(fit: CompliantFit, alone: Estimate, fixed: Estimate, confidence: float) -> tuple[BudgetLine, ...]:
+    """As `budget_of` of a rigid shaft: set free one group after another, each its share in squares; the shaft's model
+    is the last.
+    """
     at = fit.fitted.problem.model.at
     lags, timing = (at(signal_filters.SPEED_LAG), at(signal_filters.TORQUE_LAG)), (at(signal_filters.SKEW),)
     friction = (VISCOUS, DAMPING, LOAD_VISCOUS)
@@ -346,9 +351,7 @@ def _budget(
         ("lag structure", 0.5 * (alone.high - alone.low), "filters of two poles, moving averages"),
         ("shaft model", 0.5 * (fixed.high - fixed.low), "a spring that weighs something: a string"),
     )
-    lines = grown_lines(grown, 0.5 * (fixed.high - fixed.low))
-    told = (line for line in lines if line.source != "shaft model" or line.half_width_kg_m2 > 0.0)
-    return (*told, torque_scale_line(fixed.value, torque_scale_rel_sd, confidence))
+    return grown_lines(grown, 0.5 * (fixed.high - fixed.low))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
