@@ -174,7 +174,7 @@ class Runner:
             resolution = preflight.speed_resolution_rad_s
             slow: tuple[Sample, ...] = ()
             if mode is Mode.TORQUE:
-                slow = slow_down(loop, limits, speed, assumptions, resolution)
+                slow, speed = slow_down(loop, limits, speed, assumptions, resolution)
         ramps: tuple[Ramp, ...] = (speed.ramp,)
         drifted: TorqueResult | None = None
         if mode is Mode.TORQUE:

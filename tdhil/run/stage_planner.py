@@ -24,6 +24,10 @@ from tdhil.run.task import Display, Say, Task
 MOST_WANDER = 0.8
 """Of the speed window, that may be kept free of the excitation because a string under load takes the shaft there."""
 
+ROUNDING = 1e-6
+"""Of the torque limit: a plan whose amplitude ends where no braking torque is needed may come out so much below it;
+the guard holds that back, and stage 5 doesn't command it."""
+
 RESERVE_S = 30.0
 """Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
 
@@ -76,7 +80,7 @@ class StagePlanner:
                 next_step=f"The shaft was stopped. {error.next_step}",
             ) from error
         plan = planned.plan
-        if mode is Mode.TORQUE and plan.torque_min_nm < 0.0 and loop.guard.no_braking:
+        if mode is Mode.TORQUE and plan.torque_min_nm < -ROUNDING * limits.torque_nm and loop.guard.no_braking:
             raise PreflightRefused(
                 f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
                 where="plan of stage 5",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from tdhil.recording.builder import RecordingBuilder
 from tdhil.run.excitation import RigGuess
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.run.stage_planner import StagePlanner
-from tdhil.run.stages.brake_test import Answer, Before, Listener, NoPulse, Pulse, plan_pulse
+from tdhil.run.stages.brake_test import Answer, Before, Listener, NoPulse, Pulse, plan_pulse, slow_down, slow_speed
 from tdhil.run.stages.speed import SpeedResult
 from tdhil.run.stages.steady import Swing, calm_string, swing_of
 from tdhil.run.string_release import SwingDamper
@@ -220,6 +221,42 @@ def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
         planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
     assert "off bottom" in hit.value.next_step
     assert "speed loop" not in str(hit.value)
+
+
+@pytest.mark.parametrize("bit_nm", [0.0, 400.0])
+def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried(bit_nm):
+    limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
+    here = ringing(bit_nm=bit_nm)
+    before = SpeedResult(None, SimpleNamespace(speed_rad_s=3.0), RigGuess(1500.0, 8.0, 60.0), None, None, ())
+    slow, found = slow_down(here.bench, limits, before, ControlAssumptions(), 0.01)
+    mean = float(np.mean([sample.speed_rad_s for sample in slow]))
+    if bit_nm == 0.0:
+        assert found is before
+        assert (mean, here.guard.disturbed) == (pytest.approx(slow_speed(limits), abs=0.05), "")
+    else:
+        assert found.wander_rad_s > 0.1
+        assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it swings, and yields
+        assert mean > slow_speed(limits) + 0.5
+        assert "the string below swings by ±" in here.guard.disturbed
+
+
+def test_whichever_swing_takes_the_shaft_further_counts():
+    near, far = Swing(900.0, 0.2, 0.0, 0.0), Swing(300.0, 0.5, 0.0, 0.0)
+    assert near.wider(far) is far is far.wider(near) is far.wider(None)
+
+
+def test_a_plan_that_ends_where_no_braking_torque_is_needed_needs_none():
+    """What is left below zero is the arithmetic's."""
+    limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, torque_nm=15000.0)
+    for coulomb_nm in (3000.0, 3330.0, 3340.0, 3401.7):
+        here = World(FakeDrive(), limits)
+        here.guard.no_braking = "no pulse was safe"
+        speed = SpeedResult(None, None, RigGuess(1500.0, 0.0, coulomb_nm), None, None, (),
+                            swing=Swing(300.0, 0.5, 5.3, 0.9))
+        planned = StagePlanner(here.bench, here.log, here.display, print).plan(
+            Task(limits, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior()
+        )
+        assert planned.plan.torque_min_nm >= -1e-6 * limits.torque_nm
 
 
 @pytest.mark.parametrize(("echo_s", "kind", "told"), [(1.4, "multisine", 1), (1.4, "prbs", 0), (0.0, "multisine", 0)])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -317,26 +317,39 @@ def slow_speed(limits: MachineLimits, wander_rad_s: float = 0.0) -> float:
 def slow_down(
     loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, assumptions: ControlAssumptions,
     speed_resolution_rad_s: float,
-) -> tuple[Sample, ...]:
-    """Down to the probe's speed in speed mode; the samples of steady rotation there. LimitHit if it gets none.
+) -> tuple[tuple[Sample, ...], SpeedResult]:
+    """Down to the probe's speed in speed mode; the samples of steady rotation there, and what is known by now.
 
-    Of a drill string so many that its swing shows in them, and averages out where it gets no calmer.
+    Of a drill string so many samples that its swing shows in them, and averages out where it gets no calmer. Where it
+    swings further than it did before, the probe is tried so much faster. LimitHit if there is no steady rotation.
     """
-    model, from_rad_s = speed.model, speed.high.speed_rad_s
+    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    target = _ramp_to(loop, limits, speed, speed.high.speed_rad_s)
+    if not limits.winds_up:
+        command = Command(Mode.SPEED, target, 0.0)
+        loop.hold(command, assumptions.largest_speed_lag_s)
+        settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
+        return tuple(settled[-loop.cycles(STEADY_S) :]), speed
+    while True:
+        calmed = calm_string(loop, limits, target, tolerance)
+        if calmed.swing.restless(limits):
+            swing = calmed.swing.wider(speed.swing)
+            speed, loop.guard.disturbed = replace(speed, swing=swing), swing.told
+        if slow_speed(limits, speed.wander_rad_s) <= target + tolerance:
+            length_s = 2.0 * WINDOW_S if calmed.swing.restless(limits) else CALM_S
+            return tuple(calmed.samples[-loop.cycles(length_s) :]), speed
+        target = _ramp_to(loop, limits, speed, target)
+
+
+def _ramp_to(loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, from_rad_s: float) -> float:
+    """To the probe's speed, in speed mode; that speed, rad/s."""
     target = slow_speed(limits, speed.wander_rad_s)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
-    rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2)
+    rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / speed.model.inertia_kg_m2)
     steps = loop.cycles(abs(target - from_rad_s) / rate)
     for step in range(1, steps + 1):
         loop.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
-    command = Command(Mode.SPEED, target, 0.0)
-    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
-    if limits.winds_up:
-        calmed = calm_string(loop, limits, target, tolerance)
-        return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if calmed.swing.restless(limits) else CALM_S) :])
-    loop.hold(command, assumptions.largest_speed_lag_s)
-    settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
-    return tuple(settled[-loop.cycles(STEADY_S) :])
+    return target
 
 
 def probe_braking(

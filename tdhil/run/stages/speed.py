@@ -129,13 +129,16 @@ def run_speed(
     speed_now = max(0.0, start.speed_rad_s) if start else 0.0
     unit_check = SpeedUnitCheck(loop, limits, assumptions, speed_resolution_rad_s, onlooker)
     unit_check.ramp(speed_now, low_rad_s, rate)
-    low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, unit_check.level).level
+    low_held = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions, unit_check.level)
+    swing = low_held.swing
     unit_check.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
     good_enough = STRING_ERROR if limits.winds_up else GOOD_ENOUGH
     for _ in range(TRIES):
         ramped = _ramp(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
-        between, high_samples = [*ramped, *high_held.settling], high_held.level
+        # What scatters may be calm at one level for a while, and no string at both.
+        swing = swing if high_held.swing is None else high_held.swing.wider(swing)
+        low_samples, between, high_samples = low_held.level, [*ramped, *high_held.settling], high_held.level
         low, high = steady_level(low_samples), steady_level(high_samples)
         moved = trace([*low_samples, *between, *high_samples])
         rough = rough_inertia(
@@ -144,7 +147,7 @@ def run_speed(
         )
         if rough is not None and rough.rel_error <= good_enough:
             break
-        if high_held.swing is not None and limits.echo_s > 0.0:
+        if swing is not None and limits.echo_s > 0.0:
             friction = rough_friction(
                 moved.time_s, moved.speed_rad_s, moved.torque_nm - torque_offset_nm, low.level, high.level
             )
@@ -154,7 +157,8 @@ def run_speed(
         rate *= 4.0
         loop.log.event(loop.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
         _ramp(loop, high_rad_s, low_rad_s, rate)
-        low_samples = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions).level
+        low_held = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions)
+        swing = swing if low_held.swing is None else low_held.swing.wider(swing)
     if rough is None or not rough.inertia_kg_m2 > 0.0:
         found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
         raise DriveFault(
@@ -162,8 +166,8 @@ def run_speed(
             where="stage speed",
             next_step=_TOO_RESTLESS if limits.winds_up else _WRONG_TORQUE,
         )
-    if high_held.swing is not None:
-        loop.guard.disturbed = high_held.swing.told
+    if swing is not None:
+        loop.guard.disturbed = swing.told
     friction = rough.friction.opposing(0.5 * (low.speed_rad_s + high.speed_rad_s))
     model = RigGuess(
         rough.inertia_kg_m2,
@@ -181,7 +185,7 @@ def run_speed(
         tuple(high_samples[-loop.cycles(0.5) :]),
         tuple(_samples(part, torque_offset_nm) for part in (low_samples, high_samples)),
         _course(low_samples, ramped, high_held, mean_speeds(limits)),
-        high_held.swing,
+        swing,
     )
 
 

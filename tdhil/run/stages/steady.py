@@ -127,6 +127,10 @@ class Swing:
             " and gets no calmer"
         )
 
+    def wider(self, other: Swing | None) -> Swing:
+        """Whichever takes the shaft further."""
+        return self if other is None or self.speed_rad_s >= other.speed_rad_s else other
+
     def restless(self, limits: MachineLimits) -> bool:
         """Does it swing further than a calm string?"""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
