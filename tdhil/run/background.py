@@ -14,8 +14,8 @@ import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from threading import Event, Lock, Thread
 from typing import IO, Any, Generic, TypeVar
 
@@ -174,17 +174,30 @@ class Background(Generic[T]):
                 if self._dropped:
                     raise
                 self.instead = str(gone)
-        usual_s = sys.getswitchinterval()
-        sys.setswitchinterval(min(usual_s, SWITCH_S))
-        _in_threads.add(self)
-        try:
+        with _in_a_thread(self):
             return self._work()
-        finally:
-            _in_threads.discard(self)
-            sys.setswitchinterval(usual_s)
 
 
 _in_threads: set[Background[Any]] = set()
+_entering = Lock()
+_usual_s: list[float] = []       # the interpreter's own, while any thread is at it
+
+
+@contextmanager
+def _in_a_thread(work: Background[Any]) -> Iterator[None]:
+    """The first one in has the interpreter handed over sooner, the last one out gives back what was usual."""
+    with _entering:
+        if not _in_threads:
+            _usual_s.append(sys.getswitchinterval())
+            sys.setswitchinterval(min(_usual_s[0], SWITCH_S))
+        _in_threads.add(work)
+    try:
+        yield
+    finally:
+        with _entering:
+            _in_threads.discard(work)
+            if not _in_threads:
+                sys.setswitchinterval(_usual_s.pop())
 
 
 def goes_on() -> bool:

@@ -14,8 +14,10 @@ import pytest
 from drivers.drive import Command, Counters, Mode
 from drivers.errors import CommunicationLost, LimitHit
 from tdhil.errors import Interrupted
-from tdhil.run import adaptive_duration, stage_planner
+from tdhil.run import adaptive_duration, background, stage_planner
+from tdhil.run.background import Background, goes_on
 from tdhil.run.settings import ExcitationRequest
+from tests.path.path_runs import wait_for
 from tests.run.run_outcomes import assert_at_rest
 
 IN_VAIN_S = 120.0
@@ -89,9 +91,27 @@ leave(3)
     assert (done.returncode, done.stdout, done.stderr) == (3, "left alone\n", "")
 
 
-def test_what_the_arithmetic_raises_is_raised_and_the_interpreter_goes_on_as_before(world):
+@pytest.fixture
+def usual_s():
+    """Of the interpreter's switches, once no arithmetic of the tests before goes on that nobody waited for."""
+    wait_for("the arithmetic of the tests before", lambda: not goes_on(), hangs_s=IN_VAIN_S)
+    return sys.getswitchinterval()
+
+
+def test_the_interpreter_switches_sooner_until_the_last_piece_of_arithmetic_is_over(usual_s):
+    """Whichever began first: one that was left alone may end before or after the next one."""
+    until = [threading.Event() for _ in range(2)]
+    first, second = (Background(one.wait) for one in until)
+    wait_for("both", lambda: len(background._in_threads) == 2, hangs_s=IN_VAIN_S)
+    for one, event in zip((first, second), until, strict=True):
+        assert sys.getswitchinterval() == pytest.approx(background.SWITCH_S)
+        event.set()
+        one.ended.wait(IN_VAIN_S)
+    assert sys.getswitchinterval() == usual_s
+
+
+def test_what_the_arithmetic_raises_is_raised_and_the_interpreter_goes_on_as_before(world, usual_s):
     here = world()
-    usual_s = sys.getswitchinterval()
     with pytest.raises(SystemExit):
         here.bench.compute(lambda: sys.exit(3), Command(Mode.SPEED, 0.0, 0.0))
     assert sys.getswitchinterval() == usual_s
