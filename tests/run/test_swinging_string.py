@@ -214,10 +214,10 @@ def test_yielding_stays_within_its_bounds_and_forward():
 
 def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
     here = World(FakeDrive(), LIMITS)
-    here.guard.disturbed = Swing(1200.0, 3.0, 5.3, 0.9).told
-    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.0, 5.3, 0.9))
+    here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).told
+    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.2, 5.3, 0.9))
     planner = StagePlanner(here.bench, here.log, here.display, print)
-    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top by ±3\.00 rad/s") as hit:
+    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top by ±3\.20 rad/s") as hit:
         planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
     assert "off bottom" in hit.value.next_step
     assert "speed loop" not in str(hit.value)

@@ -58,8 +58,9 @@ RESTLESS_ERROR = 0.5
 """As `STRING_ERROR`, of a shaft whose own inertia is known by what it did before an echo: where the string swings
 along, the motor still moves further than by its inertia alone."""
 
-WANDER = 1.5
-"""Under torque alone a restless shaft goes so many times as far as it does under a speed control that yields."""
+WANDER = 1.25
+"""Under torque alone a restless shaft goes so many times as far as the furthest that it was seen to go under a speed
+control that yields."""
 
 TRIES = 4
 NOBODY = Onlooker()
