@@ -27,7 +27,7 @@ from drivers import (
 from drivers.own_limits import SPEED, TORQUE, WIDER_FLAG
 from tdhil.config import DEFAULT_EXCITATION, told_before_echo
 from tdhil.recording import LagPrior
-from tdhil.run.excitation import ECHOES_S, excitation_kind
+from tdhil.run.excitation import ECHOES_S, excitation_kind, tells_before_echo
 from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -243,7 +243,7 @@ def refuse_by_plan(limits: MachineLimits, request: ExcitationRequest, lets_go: b
             next_step="Use --excitation multisine, or give load: {kind: string, length_m, outer_diameter_m,"
             " inner_diameter_m}",
         )
-    if told_before_echo(request.kind) and not ECHOES_S[0] <= limits.echo_s <= ECHOES_S[1]:
+    if told_before_echo(request.kind) and not tells_before_echo(limits.echo_s):
         raise PreflightRefused(
             f"{request.kind} was asked for, and an echo comes back after {limits.echo_s:.2f} s: it tells those of"
             f" {ECHOES_S[0]:g} to {ECHOES_S[1]:g} s, of about 1100 to 6000 m of pipe",

@@ -14,7 +14,7 @@ from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.run.adaptive_duration import Decision, Enough
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.design import Knowledge, Noise, assumed_noise, measured_noise
-from tdhil.run.excitation import ECHOES_S, MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan
+from tdhil.run.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, tells_before_echo
 from tdhil.run.guard import LIGHTEN, Guard
 from tdhil.run.planning import Planned, as_followed, plan_acquisition
 from tdhil.run.settings import ExcitationRequest
@@ -23,10 +23,6 @@ from tdhil.run.task import Display, Say, Task
 
 MOST_WANDER = 0.8
 """Of the speed window, that may be kept free of the excitation because a string under load takes the shaft there."""
-
-ROUNDING = 1e-6
-"""Of the torque limit: a plan whose amplitude ends where no braking torque is needed may come out so much below it;
-the guard holds that back, and stage 5 doesn't command it."""
 
 RESERVE_S = 30.0
 """Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
@@ -80,7 +76,8 @@ class StagePlanner:
                 next_step=f"The shaft was stopped. {error.next_step}",
             ) from error
         plan = planned.plan
-        if mode is Mode.TORQUE and plan.torque_min_nm < -ROUNDING * limits.torque_nm and loop.guard.no_braking:
+        # Where the amplitude ends because no braking torque is had, rounding may leave it just below zero.
+        if mode is Mode.TORQUE and plan.torque_min_nm < -1e-9 * limits.torque_nm and loop.guard.no_braking:
             raise PreflightRefused(
                 f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
                 where="plan of stage 5",
@@ -96,9 +93,7 @@ class StagePlanner:
             f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
         )
         self._tell(planned.said())
-        if speed.swing is not None and not told_before_echo(request.kind) and (
-            ECHOES_S[0] <= limits.echo_s <= ECHOES_S[1]
-        ):
+        if speed.swing is not None and not told_before_echo(request.kind) and tells_before_echo(limits.echo_s):
             self._tell(
                 "the string below will drown some of these lines; --excitation prbs asks only for the time before an"
                 " echo, and tells more of J above a bit"

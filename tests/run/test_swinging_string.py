@@ -18,7 +18,7 @@ from tdhil.run.settings import ControlAssumptions, ExcitationRequest, MachineLim
 from tdhil.run.stage_planner import StagePlanner
 from tdhil.run.stages.brake_test import Answer, Before, Listener, NoPulse, Pulse, plan_pulse, slow_down, slow_speed
 from tdhil.run.stages.speed import SpeedResult
-from tdhil.run.stages.steady import Swing, calm_string, swing_of
+from tdhil.run.stages.steady import Swing, calm_string, swing_of, widest
 from tdhil.run.string_release import SwingDamper
 from tdhil.run.task import Task
 from tests.run.fake_drive import PERIOD_S, FakeDrive, FakeLog, World
@@ -242,7 +242,8 @@ def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried
 
 def test_whichever_swing_takes_the_shaft_further_counts():
     near, far = Swing(900.0, 0.2, 0.0, 0.0), Swing(300.0, 0.5, 0.0, 0.0)
-    assert near.wider(far) is far is far.wider(near) is far.wider(None)
+    assert widest(near, far) is far is widest(far, near) is widest(None, far)
+    assert widest(None, None) is None
 
 
 def test_a_plan_that_ends_where_no_braking_torque_is_needed_needs_none():

@@ -280,7 +280,7 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
     fixed = alone if chosen.beside is None else _united(alone, inertias(chosen.beside, confidence))
     speed_lag, torque_lag, skew = lags_of(chosen.fit.fitted, confidence)
     *own, by_model = _budget(chosen.fit, alone.inertia, fixed.inertia, confidence)
-    by_model_kg_m2 = by_model.half_width_kg_m2
+    told = own if by_model.half_width_kg_m2 == 0.0 else [*own, by_model]
     return CompliantResult(
         inertia=fixed.inertia,
         shaft=Compliant(
@@ -296,11 +296,8 @@ def result_of(chosen: Chosen, levels: Levels, confidence: float, torque_scale_re
         speed_lag_s=speed_lag,
         torque_lag_s=torque_lag,
         skew_s=skew,
-        budget=(
-            *own, *([by_model] if by_model_kg_m2 > 0.0 else []),
-            torque_scale_line(fixed.inertia.value, torque_scale_rel_sd, confidence),
-        ),
-        by_model=by_model_kg_m2 > max(line.half_width_kg_m2 for line in own),
+        budget=(*told, torque_scale_line(fixed.inertia.value, torque_scale_rel_sd, confidence)),
+        by_model=by_model.half_width_kg_m2 > max(line.half_width_kg_m2 for line in own),
     )
 
 

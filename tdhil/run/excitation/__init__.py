@@ -14,7 +14,8 @@ from tdhil.run.excitation.reference import (
     Transition as Transition, excitation_kind as excitation_kind, make_transition as make_transition,
 )
 from tdhil.run.excitation.signals import (
-    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape, unit_peak as unit_peak,
+    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape, tells_before_echo as tells_before_echo,
+    unit_peak as unit_peak,
 )
 from tdhil.run.excitation.speed_loop import (
     Following as Following, fit_following as fit_following, held_back_to as held_back_to,

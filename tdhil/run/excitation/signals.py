@@ -212,6 +212,11 @@ _ORDER, _TAPS = 6, (6, 5)
 _PRBS_LINES = 30
 
 
+def tells_before_echo(echo_s: float) -> bool:
+    """Does what comes back after ``echo_s`` leave this excitation time to tell J, and die away in time?"""
+    return ECHOES_S[0] <= echo_s <= ECHOES_S[1]
+
+
 def prbs_shape() -> Shape:
     """Harmonics 1 to 30, peak deviation of speed 1."""
     register, sequence = [1] * _ORDER, []

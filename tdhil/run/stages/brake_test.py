@@ -22,8 +22,8 @@ from tdhil.run.control_loop import ControlLoop
 from tdhil.run.excitation import RigGuess
 from tdhil.run.guard import LIGHTEN
 from tdhil.run.settings import ControlAssumptions, MachineLimits
-from tdhil.run.stages.speed import SpeedResult, mean_speeds
-from tdhil.run.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady
+from tdhil.run.stages.speed import SpeedResult, mean_speeds, ramp_speed
+from tdhil.run.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady, widest
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The braking probe's pulse: how strong, how long, and what it would do on a drive that takes it the wrong way. Pure.
@@ -332,12 +332,12 @@ def slow_down(
         return tuple(settled[-loop.cycles(STEADY_S) :]), speed
     while True:
         calmed = calm_string(loop, limits, target, tolerance)
-        if calmed.swing.restless(limits):
-            swing = calmed.swing.wider(speed.swing)
-            speed, loop.guard.disturbed = replace(speed, swing=swing), swing.told
+        restless = calmed.swing.restless(limits)
+        if restless:
+            speed = replace(speed, swing=widest(speed.swing, calmed.swing))
+            loop.guard.disturbed = speed.disturbed
         if slow_speed(limits, speed.wander_rad_s) <= target + tolerance:
-            length_s = 2.0 * WINDOW_S if calmed.swing.restless(limits) else CALM_S
-            return tuple(calmed.samples[-loop.cycles(length_s) :]), speed
+            return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if restless else CALM_S) :]), speed
         target = _ramp_to(loop, limits, speed, target)
 
 
@@ -346,9 +346,7 @@ def _ramp_to(loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, from_
     target = slow_speed(limits, speed.wander_rad_s)
     span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
     rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / speed.model.inertia_kg_m2)
-    steps = loop.cycles(abs(target - from_rad_s) / rate)
-    for step in range(1, steps + 1):
-        loop.cycle(Command(Mode.SPEED, from_rad_s + (target - from_rad_s) * step / steps, 0.0))
+    ramp_speed(loop, from_rad_s, target, rate)
     return target
 
 

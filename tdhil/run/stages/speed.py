@@ -33,6 +33,7 @@ from tdhil.run.stages.steady import (
     steady_level,
     trace,
     wait_until_steady,
+    widest,
 )
 from tdhil.run.string_release import SwingDamper
 
@@ -101,6 +102,11 @@ class SpeedResult:
         return 0.0 if self.swing is None else WANDER * self.swing.speed_rad_s
 
     @property
+    def disturbed(self) -> str:
+        """For the guard: what disturbs the shaft, in words; empty where nothing does."""
+        return "" if self.swing is None else self.swing.told
+
+    @property
     def levels(self) -> tuple[Level, ...]:
         return (self.low.level, self.high.level)
 
@@ -135,10 +141,10 @@ def run_speed(
     unit_check.conclude(Command(Mode.SPEED, low_rad_s, 0.0))
     good_enough = STRING_ERROR if limits.winds_up else GOOD_ENOUGH
     for _ in range(TRIES):
-        ramped = _ramp(loop, low_rad_s, high_rad_s, rate)
+        ramped = ramp_speed(loop, low_rad_s, high_rad_s, rate)
         high_held = _settle_and_hold(loop, limits, high_rad_s, tolerance_rad_s, assumptions)
         # What scatters may be calm at one level for a while, and no string at both.
-        swing = swing if high_held.swing is None else high_held.swing.wider(swing)
+        swing = widest(swing, high_held.swing)
         low_samples, between, high_samples = low_held.level, [*ramped, *high_held.settling], high_held.level
         low, high = steady_level(low_samples), steady_level(high_samples)
         moved = trace([*low_samples, *between, *high_samples])
@@ -157,9 +163,9 @@ def run_speed(
             break
         rate *= 4.0
         loop.log.event(loop.now_s, "plan", f"rough inertia is uncertain; ramping again at {rate:.3g} rad/s²")
-        _ramp(loop, high_rad_s, low_rad_s, rate)
+        ramp_speed(loop, high_rad_s, low_rad_s, rate)
         low_held = _settle_and_hold(loop, limits, low_rad_s, tolerance_rad_s, assumptions)
-        swing = swing if low_held.swing is None else low_held.swing.wider(swing)
+        swing = widest(swing, low_held.swing)
     if rough is None or not rough.inertia_kg_m2 > 0.0:
         found = "none" if rough is None else f"{rough.inertia_kg_m2:.3g} kg·m²"
         raise DriveFault(
@@ -167,8 +173,6 @@ def run_speed(
             where="stage speed",
             next_step=_TOO_RESTLESS if limits.winds_up else _WRONG_TORQUE,
         )
-    if swing is not None:
-        loop.guard.disturbed = swing.told
     friction = rough.friction.opposing(0.5 * (low.speed_rad_s + high.speed_rad_s))
     model = RigGuess(
         rough.inertia_kg_m2,
@@ -176,8 +180,7 @@ def run_speed(
         friction.coulomb_nm,
         min(0.8, max(good_enough, rough.rel_error)),
     )
-    loop.guard.model = model
-    return SpeedResult(
+    result = SpeedResult(
         low,
         high,
         model,
@@ -188,6 +191,8 @@ def run_speed(
         _course(low_samples, ramped, high_held, mean_speeds(limits)),
         swing,
     )
+    loop.guard.model, loop.guard.disturbed = model, result.disturbed
+    return result
 
 
 def _before_echo(
@@ -202,7 +207,7 @@ def _before_echo(
     for number, between_s in enumerate(BEFORE_RAMPS_S):
         before, asked = hold_damped(loop, _damper(loop, limits, to), between_s)
         to = speeds_rad_s[number % 2]
-        ramped = _ramp(loop, asked[-1], to, rate)
+        ramped = ramp_speed(loop, asked[-1], to, rate)
         after = loop.hold(Command(Mode.SPEED, to, 0.0), limits.echo_s)
         one = trace([*before, *ramped, *after])
         seen.append((one.time_s, one.speed_rad_s, one.torque_nm, before[-1].time_s))
@@ -246,8 +251,9 @@ def _in_torque(loop: ControlLoop) -> bool:
     return loop.last is not None and loop.last.mode is Mode.TORQUE
 
 
-def _ramp(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
-    steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / loop.period_s))
+def ramp_speed(loop: ControlLoop, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> list[Sample]:
+    """A straight ramp of the setpoint in speed mode; the samples."""
+    steps = loop.cycles(abs(end_rad_s - start_rad_s) / rate_rad_s2)
     span = end_rad_s - start_rad_s
     return [loop.cycle(Command(Mode.SPEED, start_rad_s + span * step / steps, 0.0)) for step in range(1, steps + 1)]
 

@@ -127,10 +127,6 @@ class Swing:
             " and gets no calmer"
         )
 
-    def wider(self, other: Swing | None) -> Swing:
-        """Whichever takes the shaft further."""
-        return self if other is None or self.speed_rad_s >= other.speed_rad_s else other
-
     def restless(self, limits: MachineLimits) -> bool:
         """Does it swing further than a calm string?"""
         return self.torque_nm > CALM_SHARE * limits.torque_nm
@@ -144,6 +140,11 @@ class Calmed:
     setpoints_rad_s: list[float]
     swing: Swing
     damper: SwingDamper
+
+
+def widest(*swings: Swing | None) -> Swing | None:
+    """Whichever takes the shaft furthest; None where there is none."""
+    return max((one for one in swings if one is not None), key=lambda one: one.speed_rad_s, default=None)
 
 
 def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
