@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from drivers.angle import Unwrapped as Unwrapped
     from drivers.clock import (
         Clock as Clock, LOWER_THE_RATE as LOWER_THE_RATE, MonotonicClock as MonotonicClock,
         SteppedClock as SteppedClock, quantile as quantile,
@@ -14,13 +15,14 @@ if TYPE_CHECKING:
         FrameTap as FrameTap, Identity as Identity, KeptAlive as KeptAlive, Mode as Mode, Outcome as Outcome,
         Paced as Paced, Polled as Polled, PositionReading as PositionReading, Positioned as Positioned,
         PowerState as PowerState, Preflight as Preflight, RawFrame as RawFrame, Rehearsed as Rehearsed,
-        ReportingFilters as ReportingFilters, Sample as Sample, StopsFeeding as StopsFeeding, Telling as Telling,
-        Timed as Timed,
+        RemovesTorque as RemovesTorque, ReportingFilters as ReportingFilters, Sample as Sample,
+        StopsFeeding as StopsFeeding, Telling as Telling, Timed as Timed,
     )
     from drivers.errors import (
         CommandRejected as CommandRejected, CommunicationLost as CommunicationLost, DataFileError as DataFileError,
         DriveFault as DriveFault, LimitHit as LimitHit, ModeNotConfirmed as ModeNotConfirmed,
         ObjectRefused as ObjectRefused, PreflightRefused as PreflightRefused, Problem as Problem,
+        ReportsContradict as ReportsContradict,
         StopNotConfirmed as StopNotConfirmed, TdhilError as TdhilError,
     )
     from drivers.preflight import (

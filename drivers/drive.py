@@ -9,6 +9,7 @@ knows of objects, registers, per-mille or rpm. A caller goes down the list once:
 `exchange` calls that follow, one a cycle, so that every cycle is seen, recorded and guarded alike.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -33,6 +34,7 @@ class PowerState(Enum):
     ENABLED = "enabled"            # operation enabled: setpoints act
     QUICK_STOP = "quick stop"      # decelerating or holding after a quick stop
     FAULT = "fault"                # fault reaction active, or fault
+    UNKNOWN = "no valid state"     # the status word is none that the drive can show: nothing is known of it
 
 
 class Command(NamedTuple):
@@ -54,6 +56,10 @@ class Sample(NamedTuple):
     ``time_s`` is control time of the SYNC (of the middle of the transaction on Modbus, give or take
     ``half_width_s``); ``age_s`` says how long after it the feedback arrived. ``fresh`` is False when the
     cycle brought none: the values are then those of the cycle before.
+
+    ``position_rad`` is the motor shaft's angle at ``time_s``, counted by the drive apart from its speed, and unwrapped
+    since the first reading (`drivers.angle`). None where the cycle brought none. In a sample that was polled for
+    (`Polled`) it was read right behind the rest.
     """
 
     time_s: float
@@ -68,6 +74,7 @@ class Sample(NamedTuple):
     standstill: bool               # as the drive says, where it says so
     limit_active: bool             # internal limit active (statusword bit 11)
     status: int                    # raw statusword, for the log
+    position_rad: float | None = None
 
 
 class RawFrame(NamedTuple):
@@ -160,6 +167,9 @@ class Preflight:
     kept_speed_rad_s: float | None = None        # (`drivers.own_limits`)
     quick_stop_holds: bool | None = None   # after a quick stop: held by the drive, let go of; None: nobody knows
     fed_by_any_client: bool = False    # requests of any other client keep the watchdog from acting, as far as is known
+    position_resolution_rad: float = 0.0   # one count of the motor's angle; 0: the drive reports none
+    position_period_s: float | None = None     # so far apart at most it comes with the cycle; None: `Positioned` alone
+    position_gap_s: float = math.inf       # after a longer gap the turns are not known (`drivers.angle.Unwrapped`)
 
     @property
     def watched(self) -> bool:
@@ -254,6 +264,17 @@ class StopsFeeding(Protocol):
     """
 
     def stop_feeding(self) -> None: ...
+
+
+@runtime_checkable
+class RemovesTorque(Protocol):
+    """A drive whose `disable` brakes a shaft that still turns, and that can also be told not to.
+
+    ``remove_torque`` moves towards disabled in the cycles that follow, whatever the reported speed is: for a shaft that
+    the drive itself accelerates against a quick stop.
+    """
+
+    def remove_torque(self) -> None: ...
 
 
 @runtime_checkable

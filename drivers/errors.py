@@ -8,7 +8,8 @@
     │   └── ObjectRefused           SDO abort 06090030h on 6072h; Modbus exception 2 on register 40111
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged; SDO time-out; Modbus CRC
     ├── DriveFault                  EMCY 7305h in motion; fault state; state machine stuck; Modbus exception in motion
-    │   └── ModeNotConfirmed        6061h did not follow 6060h in time
+    │   ├── ModeNotConfirmed        6061h did not follow 6060h in time
+    │   └── ReportsContradict       the reported speed fell by 4 rad/s while the reported torque accelerates the shaft
     ├── LimitHit                    speed left its window; torque or time limit reached
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence
     └── CommandRejected             a NaN or out-of-range setpoint; never reached the bus
@@ -29,6 +30,7 @@ __all__ = [
     "ObjectRefused",
     "PreflightRefused",
     "Problem",
+    "ReportsContradict",
     "StopNotConfirmed",
     "TdhilError",
 ]
@@ -52,6 +54,10 @@ class DriveFault(TdhilError):
 
 class ModeNotConfirmed(DriveFault):
     """The drive did not take over the mode of operation it was asked for."""
+
+
+class ReportsContradict(DriveFault):
+    """Two reports of the drive cannot both be true of one shaft."""
 
 
 class LimitHit(TdhilError):

@@ -33,6 +33,9 @@ class Ended(Enum):
     NO_ANSWER = "no answer"
 
 
+BLANK_WORDS = (0x0000, 0xFFFF)
+
+
 @dataclass(frozen=True)
 class Seen:
     """One look. ``speed`` in rad/s, or in counts where the drive's unit isn't known; ``unit`` says which."""
@@ -44,6 +47,7 @@ class Seen:
     near_zero: bool
     standstill: bool                   # as the drive says
     follows: bool                      # setpoints still act
+    blank: bool = False                # the status word is all zeros or all ones: a gateway without its drive
 
 
 class Target(Protocol):
@@ -80,6 +84,7 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
     best, asked, follows = math.inf, 0, True
     troubles: list[str] = []
     coasted: Seen | None = None
+    shown = ""                         # what was shown in place of a state
     ended: Ended | None = None
     while ended is None:
         try:
@@ -101,9 +106,10 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
                 ended = Ended.NO_ANSWER
         else:
             now_s = heard_s = clock.now_s()
-            first, follows = first or last, last.follows
+            first, follows = first or last, last.follows or last.blank
             if coasted is None and last.state is PowerState.OFF and not last.near_zero:
                 coasted = last
+            shown = last.text if last.blank else shown
             if not last.near_zero or follows:
                 quiet_since_s = None
             elif quiet_since_s is None:
@@ -122,8 +128,12 @@ def bare_stop(target: Target, clock: Clock, longest_s: float = LONGEST_S) -> Bar
     let_go = () if coasted is None else (
         f"its torque was off while the shaft still turned at {coasted.speed:.3g} {coasted.unit}: it ran out unbraked",
     )
+    no_state = () if not shown else (
+        f"the drive showed {shown}: a speed that comes with it is not believed, and the quick stop was asked for again",
+    )
     return BareStopReport(
-        ended, first, last, clock.now_s() - begun_s, asked, (*target.remarks(), *let_go, *dict.fromkeys(troubles))
+        ended, first, last, clock.now_s() - begun_s, asked,
+        (*target.remarks(), *let_go, *no_state, *dict.fromkeys(troubles)),
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from profiles.library import (
         Profile as Profile, eds_path as eds_path, load_canopen_profile as load_canopen_profile,
         load_modbus_profile as load_modbus_profile, load_profile as load_profile, matching_names as matching_names,
-        profile_names as profile_names,
+        parse_profile as parse_profile, profile_names as profile_names, profile_text as profile_text,
     )
     from profiles.model import (
         DataModel as DataModel, Finding as Finding, NonNegative as NonNegative, Positive as Positive,

@@ -80,6 +80,16 @@ def load_profile(name_or_path: str, bus: str | None = None) -> Profile:
     return profile
 
 
+def profile_text(name_or_path: str) -> str:
+    """The text of the file that `load_profile` reads. DataFileError where it can't be read."""
+    return read_text(profile_path(name_or_path))
+
+
+def parse_profile(text: str, name: str) -> Profile:
+    """A profile from its text; ``name`` stands in messages. DataFileError with every problem and its line."""
+    return _parsed(text, name)
+
+
 @lru_cache(maxsize=64)
 def _parsed(text: str, name: str) -> Profile:
     """The same text is parsed once: what comes of it is frozen, and a scan or a table asks for all of them."""

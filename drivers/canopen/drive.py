@@ -4,6 +4,7 @@ One cycle, all of it sent by this loop and nothing by any other thread or by the
 
     tick ─ heartbeat (when due) ─ RPDO2 (when the mode changes) ─ RPDO1 ─ SYNC ─► TPDO1 (─ TPDO2)
            700h+host              6060h                         6040h 6071h 60FFh   6041h 6077h 606Ch
+                                                                                   (6061h 6074h 6064h)
 
 Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO shows that same instant. A mode
 switch and the torque target that seeds it therefore act together. Where a torque offset is used (60B2h) it goes out in
@@ -15,10 +16,13 @@ is asked by node guarding instead (remote frame 700h+node); what else the frames
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from drivers.angle import Unwrapped
 from drivers.canopen import preflight as checks
 from drivers.canopen import watchdog as arming
 from drivers.canopen.bus import PEER_DEAD_S, CanLink
@@ -27,6 +31,7 @@ from drivers.canopen.other_master import Strangers
 from drivers.canopen.pdo import (
     Feedback,
     Reported,
+    Slow,
     Units,
     encode_speed,
     encode_torque,
@@ -45,9 +50,18 @@ from drivers.canopen.preflight import (
 from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
 from drivers.canopen.sdo_feedback import keep_stepping, poll, push
-from drivers.canopen.state_machine import DISABLE_VOLTAGE, FAULT_RESET, State, Wish, controlword_towards, decode
-from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, ReadBack, SignOfLife, Watch
-from drivers.clock import RATES_HZ, Clock, Ticks, how_late
+from drivers.canopen.slow_feedback import Shown, SlowFeedback
+from drivers.canopen.state_machine import (
+    DISABLE_VOLTAGE,
+    FAULT_RESET,
+    REMOTE,
+    State,
+    Wish,
+    controlword_towards,
+    decode,
+)
+from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, Group, ReadBack, SignOfLife, Watch
+from drivers.clock import RATES_HZ, STALL_CYCLES, STALL_S, Clock, Ticks, how_late
 from drivers.drive import Command, Counters, DriveLimits, FrameTap, Identity, Mode, PositionReading, Preflight, Sample
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import OwnLimits
@@ -63,6 +77,10 @@ HOST_NODE = 127
 SYNC = 0x080
 NMT = 0x000
 START, ENTER_PRE_OPERATIONAL = 0x01, 0x80
+NMT_COMMANDS = {START: "start", 0x02: "stop", ENTER_PRE_OPERATIONAL: "enter pre-operational", 0x81: "reset node",
+                0x82: "reset communication"}
+LOCAL_CYCLES = 3
+"""A bit that is missing for so many cycles is no accident of one frame."""
 FIRST_ANSWERS, FIRST_ANSWER_S = 3, 0.05
 """The first SYNCs, at standstill, are given so long: how soon this drive answers is then known, and what is late."""
 QUICK_STOP_OPTION = 0x605A
@@ -70,6 +88,10 @@ DRIVE_SILENT_S = 0.5
 """After so long without its heartbeat the drive counts as lost."""
 MODE_STALE_S, MODE_STALE_TIMES = 0.5, 10
 """A mode that was displayed for the last time so long ago, and so many frames of it ago, isn't known any more."""
+THIN_S, THIN_CYCLES, THIN_SHARE = 1.0, 10, 0.5
+"""Feedback that is missing in more than this share of the cycles within this time (so many cycles at least) is too
+little to guard a shaft by. A bus that loses every tenth frame is far from it."""
+TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 _NO_WORD = b""
 _DISABLED = (State.SWITCH_ON_DISABLED, State.FAULT)
 _OUT_OF_OPERATION = (State.QUICK_STOP_ACTIVE, State.FAULT, State.FAULT_REACTION_ACTIVE)
@@ -115,6 +137,7 @@ class Cia402Drive:
             self._watch, lambda request: self._link.send(0x600 + node, request), self._strangers.tell, node
         )
         self._objects.on_answer(self._read_back.take)
+        self._read_back.on_changed = self._on_changed
         self._strangers.on_write = self._on_write
         self._shape = shape_of(profile)
         self._standing = Standing(self._objects, self._link, node, self.period_s, self._shape.target_speed)
@@ -126,22 +149,26 @@ class Cia402Drive:
         self._identity: Identity | None = None
         self._stage = ""               # as announced
         self._taken = False
+        self._remapped = False         # what the TPDOs carry was changed: no frame of theirs is believed any more
         self._units = Units(1.0, 1.0)
         self._codes: dict[Mode, int] = {}
         self._modes: dict[int, Mode] = {}
         self._layout = self._shape.feedback
         self._wide = self._shape.wide
         self._feedback = self._new_feedback()
+        self._link.handlers[NMT] = self._on_nmt
         self._strangers.own(SYNC, "SYNC", lambda data: self._feedback.on_foreign_sync())
         for number in range(1, 5):
             self._strangers.own(0x100 * (1 + number) + node, rpdo_kind(number, 0x100 * (1 + number) + node))
         self._has_target = self._shape.target_torque
-        self._slow_layout = self._shape.slow(False)
+        self._slow = SlowFeedback(Slow(wide=self._wide), 1)
         self._watchdog_s = self._allowed_silence_s = 0.0
         self._angle: Angle | None = None
+        self._unwrapped: Unwrapped | None = None
         self._shown_s = clock.now_s()  # when the mode was last displayed
         self._wish = Wish.OFF
         self._in_operation = False     # enabled, and seen enabled since
+        self._was_remote, self._local = False, 0       # bit 9: was it set in operation, and for how long not since
         self._ever_asked = False       # to be enabled
         self._armed = True             # its watchdog, or nobody knows yet
         self._reported = Reported()
@@ -152,14 +179,29 @@ class Cia402Drive:
         self._ticks = Ticks(clock, self.period_s)
         self._watch.host_stood_still = self._stood_still
         self._watch.host_late = self.host_late
+        self._watch.on_boot_up = self._reported.restarted
         self._cycles = self._missed = self._late = 0
 
     def _new_feedback(self) -> Feedback:
+        self._recent: deque[bool] = deque(maxlen=max(THIN_CYCLES, round(THIN_S / self.period_s)))
         feedback = Feedback(self._shape, None if self.clock.stepped else self.clock.now_s, self.period_s)
         self._link.handlers[self._tpdo1_id] = feedback.on_tpdo1
         if self.clock.stepped:
             self._link.handlers[CYCLE_ID] = feedback.on_cycle_end
         return feedback
+
+    def _new_slow(self, carried: Slow) -> SlowFeedback:
+        return SlowFeedback(carried, 1 if self._wide else slow_syncs(self.period_s))
+
+    def _angle_coming(self) -> checks.AngleComing:
+        """How the motor's angle will come, at whichever rate this drive is given."""
+        if self._angle is None or self._unwrapped is None:
+            return checks.AngleComing()
+        periods_s = (self.period_s, *(1.0 / rate for rate in self.rates_hz))
+        apart_s = max(periods_s if self._wide else (slow_syncs(one) * one for one in periods_s))
+        gap_s = self._unwrapped.longest_gap_s
+        comes = self._slow.carried.position is not None and apart_s <= gap_s
+        return checks.AngleComing(self._angle.rad_per_count, apart_s if comes else None, gap_s)
 
     def host_late(self) -> str:
         """How late this computer or its adapter has been of late, in words; empty where it keeps up."""
@@ -216,7 +258,8 @@ class Cia402Drive:
         self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
         checks.check_identity(table, self._identity, self._profile)
         if not checks.check_state(table, objects, self._units, self._profile, limits):
-            return checks.report(table, self._identity, self._profile, objects, self._units, rated_nm, {}, 0.0, {})
+            return checks.report(table, self._identity, self._profile, objects, self._units, rated_nm, {}, 0.0, {},
+                                 checks.AngleComing())
         if self._journal is not None:
             checks.restore_from(table, objects, self._journal, self._identity)
         check_parameters(table, objects, self._profile)
@@ -234,11 +277,16 @@ class Cia402Drive:
             self._shape = replace(self._shape, offset=offset[0])
             self._units = replace(self._units, offset_nm_per_lsb=offset[1])
         self._standing.offset = self._shape.offset
-        with_demand, others = arming.map_pdos(table, objects, self._node, self._profile, self._shape, self.period_s)
+        carried, others = arming.map_pdos(
+            table, objects, self._node, self._profile, self._shape, self.period_s,
+            None if self._angle is None else self._angle.entry,
+        )
         for number, cob_id in others.items():
             self._strangers.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
         self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.second else {}), **others}
-        self._slow_layout = self._shape.slow(with_demand)
+        self._slow = self._new_slow(carried)
+        frames = arming.feedback_frames(objects)
+        self._unwrapped = None if self._angle is None else self._angle.unwrapped(limits.speed_rad_s)
         self._life.pace(limits.watchdog_s / 5.0)
         self._life.host_node = self._strangers.settle_number(table)
         heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
@@ -256,10 +304,10 @@ class Cia402Drive:
         )
         self._life.keep_to(feed_s)
         self._armed = feed_s > 0.0
-        self._watch_settings(limits.watchdog_s if feed_s else 0.0)
+        self._watch_settings(limits.watchdog_s if feed_s else 0.0, frames)
         found = checks.report(
             table, self._identity, self._profile, objects, self._units, rated_nm, self._codes,
-            limits.watchdog_s if feed_s else 0.0, own.kept,
+            limits.watchdog_s if feed_s else 0.0, own.kept, self._angle_coming(),
         )
         self._allowed_silence_s = limits.watchdog_s if self._life.asks else DRIVE_SILENT_S if heard else 0.0
         self._start()
@@ -290,14 +338,15 @@ class Cia402Drive:
         with suppress(ObjectRefused):  # it follows the SYNC alone then
             arming.set_period(self._objects, self._profile, self.period_s)
         with suppress(ObjectRefused):
-            arming.set_slow_syncs(self._objects, self.period_s)
+            self._read_back.stands(0x1801, 2, arming.set_slow_syncs(self._objects, self.period_s))
         self._standing.set_period(self.period_s)
         self._life.feed()
         self._feedback = self._new_feedback()
+        self._slow = self._new_slow(self._slow.carried)
         self._cycles = self._missed = self._late = self._contradictions = 0
         self._start(0.0 if measuring else 0.5)
 
-    def _watch_settings(self, watchdog_s: float) -> None:
+    def _watch_settings(self, watchdog_s: float, frames: Sequence[tuple[str, int, int, bytes]]) -> None:
         """What preflight set stays as it is in motion: it is read back there."""
         watchdog, back = self._profile.watchdog, self._read_back
         back.clear()
@@ -307,13 +356,15 @@ class Cia402Drive:
             if index in guards or (index, sub) == reaction:
                 if watchdog_s:
                     title = "the watchdog's reaction" if (index, sub) == reaction else "the drive's watchdog"
-                    back.watch(title, index, sub, data, often=True)
+                    back.watch(title, index, sub, data, Group.SAFETY)
             elif 0x1400 <= index < 0x1600:
-                back.watch(f"the switch of RPDO{index - 0x1400 + 1}", index, sub, data)
+                back.watch(f"the switch of RPDO{index - 0x1400 + 1}", index, sub, data, Group.REST)
             elif index == QUICK_STOP_OPTION:
-                back.watch("the quick-stop option", index, sub, data, often=True)
+                back.watch("the quick-stop option", index, sub, data, Group.SAFETY)
             elif index not in (0x1006, 0x1017, 0x6060, MARKER_INDEX):
-                back.watch("the drive's own limit", index, sub, data)
+                back.watch("the drive's own limit", index, sub, data, Group.REST)
+        for one in frames:
+            back.watch(*one, Group.FEEDBACK)
         back.watch_setpoint("the target velocity", self._shape.target_speed[0])
         if self._has_target:
             back.watch_setpoint("the target torque", 0x6071)
@@ -388,7 +439,7 @@ class Cia402Drive:
         offset_raw = encode_torque_offset(command.torque_offset_nm, self._units)
         if self._wish is not Wish.ENABLED or command.mode is not Mode.SPEED:
             offset_raw = 0
-        self._ticks.wait(self._listen_until)
+        self._ticks.wait(self._listen_after_all)
         if self._wish is not Wish.ENABLED and not self._armed:
             self._link.try_again()
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
@@ -450,18 +501,21 @@ class Cia402Drive:
         feedback = self._feedback
         feedback.begin(now_s, sync=sync)
         if sync:
+            self._slow.begin()
             self._link.send(SYNC, _NO_WORD, self._ticks.check)     # it is the SYNC that makes a setpoint act
         age_s = self._await_feedback(now_s)
         self._cycles += 1
-        fresh = bool(feedback.data)
+        fresh = bool(feedback.data) and not self._remapped
         if not fresh:
             self._missed += 1
+        self._count(fresh)
         if feedback.doubted() and self._wish is not Wish.ENABLED:
             fresh = False
         if fresh:
             status, torque_raw, speed_raw = self._layout.unpack(feedback.data)
             self._reported.take(status, speed_raw, torque_raw)
             self._follow_state()
+            self._follow_remote(status)
         while self._contradictions < feedback.contradictions:
             self._contradictions += 1
             self._watch.on_contradiction()
@@ -470,7 +524,27 @@ class Cia402Drive:
         hidden_s = now_s - self._shown_s
         if hidden_s > MODE_STALE_S and hidden_s > MODE_STALE_TIMES * slow_syncs(self.period_s) * self.period_s:
             self._reported.shown_code = 0      # whatever it was, nobody knows any more
-        return self._sample(now_s, age_s, fresh)
+        counts = self._slow.counts if fresh and sync else None
+        return self._sample(now_s, age_s, fresh, None if counts is None else self._turned(now_s, counts))
+
+    def _turned(self, time_s: float, counts: float) -> float | None:
+        """The motor's angle since the first reading, rad; None where it is not known."""
+        if self._angle is None or self._unwrapped is None:
+            return None
+        return self._unwrapped.take(time_s, counts * self._angle.rad_per_count)
+
+    def _count(self, fresh: bool) -> None:
+        """Notice feedback that comes too seldom to guard a shaft by."""
+        recent = self._recent
+        if not (self._in_operation and self._wish is Wish.ENABLED):
+            recent.clear()
+            return
+        recent.append(fresh)
+        # Where nothing comes at all, the guard's age limit and the drive's heartbeat say so.
+        if fresh and (missed := recent.count(False)) > THIN_SHARE * (recent.maxlen or 0):
+            self._watch.thin_feedback(missed, len(recent), self.period_s, f"TPDO1, {self._tpdo1_id:03X}h")
+            with suppress(CommunicationLost):      # for the stop that follows
+                self._read_back.put_back(TPDO_COMMUNICATION, 2)
 
     def _check(self) -> None:
         """Raise what is wrong with the drive; a sign of life that hasn't been read yet isn't missing."""
@@ -479,7 +553,8 @@ class Cia402Drive:
         self._watch.check()
 
     def poll(self) -> Sample | None:
-        """Status, speed and torque by SDO, for a stop whose cyclic feedback is not to be had; None without an answer.
+        """Status, speed, torque and angle by SDO, for a stop whose cyclic feedback is not to be had; None without an
+        answer.
 
         Once something else than enabling was asked for, that goes out by SDO (6040h) too. Raises CommunicationLost.
         """
@@ -495,10 +570,19 @@ class Cia402Drive:
         half_s = 0.5 * (self.clock.now_s() - begun_s)
         self._reported.take(found.status, found.speed, found.torque)
         self._follow_state()
-        push(self._objects, found.status, self._wish, self._watchdog_s, self._shape.offset)
+        push(self._objects, self._reported.state, self._wish, self._watchdog_s, self._shape.offset)
         self._life.feed()
+        position_rad = self._poll_angle()
         self._ticks.put_off()
-        return self._sample(begun_s + half_s, half_s, True)._replace(half_width_s=half_s)
+        return self._sample(begun_s + half_s, half_s, True, position_rad)._replace(half_width_s=half_s)
+
+    def _poll_angle(self) -> float | None:
+        """The angle by SDO, behind all that a stop needs more."""
+        if self._angle is None or self._unwrapped is None:
+            return None
+        found = self._angle.read(self._objects, self.clock, self._watchdog_s)
+        self._life.feed()
+        return None if found is None else self._unwrapped.take(found.time_s, found.position_rad)
 
     def read_position(self) -> PositionReading | None:
         """The motor's angle by one SDO between two cycles; None where the drive has none, or didn't answer in time."""
@@ -523,16 +607,59 @@ class Cia402Drive:
         elif self._in_operation or self._reported.state in _OUT_OF_OPERATION:
             self._wish = Wish.QUICK_STOP
 
+    def _follow_remote(self, status: int) -> None:
+        """In operation bit 9 of the statusword stays set, where it has been: else another place has taken control."""
+        if not (self._in_operation and self._wish is Wish.ENABLED):
+            self._local = 0
+        elif status & REMOTE:
+            self._was_remote, self._local = True, 0
+        elif self._was_remote:
+            self._local += 1
+            if self._local == LOCAL_CYCLES:
+                self._watch.interference(
+                    f"the bus no longer controls the drive: bit 9 (remote) of the statusword {status:04X}h is 0",
+                    f"node {self._node}, 6041h",
+                    "Was the drive switched to its panel or to another fieldbus? Give control back, and start anew",
+                    kind="remote",
+                )
+
+    def _on_nmt(self, data: bytes) -> None:
+        """An NMT command that another master sent: to this drive, or to all nodes (CiA 301)."""
+        if len(data) < 2 or data[1] not in (0, self._node):
+            return
+        name = NMT_COMMANDS.get(data[0], f"command {data[0]:02X}h")
+        self._strangers.tell(f"somebody else sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
+        state = {0x02: "stopped", ENTER_PRE_OPERATIONAL: "pre-operational"}.get(data[0])
+        if state is not None and self._watch.expect_operational:       # after a reset its boot-up message says so
+            self._watch.interference(
+                f"somebody put the drive into NMT state {state}, by a command", f"node {self._node}",
+                "Is a second master on the bus? Take it off and start anew", kind="nmt",
+            )
+
+    def _listen_after_all(self, tick_s: float) -> None:
+        """The same, where this loop may have stood still: then that comes before what it finds on the bus."""
+        away_s = self.clock.now_s() - tick_s
+        try:
+            self._listen_until(tick_s)
+        except CommunicationLost as error:
+            if away_s <= max(STALL_S, STALL_CYCLES * self.period_s):
+                raise
+            raise CommunicationLost(
+                f"this computer was late: its control loop stood still for {away_s:.2f} s; after that: {error.what}",
+                where=f"host; {error.where}", next_step=error.next_step,
+            ) from error
+
     def _listen_until(self, tick_s: float) -> None:
         """Wait for the next tick, and take what comes meanwhile; feedback among it is late."""
         clock, feedback = self.clock, self._feedback
         before = feedback.arrived - feedback.older
         if clock.stepped:
             clock.wait_until(tick_s)
-        else:
-            while (left_s := tick_s - clock.now_s()) > 0.0:
-                if self._link.receive(left_s) is None:
-                    break
+        if (shown := self._slow.end()) is not None:
+            self._show(shown)
+        while not clock.stepped and (left_s := tick_s - clock.now_s()) > 0.0:
+            if self._link.receive(left_s) is None:
+                break
         self._link.drain()
         self._late += feedback.arrived - feedback.older > before
 
@@ -542,7 +669,9 @@ class Cia402Drive:
         link = self._link
         if clock.stepped:
             # In stepped time nothing is late, it is lost.
-            link.await_answer(lambda: self._feedback.done, PEER_DEAD_S)
+            if link.await_answer(lambda: self._feedback.done, PEER_DEAD_S) and self._slow.due:
+                self._slow.wait()
+                link.await_answer(lambda: self._feedback.over or not self._slow.due, PEER_DEAD_S)
             return 0.0
         feedback = self._feedback
         first = not feedback.arrived and self._cycles < FIRST_ANSWERS
@@ -553,9 +682,14 @@ class Cia402Drive:
         if not feedback.done:
             link.drain()               # a loop that comes back late finds in time what came in time
             feedback.settle()
+        age_s = clock.now_s() - sync_s
+        if feedback.done and self._slow.due:
+            self._slow.wait()
+            while self._slow.due and (left_s := deadline_s - clock.now_s()) > 0.0:
+                link.receive(left_s)
         if first:
             self._ticks.put_off()
-        return clock.now_s() - sync_s
+        return age_s
 
     def stop_feeding(self) -> None:
         """No sign of life, setpoint or controlword any more; see `drivers.drive.StopsFeeding`."""
@@ -582,17 +716,29 @@ class Cia402Drive:
         self._mode_overwritten |= index == 0x6060
         self._read_back.soon(index, sub)
 
+    def _on_changed(self, index: int, sub: int) -> None:
+        """Somebody else changed what is read back: a frame whose mapping isn't ours says nothing that is known."""
+        self._remapped |= index in (TPDO_MAPPING, TPDO_MAPPING + 1)
+
     def _on_slow_feedback(self, data: bytes) -> None:
-        if self._wide and len(data) == 2 + self._slow_layout.size:
+        if self._remapped:
+            return
+        size = self._slow.carried.size
+        if self._wide and len(data) == 2 + size:
             self._feedback.on_status(data[:2])
             data = data[2:]
-        if len(data) == self._slow_layout.size:
-            values = self._slow_layout.unpack(data)
-            self._shown_s = self.clock.now_s()
-            self._reported.take_slow(values[0], values[1] if len(values) > 1 else None)
+        if len(data) == size:
+            # A wide drive's two TPDOs come in whichever order, with each SYNC: the two of one are put together.
+            shown = self._slow.take(data, self._wide or bool(self._feedback.data))
+            if shown is not None:
+                self._show(shown)
 
-    def _sample(self, time_s: float, age_s: float, fresh: bool) -> Sample:
-        return self._reported.sample(time_s, age_s, fresh, self._units, self._modes)
+    def _show(self, shown: Shown) -> None:
+        self._shown_s = self.clock.now_s()
+        self._reported.take_slow(*shown)
+
+    def _sample(self, time_s: float, age_s: float, fresh: bool, position_rad: float | None = None) -> Sample:
+        return self._reported.sample(time_s, age_s, fresh, self._units, self._modes, position_rad)
 
     # -- afterwards ------------------------------------------------------------------------------------------
 

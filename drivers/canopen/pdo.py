@@ -6,11 +6,14 @@
   speed: then TPDO1 is torque and speed, and TPDO2 brings the statusword with every SYNC.
 """
 
+from __future__ import annotations
+
 import math
 import struct
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from struct import Struct, error
 
 from drivers.canopen.state_machine import (
@@ -20,12 +23,13 @@ from drivers.canopen.state_machine import (
     TARGET_REACHED,
     State,
     decode,
+    decode_after,
     power_state,
 )
 from drivers.drive import Mode, PowerState, Sample
 from drivers.errors import CommandRejected, ObjectRefused
 from profiles import CYCLES_END, LAST_CYCLE_OVER
-from profiles.canopen import CanopenProfile, ObjectType
+from profiles.canopen import CanopenProfile, ObjectType, Position
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The CiA 402 objects that tdhil uses, and the pure codec between them and SI.
@@ -35,7 +39,7 @@ from profiles.canopen import CanopenProfile, ObjectType
 #     RPDO1  6040h controlword u16 | 6071h target torque i16 ‰ | 60FFh target velocity i32 LSB
 #     TPDO1  6041h statusword  u16 | 6077h torque actual i16 ‰ | 606Ch velocity actual i32 LSB
 #     RPDO2  6060h modes of operation i8 [| 60B2h torque offset i16 ‰, then in every cycle]
-#     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰]
+#     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰] [| 6064h angle of the motor i32]
 #
 # ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
 
@@ -45,8 +49,7 @@ TPDO1 = struct.Struct("<Hhi")
 RPDO2 = struct.Struct("<b")
 RPDO2_OFFSET = struct.Struct("<h")
 RPDO2_MODE_OFFSET = struct.Struct("<bh")
-TPDO2_MODE = struct.Struct("<b")
-TPDO2_MODE_DEMAND = struct.Struct("<bh")
+PDO_BYTES = 8
 
 RPM = 2.0 * math.pi / 60.0
 """rad/s in one rev/min."""
@@ -132,6 +135,7 @@ class Reported:
 
     def __init__(self) -> None:
         self.state = State.NOT_READY
+        self._started = False          # has it shown another state than not ready since its start?
         self.shown_code = 0            # 6061h
         self._status = 0
         self._speed_raw = 0
@@ -142,13 +146,21 @@ class Reported:
         """6041h, 606Ch and 6077h (or the manufacturer's object) of one instant; None: the torque stays as it was."""
         self._status, self._speed_raw = status, speed_raw
         self._torque_raw = self._torque_raw if torque_raw is None else torque_raw
-        self.state = decode(status)
+        self.state = decode_after(status) if self._started else decode(status)
+        self._started = self._started or self.state not in (State.NOT_READY, State.UNKNOWN)
+
+    def restarted(self) -> None:
+        """Note that the drive has sent its boot-up message: it may be not ready to switch on."""
+        self._started = False
 
     def take_slow(self, shown_code: int, demand_raw: int | None) -> None:
         """6061h, and 6074h where the drive has it."""
         self.shown_code, self._demand_raw = shown_code, demand_raw
 
-    def sample(self, time_s: float, age_s: float, fresh: bool, units: Units, modes: Mapping[int, Mode]) -> Sample:
+    def sample(
+        self, time_s: float, age_s: float, fresh: bool, units: Units, modes: Mapping[int, Mode],
+        position_rad: float | None = None,
+    ) -> Sample:
         """``time_s`` and ``age_s`` in control time; ``modes`` by their codes of 6061h."""
         status = self._status
         power = power_state(self.state)
@@ -168,6 +180,7 @@ class Reported:
             reached or zero,
             bool(status & INTERNAL_LIMIT),
             status,
+            position_rad,
         )
 
 
@@ -190,6 +203,11 @@ def decode_value(kind: ObjectType, data: bytes, where: str) -> float:
     if not math.isfinite(value):
         raise ObjectRefused(f"{value} is no number to work with", where=where)
     return value
+
+
+def bits_of(kind: ObjectType) -> int:
+    """How long an object of this type is, bits."""
+    return 8 * _LAYOUTS[kind].size
 
 
 def encode_value(kind: ObjectType, value: float, where: str) -> bytes:
@@ -264,9 +282,50 @@ class Shape:
         """Bytes of TPDO1."""
         return self.feedback.size - 2 if self.wide else self.feedback.size
 
-    def slow(self, with_demand: bool) -> Struct:
-        """TPDO2, without the statusword that stands before it in a wide shape."""
-        return TPDO2_MODE_DEMAND if with_demand else TPDO2_MODE
+
+
+@dataclass(frozen=True)
+class Slow:
+    """What TPDO2 carries behind the mode display, and behind the statusword in a wide shape.
+
+    ``position`` is what counts the motor's angle. Where there is no room for both, the demand is left out: the angle
+    is the only signal that does not come from the drive's speed or torque.
+    """
+
+    demand: bool = False
+    position: Position | None = None
+    wide: bool = False
+
+    @classmethod
+    def fitting(cls, demand: bool, position: Position | None, shape: Shape) -> Slow:
+        """Return what fits into the frame."""
+        whole = cls(demand, position, shape.wide)
+        return whole if whole.size + 2 * shape.wide <= PDO_BYTES else cls(False, position, shape.wide)
+
+    @property
+    def mapped(self) -> tuple[tuple[int, int, int], ...]:
+        """Index, subindex, bits of each object, the statusword among them."""
+        position = self.position
+        angle = () if position is None else ((position.index, position.sub, bits_of(position.type)),)
+        return (STATUSWORD,) * self.wide + (MODE_DISPLAY,) + (TORQUE_DEMAND,) * self.demand + angle
+
+    @property
+    def size(self) -> int:
+        """Bytes, without the statusword of a wide shape."""
+        return self.layout.size
+
+    @cached_property
+    def layout(self) -> Struct:
+        """Mode display, demand and angle, as far as they are there."""
+        angle = "" if self.position is None else _LAYOUTS[self.position.type].format.lstrip("<")
+        return Struct("<b" + "h" * self.demand + angle)
+
+    def unpack(self, data: bytes) -> tuple[int, int | None, float | None]:
+        """Mode display, demand, angle in counts; None for what isn't carried."""
+        values = self.layout.unpack(data)
+        return (
+            values[0], values[1] if self.demand else None, None if self.position is None else float(values[-1]),
+        )
 
 
 STANDARD = Shape()

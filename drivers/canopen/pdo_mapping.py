@@ -9,12 +9,11 @@ from dataclasses import dataclass
 
 from drivers.canopen.pdo import (
     CONTROLWORD,
-    MODE_DISPLAY,
     STANDARD,
     STATUSWORD,
     TARGET_TORQUE,
-    TORQUE_DEMAND,
     Shape,
+    Slow,
     mapping_entry,
 )
 from drivers.canopen.sdo import Objects, name
@@ -22,9 +21,9 @@ from drivers.errors import PreflightRefused
 
 DISABLED = 1 << 31
 SLOW_SYNCS, SLOW_S = 5, 0.1
-"""The second TPDO (mode display, torque demand) comes with every fifth SYNC: people, mode switches and
-the guard look at it, not the control, and the bus is short. On a slow cycle it comes sooner: a mode that was lost must
-show within a tenth of a second, or a cycle."""
+"""The second TPDO (mode display, torque demand, angle) comes with every fifth SYNC: people, mode switches and
+the guard look at it, not the control, and the bus is short. On a slow cycle it comes sooner: a mode that was lost, and
+an angle, must show within a tenth of a second, or a cycle."""
 _LEAST_RPDOS, _MOST_RPDOS = 8, 64
 """RPDOs that a drive is asked for: the first ones in any case, since some numbers may be left out, then while there are
 more."""
@@ -57,21 +56,15 @@ def slow_syncs(period_s: float) -> int:
     return max(1, min(SLOW_SYNCS, round(SLOW_S / period_s)))
 
 
-def layout(with_demand: bool, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
-    """RPDO1, TPDO1, RPDO2 (`Shape.second`), TPDO2; ``with_demand`` adds 6074h where the drive has it.
-
-    ``slow``: see `slow_syncs`.
-    """
+def layout(carried: Slow, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
+    """RPDO1, TPDO1, RPDO2 (`Shape.second`), TPDO2 with what is ``carried``; ``slow``: see `slow_syncs`."""
     targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
-    shown = (MODE_DISPLAY, TORQUE_DEMAND) if with_demand else (MODE_DISPLAY,)
-    first: tuple[tuple[int, int, int], ...]
-    second: tuple[tuple[int, int, int], ...]
-    if shape.wide:
-        first, second, syncs = (shape.torque, shape.actual_speed), (STATUSWORD, *shown), 1
-    else:
-        first, second, syncs = (STATUSWORD, shape.torque, shape.actual_speed), shown, slow
+    first = (STATUSWORD,) * (not shape.wide) + (shape.torque, shape.actual_speed)
     modes = (Pdo(True, 2, 1, shape.second),) if shape.second else ()
-    return (Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes, Pdo(False, 2, syncs, second))
+    return (
+        Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes,
+        Pdo(False, 2, 1 if shape.wide else slow, carried.mapped),
+    )
 
 
 def written(pdo: Pdo) -> str:

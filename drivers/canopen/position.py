@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from drivers.canopen.pdo import RPM, decode_value
+from drivers.angle import Unwrapped
+from drivers.canopen.pdo import RPM, bits_of, decode_value
 from drivers.canopen.sdo import Objects, name
 from drivers.clock import Clock
 from drivers.drive import PositionReading
@@ -26,7 +27,6 @@ WATCHDOG_SHARE = 0.15
 _ENCODER, _GEAR, _FEED, _UNIT = 0x608F, 0x6091, 0x6092, 0x60A8
 _INCREMENTS = (0x0000_0000, 0x00B5_0000)
 """60A8h where one count of 6064h is one increment (CiA 303-2: B5h)."""
-_WIDTHS = {"u8": 8, "i8": 8, "u16": 16, "i16": 16, "u32": 32, "i32": 32}
 _TITLE = "angle of the motor"
 _ASKED = "whether the shaft turns as fast as the drive says is asked of the operator"
 
@@ -43,9 +43,12 @@ class Angle(NamedTuple):
         """The angle after which it starts over, rad."""
         counts = self.entry.wrap_counts
         if counts is None:
-            width = _WIDTHS.get(self.entry.type)
-            counts = None if width is None else float(1 << width)
+            counts = None if self.entry.type == "f32" else float(1 << bits_of(self.entry.type))
         return None if counts is None else counts * self.rad_per_count
+
+    def unwrapped(self, limit_rad_s: float) -> Unwrapped:
+        """What counts its readings on, of a shaft with this speed limit."""
+        return Unwrapped(self.wraps_rad, limit_rad_s)
 
     def read(self, objects: Objects, clock: Clock, watchdog_s: float) -> PositionReading | None:
         """Ask once, in a part of the watchdog's time; None without a good answer."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from drivers.canopen.limits import Settings
 from drivers.canopen.pdo import (
@@ -220,7 +221,10 @@ def check_state(
         braking = abs(speed_lsb) > max(STILL_LSB, STILL_RAD_S / units.speed_rad_s_per_lsb)
         found += f", velocity {speed_lsb}"
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
-    table.row("state", "no fault, at rest", found, not faulty and not braking, "6041h", mend)
+    if state is State.UNKNOWN:
+        mend = "Check the drive behind a gateway, and that --profile is this drive's"
+    known = not faulty and not braking and state is not State.UNKNOWN
+    table.row("state", "no fault, at rest", found, known, "6041h", mend)
     if state is State.QUICK_STOP_ACTIVE and not braking and limits.string:
         counts = reported_torque(objects, profile)
         held_nm = None if counts is None else counts * units.torque_nm_per_lsb
@@ -335,6 +339,14 @@ def quick_stop_holds(objects: Objects, profile: CanopenProfile) -> bool | None:
     return None if code is None or code < 0 or code > _LAST_OPTION else code >= _HOLDS_FROM
 
 
+class AngleComing(NamedTuple):
+    """One count of the motor's angle, how far apart it comes with the cycle, and how far apart it may."""
+
+    resolution_rad: float = 0.0
+    period_s: float | None = None
+    gap_s: float = math.inf
+
+
 def report(
     table: Table,
     identity: Identity,
@@ -345,6 +357,7 @@ def report(
     modes: dict[Mode, int],
     watchdog_s: float,
     kept: Mapping[str, float],
+    angle: AngleComing,
 ) -> Preflight:
     """The table and what goes with it."""
     filters = read_filters(table.note, objects, profile)
@@ -365,6 +378,9 @@ def report(
         kept_torque_nm=kept.get(TORQUE),
         kept_speed_rad_s=kept.get(SPEED),
         quick_stop_holds=quick_stop_holds(objects, profile),
+        position_resolution_rad=angle.resolution_rad,
+        position_period_s=angle.period_s,
+        position_gap_s=angle.gap_s,
     )
 
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from drivers.canopen.bus import CanLink
 from drivers.canopen.pdo import TARGET_VELOCITY, VELOCITY_ACTUAL, VL_ACTUAL, mapping_entry
 from drivers.canopen.pdo_mapping import DISABLED
-from drivers.canopen.preflight import speed_unit
+from drivers.canopen.preflight import read_identity, speed_unit
 from drivers.canopen.sdo import Objects, name
 from drivers.canopen.sdo_feedback import ANSWER_S, WATCHDOG_SHARE
 from drivers.canopen.state_machine import (
@@ -33,10 +33,10 @@ from drivers.canopen.state_machine import (
     power_state,
 )
 from drivers.clock import Clock
-from drivers.drive import PowerState
+from drivers.drive import Identity, PowerState
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
 from drivers.preflight import Table
-from drivers.quick_stop import Seen
+from drivers.quick_stop import BLANK_WORDS, Seen
 from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile
 
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 UNDONE_S, UNDONE_CYCLES = 0.3, 5
 """A drive that is in operation for so long, and so many cycles, after a quick stop was asked for does not follow it."""
 _EXPEDITED_2, _EXPEDITED_4 = 0x2B, 0x23
-_LEFT_ALONE = frozenset(State) - {State.OPERATION_ENABLED}
+_LEFT_ALONE = frozenset(State) - {State.OPERATION_ENABLED, State.UNKNOWN}
 
 
 class Standing:
@@ -86,7 +86,8 @@ class Standing:
     def undone(self, now_s: float, state: State, others: bool) -> bool:
         """After a quick stop, once a cycle: is it time to take over? ``others``: somebody else's RPDOs were heard."""
         if state is not State.OPERATION_ENABLED:
-            if not others:                         # while they are there it may be enabled in between unseen
+            # While they are there it may be enabled in between unseen, and so may one that shows no valid state.
+            if not others and state is not State.UNKNOWN:
                 self._since_s = None
             return False
         if self._since_s is None:
@@ -207,7 +208,12 @@ class Cia402Target:
             near_zero=abs(raw) <= NEAR_ZERO_LSB or abs(speed) <= NEAR_ZERO_RAD_S,
             standstill=bool(status & TARGET_REACHED) and state in (State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED),
             follows=enabled and not (self._word & HALT and status & TARGET_REACHED),
+            blank=status in BLANK_WORDS,
         )
+
+    def identity(self) -> Identity:
+        """1018h, for after the stop: is it the drive that was meant? Raises TdhilError."""
+        return read_identity(self._objects)
 
     def remarks(self) -> tuple[str, ...]:
         """Another master, and what was changed in the drive."""

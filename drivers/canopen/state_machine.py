@@ -26,6 +26,7 @@ class State(Enum):
     QUICK_STOP_ACTIVE = "quick stop active"
     FAULT_REACTION_ACTIVE = "fault reaction active"
     FAULT = "fault"
+    UNKNOWN = "no valid state"     # no pattern of the standard's: a gateway without its drive, or a dead TPDO
 
 
 class Wish(Enum):
@@ -37,8 +38,6 @@ class Wish(Enum):
 
 
 # Statusword bits (6041h).
-VOLTAGE_ENABLED = 1 << 4
-WARNING = 1 << 7
 REMOTE = 1 << 9
 TARGET_REACHED = 1 << 10
 INTERNAL_LIMIT = 1 << 11
@@ -77,12 +76,23 @@ _POWER = {
     State.QUICK_STOP_ACTIVE: PowerState.QUICK_STOP,
     State.FAULT_REACTION_ACTIVE: PowerState.FAULT,
     State.FAULT: PowerState.FAULT,
+    State.UNKNOWN: PowerState.UNKNOWN,
 }
 
 
 def decode(statusword: int) -> State:
-    """The state that a statusword shows; a pattern of no state counts as not ready."""
-    return _DECODED.get(statusword & 0x7F, State.NOT_READY)
+    """Return the state that a statusword shows; UNKNOWN for a pattern that the standard doesn't define (FFFFh)."""
+    return _DECODED.get(statusword & 0x7F, State.UNKNOWN)
+
+
+def decode_after(statusword: int) -> State:
+    """Return the same for a drive that has shown another state since it started.
+
+    A drive leaves not ready to switch on by itself (transitions 0 and 1), and comes back to it by a restart alone:
+    zeros that come later are no state.
+    """
+    state = decode(statusword)
+    return State.UNKNOWN if state is State.NOT_READY else state
 
 
 def power_state(state: State) -> PowerState:
@@ -110,7 +120,10 @@ def controlword_towards(state: State, wish: Wish) -> int:
 
     Quick stop is the same word in every state: where the drive is not in operation it switches off or does nothing
     (transitions 7 and 10), and where it is after all, since the state shown is old or another node's, the shaft stops.
+    So it is also the word for a drive that shows no valid state, whatever the wish: disabling could let a shaft coast.
     """
+    if state is State.UNKNOWN:
+        return QUICK_STOP
     if wish is Wish.ENABLED:
         return _TOWARDS_ENABLED.get(state, QUICK_STOP if state is State.QUICK_STOP_ACTIVE else DISABLE_VOLTAGE)
     if wish is Wish.QUICK_STOP:

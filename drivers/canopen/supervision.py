@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 
 from drivers.canopen.bus import CanLink
 from drivers.canopen.sdo import name
@@ -37,7 +38,9 @@ HOST_LOST = 0x8130
 """EMCY of a drive that lost its host: life guard or heartbeat error (CiA 301)."""
 
 HOST_SILENT = "host silent"
-OF_A_SILENT_HOST = ("heartbeat", "nmt", HOST_SILENT)
+THIN = "thin feedback"
+OF_A_LATE_HOST = (HOST_SILENT, THIN)
+OF_A_SILENT_HOST = ("heartbeat", "nmt", *OF_A_LATE_HOST)
 """Kinds of trouble that a host which was away brings about, or takes for the drive's."""
 
 # EMCY error code classes (CiA 301) and the CiA 402 codes a field engineer meets first.
@@ -97,6 +100,7 @@ class Watch:
         self.expect_operational = False
         self.emcy_code = 0
         self.nmt_state: int | None = None      # as the drive last told it; None before
+        self.on_boot_up: Callable[[], None] = lambda: None
         self.sign_of_life: Callable[[], tuple[str, str]] = lambda: ("heartbeat has been missing", "1017h")
         self.host_stood_still: Callable[[], str] = lambda: ""
         """What is to be said of this host first, where it was away itself; empty: it wasn't."""
@@ -110,6 +114,8 @@ class Watch:
         state = data[0] & 0x7F
         self._heard_s = self._clock.now_s()
         self.nmt_state = state
+        if state == BOOT_UP:
+            self.on_boot_up()
         if not self.expect_operational:
             return
         if state == BOOT_UP:
@@ -181,6 +187,17 @@ class Watch:
         """Somebody else changes this drive or drives it; raised by `check`, once for each ``kind``."""
         self._keep(kind, CommunicationLost(what, where=where, next_step=next_step))
 
+    def thin_feedback(self, missed: int, cycles: int, period_s: float, where: str) -> None:
+        """So many of the last cycles brought no feedback."""
+        self._keep(
+            THIN,
+            CommunicationLost(
+                f"{missed} of the last {cycles} cycles ({cycles * period_s:.2g} s) brought no feedback",
+                where=f"node {self._node}, {where}",
+                next_step="Did a tool change the TPDO's transmission type or mapping? Else check bus load and cable",
+            ),
+        )
+
     def on_contradiction(self) -> None:
         """A frame of feedback that the drive can't have sent, if it sent the one before it for the same SYNC."""
         if self._no_accident(self._contradicted_s):
@@ -220,7 +237,7 @@ class Watch:
 
         The drive's watchdog also acts on many cycles that are late, of which none is long.
         """
-        away = self.host_late() if kind == HOST_SILENT else self.host_stood_still()
+        away = self.host_late() if kind in OF_A_LATE_HOST else self.host_stood_still()
         if not away:
             return trouble
         where = trouble.where if kind == HOST_SILENT else f"host; {trouble.where}"
@@ -302,12 +319,14 @@ class Guarding:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What preflight set is read back all through the run, one object a second beside the cycle.
+# What preflight set is read back all through the run, two objects a second beside the cycle.
 #
 # A tool, the drive's own panel or another fieldbus may change the watchdog, its reaction, the quick stop or a limit
 # while the shaft turns; nothing on the bus need show it. So a question goes out once a cycle's feedback is in, nobody
-# waits for the answer, and it is looked at when it comes (SDO upload, expedited, CiA 301). The watchdog has every
-# second turn.
+# waits for the answer, and it is looked at when it comes (SDO upload, expedited, CiA 301). Watchdog and quick stop
+# have every third turn, limits and setpoints another, and what is in the feedback's frames (mapping, transmission
+# type, COB-ID of the TPDOs) the third. So a change shows within 0.5 s times three times the number of its group; one
+# that a tool writes on this bus is looked at in the next cycle.
 #
 # Setpoints and mode (6071h, 60FFh, 6060h) are asked for too: they must be what this host sent last. A drive counts as
 # one that echoes them once it has given back a value of ours other than zero; only then is another value somebody
@@ -319,7 +338,7 @@ class Guarding:
 # turns has been lost.
 
 
-READ_BACK_EVERY_S = 1.0
+READ_BACK_EVERY_S = 0.5
 READ_BACK_ANSWER_S = 0.5
 """Control time for an answer."""
 GIVE_UP, LOST = 5, 10
@@ -328,6 +347,14 @@ TRIES = 2
 REMEMBERED = 8
 """Cycles: an answer may show any setpoint that was sent so lately."""
 _UPLOAD, _ABORT = 2, 4
+
+
+class Group(Enum):
+    """What takes its turn together."""
+
+    SAFETY = "watchdog, its reaction, quick stop"
+    REST = "limits, setpoints, RPDOs"
+    FEEDBACK = "what the TPDOs carry, and when"
 
 
 @dataclass(eq=False)
@@ -351,8 +378,9 @@ class ReadBack:
         self._ask = ask
         self._tell = tell
         self._node = node
-        self._first: list[_Watched] = []
-        self._rest: list[_Watched] = []
+        self._groups: dict[Group, list[_Watched]] = {group: [] for group in Group}
+        self.on_changed: Callable[[int, int], None] = lambda index, sub: None
+        """Index and sub-index of what was changed by somebody else, before that is raised."""
         self._next: deque[_Watched] = deque()      # before their turn
         self._turn = 0
         self._asked: _Watched | None = None
@@ -365,18 +393,25 @@ class ReadBack:
 
     def clear(self) -> None:
         """Nothing is watched."""
-        self._first, self._rest = [], []
+        for group in self._groups.values():
+            group.clear()
         self._sent.clear()
         self._next.clear()
 
-    def watch(self, title: str, index: int, sub: int, data: bytes, *, often: bool = False) -> None:
-        """One object that must stay as it is; ``often``: every second turn is for these."""
-        (self._first if often else self._rest).append(_Watched(index, sub, title, data))
+    def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
+        """One object that must stay as it is."""
+        self._groups[group].append(_Watched(index, sub, title, data))
+
+    def stands(self, index: int, sub: int, data: bytes) -> None:
+        """Note that this host has written a watched object itself."""
+        for one in self._all():
+            if (one.index, one.sub) == (index, sub):
+                one.data = data
 
     def watch_setpoint(self, title: str, index: int) -> None:
         """One object that must show what was sent (`sent`)."""
         self._sent[index] = deque(maxlen=REMEMBERED)
-        self._rest.append(_Watched(index, 0, title, None))
+        self._groups[Group.REST].append(_Watched(index, 0, title, None))
 
     def sent(self, index: int, value: int) -> None:
         """A setpoint went out in this cycle."""
@@ -385,20 +420,20 @@ class ReadBack:
 
     def soon(self, index: int, sub: int) -> None:
         """Somebody wrote this object: ask for it before its turn."""
-        for one in (*self._first, *self._rest):
+        for one in self._all():
             if (one.index, one.sub) == (index, sub) and one not in self._next:
                 self._next.append(one)
 
     def put_back(self, index: int, sub: int) -> None:
         """Write what must stand in a watched object, and wait for no answer (SDO download, expedited)."""
-        for one in (*self._first, *self._rest):
+        for one in self._all():
             if (one.index, one.sub) == (index, sub) and one.data is not None:
                 command = 0x23 | (4 - len(one.data)) << 2
                 self._ask(bytes((command,)) + self._head(one) + one.data.ljust(4, b"\0"))
 
     def step(self, now_s: float) -> None:
         """After a cycle's feedback."""
-        if self._over or not (self._first or self._rest):
+        if self._over or not any(self._groups.values()):
             return
         if self._asked is not None:
             if now_s - self._asked_s < READ_BACK_ANSWER_S:
@@ -432,10 +467,13 @@ class ReadBack:
     def _choose(self) -> _Watched:
         if self._next:
             return self._next.popleft()
+        groups = [group for group in self._groups.values() if group]
         turn, self._turn = self._turn, self._turn + 1
-        if self._first and (turn % 2 == 0 or not self._rest):
-            return self._first[turn // 2 % len(self._first)]
-        return self._rest[turn // 2 % len(self._rest)]
+        group = groups[turn % len(groups)]
+        return group[turn // len(groups) % len(group)]
+
+    def _all(self) -> list[_Watched]:
+        return [one for group in self._groups.values() for one in group]
 
     def _compare(self, one: _Watched, found: bytes) -> None:
         if one.data is not None:
@@ -454,6 +492,7 @@ class ReadBack:
             self._next.appendleft(one)
         elif one.data is not None:
             self.put_back(one.index, one.sub)      # before the stop that follows, which may rest on it
+            self.on_changed(one.index, one.sub)
             self._watch.interference(
                 f"{one.title} was changed by somebody else in the run: {_shown(one.data)} was set, {_shown(found)}"
                 " stands there now",
@@ -483,7 +522,7 @@ class ReadBack:
             )
 
     def _drop(self, one: _Watched) -> None:
-        for those in (self._first, self._rest):
+        for those in self._groups.values():
             if one in those:
                 those.remove(one)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.canopen.pdo import Shape, consumer_heartbeat
+from drivers.canopen.pdo import Shape, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
 from drivers.canopen.sdo import Objects, name
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.preflight import DIES, Table, settle
 from profiles import MARKER_INDEX
-from profiles.canopen import CanopenProfile, Watchdog
+from profiles.canopen import CanopenProfile, Position, Watchdog
 
 GUARD_TIME, LIFE_TIME_FACTOR = 0x100C, 0x100D
 LEAST_CYCLES = 5
@@ -19,31 +19,45 @@ LEAST_CYCLES = 5
 
 
 def map_pdos(
-    table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape, period_s: float
-) -> tuple[bool, dict[int, int]]:
+    table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape, period_s: float,
+    position: Position | None,
+) -> tuple[Slow, dict[int, int]]:
     """Map both pairs of PDOs, and switch off what other RPDOs the drive has.
 
-    Whether the slow pair carries the torque demand 6074h too; and the COB-IDs that were switched off, by the RPDO's
-    number.
+    What the second TPDO carries: the torque demand 6074h and the angle ``position``, where the drive has them and lets
+    them be mapped; and the COB-IDs that were switched off, by the RPDO's number.
     """
     with_demand = profile.torque.has_demand and objects.read_if_there(0x6074) is not None
-    pdos = layout(with_demand, shape, slow_syncs(period_s))
+    carried = Slow.fitting(with_demand, position, shape)
+    *pdos, slow = layout(carried, shape, slow_syncs(period_s))
     others: dict[int, int] = {}
+    taken: list[Slow] = []             # by the drive
 
     def work() -> tuple[str, bool]:
         for pdo in pdos:
             write_pdo(objects, node, pdo)
+        try:
+            write_pdo(objects, node, slow)
+        except PreflightRefused as error:
+            if carried.position is None:
+                raise
+            less = Slow(with_demand, None, shape.wide)
+            write_pdo(objects, node, layout(less, shape, slow_syncs(period_s))[-1])
+            table.note("angle in the cycle", f"not mapped ({error.what}); it is read on request alone", error.where)
+            taken.append(less)
+            return "as wanted, without the angle", True
+        taken.append(carried)
         return "as wanted", True
 
-    table.attempt("PDO mapping", ", ".join(map(written, pdos)), "1600h, 1A00h", work)
+    table.attempt("PDO mapping", ", ".join(map(written, (*pdos, slow))), "1600h, 1A00h", work)
     try:
-        others = switch_off_others(objects, pdos)
+        others = switch_off_others(objects, (*pdos, slow))
     except PreflightRefused as error:
         table.row("other RPDOs", "off", error.what, False, error.where, error.next_step)
     if others:
         on = ", ".join(f"RPDO{number} ({cob_id & 0x7FF:X}h)" for number, cob_id in others.items())
         table.row("other RPDOs", "off", f"off (were on: {on})", True, "1400h and on")
-    return with_demand, others
+    return taken[0] if taken else carried, others
 
 
 def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> int:
@@ -53,10 +67,32 @@ def set_period(objects: Objects, profile: CanopenProfile, period_s: float) -> in
     return objects.change(0x1006, 0, round(period_s * 1e6), 32)
 
 
-def set_slow_syncs(objects: Objects, period_s: float) -> None:
-    """With every how many SYNCs the second TPDO comes (1801h:2), at another rate. Raises ObjectRefused."""
+def feedback_frames(objects: Objects) -> list[tuple[str, int, int, bytes]]:
+    """Title, index, sub-index and bytes of all that says what the two TPDOs carry and when they come.
+
+    COB-ID, transmission type, inhibit time and event timer (1800h:1, 2, 3, 5), where the drive has them; and the
+    mapping (1A00h), as far as it is used.
+    """
+    found = []
+    for number in (0, 1):
+        mapping = 0x1A00 + number
+        places = [(f"TPDO{number + 1}", 0x1800 + number, sub) for sub in (1, 2, 3, 5)]
+        used = objects.read_if_there(mapping, 0) or 0
+        places += [(f"TPDO{number + 1} mapping", mapping, sub) for sub in range(used + 1)]
+        for title, index, sub in places:
+            with suppress(ObjectRefused):
+                found.append((title, index, sub, objects.read_bytes(index, sub)))
+    return found
+
+
+def set_slow_syncs(objects: Objects, period_s: float) -> bytes:
+    """With every how many SYNCs the second TPDO comes (1801h:2), at another rate; what then stands there.
+
+    Raises ObjectRefused.
+    """
     if objects.read(0x1801, 2) > 1:            # with every SYNC anyway where it carries the statusword
         objects.write(0x1801, 2, slow_syncs(period_s), 8)
+    return objects.read_bytes(0x1801, 2)
 
 
 def set_timing(

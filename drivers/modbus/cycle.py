@@ -13,7 +13,7 @@ from drivers.modbus import pdu
 from drivers.modbus.access import Access, Answer
 from drivers.modbus.codec import Scales, WordOrder, from_words, register_name, to_counts, to_words
 from drivers.modbus.pdu import BUSY, NoisyReply, RegisterRefused
-from profiles.modbus import ModbusProfile, Register
+from profiles.modbus import ModbusProfile, Position, Register
 
 # ---------------------------------------------------------------------------------------------------------------------
 # From a profile's registers to the fewest transactions a cycle, pure.
@@ -23,8 +23,8 @@ from profiles.modbus import ModbusProfile, Register
 # writes first); without it each block has one of its own. Speed and torque are read last, in one transaction where
 # they can be, else in two that follow each other.
 #
-# What isn't needed every cycle (mode register and display, torque demand) rides along where that costs no
-# transaction.
+# What isn't needed every cycle (mode register and display, torque demand, the motor's angle) rides along where that
+# costs no transaction; the angle only beside speed or torque, so that it is of the same moment.
 
 
 Words = Mapping[tuple[str, int], int]
@@ -78,10 +78,14 @@ class CyclePlan:
     mode_writes: tuple[Transaction, ...]
     mode_reads: tuple[Transaction, ...]
     has_demand: bool
+    has_position: bool = False
 
 
-def plan_cycle(profile: ModbusProfile) -> CyclePlan:
-    """The cheapest plan. Raises PreflightRefused where the profile's functions can't do it."""
+def plan_cycle(profile: ModbusProfile, *, position: bool = False) -> CyclePlan:
+    """The cheapest plan; ``position``: the drive is known to give the profile's angle.
+
+    Raises PreflightRefused where the profile's functions can't do it.
+    """
     cycle, modes = profile.cycle, profile.modes
     setpoints = [cycle.speed_setpoint.register_]
     if modes.torque and cycle.torque_setpoint is not None:
@@ -109,10 +113,17 @@ def plan_cycle(profile: ModbusProfile) -> CyclePlan:
             feedback += extra
             if extra is mode_reads:
                 mode_reads = []
-    control = cycle.control.register_
-    writes = sorted(write_spans(written), key=lambda span: (span.covers(control), span.address))
     # Speed and torque last and side by side, so that they are as much of one moment as can be.
     moving = (cycle.speed.register_, cycle.torque.register_)
+    has_position = False
+    if position and profile.position is not None:
+        angle = profile.position.register_
+        reads = read_spans([*feedback, angle])
+        beside = any(span.covers(angle) and any(map(span.covers, moving)) for span in reads)
+        has_position = beside and len(reads) == len(read_spans(feedback))
+        feedback += [angle] * has_position
+    control = cycle.control.register_
+    writes = sorted(write_spans(written), key=lambda span: (span.covers(control), span.address))
     reads = sorted(read_spans(feedback), key=lambda span: any(span.covers(one) for one in moving))
     functions = frozenset(cycle.functions)
     return CyclePlan(
@@ -120,6 +131,7 @@ def plan_cycle(profile: ModbusProfile) -> CyclePlan:
         _pair(write_spans(mode_writes), [], functions) if mode_writes else (),
         _pair([], read_spans(mode_reads), functions) if mode_reads else (),
         bool(demand) and demand[0] in feedback,
+        has_position,
     )
 
 
@@ -279,17 +291,21 @@ class Feedback(NamedTuple):
     torque_nm: float
     torque_demand_nm: float | None
     mode_word: int | None
+    position_rad: float | None = None          # as counted; None where the angle wasn't read along
 
 
 class Codec:
     """The cycle's registers with their scales."""
 
-    def __init__(self, profile: ModbusProfile, scales: Scales, *, has_demand: bool) -> None:
+    def __init__(
+        self, profile: ModbusProfile, scales: Scales, *, has_demand: bool, has_position: bool = False
+    ) -> None:
         self._cycle = profile.cycle
         self._modes = profile.modes
         self._signless = profile.control.reverse_bits is not None
         self._order: WordOrder = profile.line.word_order
         self._has_demand = has_demand
+        self._position = profile.position if has_position else None
         self.scales = scales
 
     def setpoints(self, command: Command) -> Setpoints:
@@ -331,18 +347,24 @@ class Codec:
     def feedback(self, words: Words) -> Feedback:
         """What was read. Raises KeyError if a register is missing."""
         demand = self._cycle.torque_demand if self._has_demand else None
-        display = self._modes.display
+        display, position = self._modes.display, self._position
         return Feedback(
             self._number(words, self._cycle.status.register_) & 0xFFFF,
             self._number(words, self._cycle.speed.register_) * self.scales.speed,
             self._number(words, self._cycle.torque.register_) * self.scales.torque,
             None if demand is None else self._number(words, demand.register_) * self.scales.torque_demand,
             words.get((display.register_.table, display.register_.address)) if display is not None else None,
+            None if position is None else self._number(words, position.register_) * rad_per_count(position),
         )
 
     def _number(self, words: Words, register: Register) -> int:
         own = [words[register.table, register.address + k] for k in range(register.count)]
         return from_words(own, register.type, self._order)
+
+
+def rad_per_count(position: Position) -> float:
+    """One count of the motor's angle."""
+    return 2.0 * math.pi / position.counts_per_turn
 
 
 def shown_mode(profile: ModbusProfile, word: int) -> Mode | None:

@@ -11,9 +11,11 @@ has gone by like that, the drive counts as lost.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
+from drivers.angle import Unwrapped
 from drivers.clock import Ticks
 from drivers.drive import (
     Command,
@@ -50,7 +52,7 @@ from drivers.modbus.parameters import find_filters, own_speed_limits, set_limits
 from drivers.modbus.pdu import BUSY, CycleRefused, LinkLost, RegisterRefused
 from drivers.modbus.position import Angle, find_angle
 from drivers.modbus.preflight import check_setpoints, clear_setpoints
-from drivers.modbus.state_machine import Standstill, Wish, controlword_towards, decode, power_state, seen
+from drivers.modbus.state_machine import Standstill, Wish, controlword_towards, decode, decode_after, power_state, seen
 from drivers.modbus.temperature import Heat
 from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
 from drivers.own_limits import SPEED, TORQUE, OwnLimits
@@ -66,6 +68,8 @@ RESET_PAUSE_S = 0.1
 BUDGET_SHARE = 0.5
 """Of the watchdog time that may go by without a good reply, or with this loop standing still."""
 
+LOCAL_CYCLES = 3
+"""A bit that is missing in so many cycles is no accident of one reply."""
 SETTLED_CYCLES = 5
 """Without an enabled drive, after which one that is enabled again wasn't enabled by this run."""
 INSIST_SHARE = 0.8
@@ -79,7 +83,9 @@ PRESS_EVERY_S = 0.1
 _NO_SETPOINTS = Setpoints(0, 0, False)
 _NOTHING_YET = Feedback(0, 0.0, 0.0, None, None)
 _DRIVEN = (PowerState.ENABLED, PowerState.QUICK_STOP)
+_MAY_DRIVE = (PowerState.ENABLED, PowerState.UNKNOWN)
 _NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT)
+_NONE_YET = (PowerState.NOT_READY, PowerState.UNKNOWN)
 
 
 class ModbusDrive:
@@ -119,9 +125,12 @@ class ModbusDrive:
         self._modes: frozenset[Mode] = frozenset()
         self._watchdog_s = self._timeout_s = 0.0
         self._angle: Angle | None = None
+        self._unwrapped: Unwrapped | None = None
         self._wish = Wish.OFF
-        self._was_enabled = self._told_fault = self._reverse = self._at_rest = False
+        self._was_enabled = self._told_fault = self._reverse = self._at_rest = self._removes_torque = False
         self._ever_asked = False       # to be enabled
+        self._ever_enabled = False     # seen so
+        self._was_remote, self._local = False, 0       # controlled by the bus; cycles since in which it wasn't
         self._state: StatusState | None = None
         self._feedback = _NOTHING_YET
         self._shown: Mode | None = None
@@ -182,9 +191,15 @@ class ModbusDrive:
         own = OwnLimits(limits.accept_wider)
         filters = find_filters(table, profile, found)
         if scales is not None and clear_setpoints(table, access, profile, self._off_word()):
-            self._codec = Codec(profile, scales, has_demand=self._plan.has_demand)
             set_limits(table, access, profile, limits, rated_nm, found, own)
             self._angle = find_angle(table, access, profile)
+            if self._angle is not None:
+                self._unwrapped = Unwrapped(self._angle.wraps_rad, limits.speed_rad_s)
+            self._plan = plan_cycle(profile, position=self._angle is not None)
+            self._reads = only_reads(self._plan.cycle, frozenset(profile.cycle.functions))
+            self._codec = Codec(
+                profile, scales, has_demand=self._plan.has_demand, has_position=self._plan.has_position
+            )
             read_back = check_setpoints(table, access, profile, scales, rated_nm, found.values, limits)
             checks.check_modes(table, access, profile)
             pace = measure_pace(
@@ -212,6 +227,7 @@ class ModbusDrive:
         self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
         self._late_before = late_replies(self._link)
         target = profile.cycle.torque_setpoint
+        gap_s = math.inf if self._unwrapped is None else self._unwrapped.longest_gap_s
         return Preflight(
             identity=self._identity,
             checks=tuple(table.checks),
@@ -229,6 +245,9 @@ class ModbusDrive:
             kept_torque_nm=own.kept.get(TORQUE),
             kept_speed_rad_s=own.kept.get(SPEED),
             fed_by_any_client=shared,
+            position_resolution_rad=0.0 if self._angle is None else self._angle.rad_per_count,
+            position_period_s=self.period_s if self._plan.has_position and self.period_s <= gap_s else None,
+            position_gap_s=gap_s,
         )
 
     def _off_word(self) -> int:
@@ -274,6 +293,10 @@ class ModbusDrive:
         """From the next cycle on off; a shaft that still turns under power is braked first."""
         self._wish = Wish.OFF
 
+    def remove_torque(self) -> None:
+        """From the next cycle on off, whatever the reported speed is; see `drivers.drive.RemovesTorque`."""
+        self._wish, self._removes_torque = Wish.OFF, True
+
     def reset_fault(self) -> None:
         """The profile's words one after the other, between connect and preflight; only on an operator's word.
 
@@ -307,8 +330,11 @@ class ModbusDrive:
         if self._wish is Wish.ENABLED:
             self._heat.poll(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
+        # Nothing is disabled that was enabled and shows no valid state: it is braked, whatever its speed is said to be.
+        unknown = self._ever_enabled and power_state(self._state) is PowerState.UNKNOWN
         word = controlword_towards(
-            self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse, turning=turning
+            self._profile.control, self._state, self._wish, command.mode, reverse=self._reverse,
+            turning=(turning or unknown) and not self._removes_torque,
         )
         image = self._codec.image(word, setpoints, command.mode)
         self._unless_frozen(self._ticks.check)
@@ -371,7 +397,7 @@ class ModbusDrive:
             except (CommunicationLost, RegisterRefused):
                 break                  # the next cycle tells of it
             self._feedback = self._codec.feedback(got.words)
-            self._state = decode(self._profile.control, self._feedback.status)
+            self._state = self._decoded(self._feedback.status)
             took_s = self.clock.now_s() - sent_s
             if took_s <= 0.0:          # a line that takes no time has no end of room
                 break
@@ -399,7 +425,7 @@ class ModbusDrive:
         """Not once the drive is left to its watchdog; but a shaft at rest that nothing drives may be disabled."""
         if self._silent_since_s is None:
             return True
-        return self._wish is Wish.OFF and self._at_rest and power_state(self._state) is not PowerState.ENABLED
+        return self._wish is Wish.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
 
     def _watch(self) -> Sample:
         """A cycle that only reads, or not even that while reading feeds the watchdog."""
@@ -420,9 +446,9 @@ class ModbusDrive:
             raise
 
     def poll(self) -> Sample | None:
-        """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still tell how it is.
+        """Plain reads, for a stop whose cycles fail: a drive that refuses to be written to may still report how it is.
 
-        While it shows itself enabled the quick-stop word is written by itself, once each time.
+        While it shows itself enabled the quick-stop word is written by itself, once each time. The angle comes last.
         """
         if not self._reads or self._must_be_silent():
             return None
@@ -434,9 +460,13 @@ class ModbusDrive:
         self._take(self._codec.feedback(got.words), self._sent_mode)
         if (
             self._silent_since_s is None and self._wish is not Wish.ENABLED
-            and power_state(self._state) is PowerState.ENABLED
+            and power_state(self._state) in _MAY_DRIVE
         ):
             self._push()
+        if self._feedback.position_rad is None and self._angle is not None:
+            angle = self._angle.read(self._access, self._timeout_s)
+            if angle is not None:
+                self._feedback = self._feedback._replace(position_rad=angle.position_rad)
         self._ticks.done()
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
@@ -511,8 +541,13 @@ class ModbusDrive:
         if self._wish is Wish.ENABLED:
             self._wish = Wish.QUICK_STOP
 
+    def _decoded(self, status: int) -> StatusState | None:
+        state = (decode_after if self._ever_enabled else decode)(self._profile.control, status)
+        self._ever_enabled = self._ever_enabled or power_state(state) is PowerState.ENABLED
+        return state
+
     def _take(self, feedback: Feedback, sent: Mode) -> None:
-        self._state = decode(self._profile.control, feedback.status)
+        self._state = self._decoded(feedback.status)
         if self._profile.modes.display is None:
             self._shown = sent
         elif feedback.mode_word is not None:
@@ -520,7 +555,8 @@ class ModbusDrive:
         self._feedback = feedback
         at_zero = self._standstill.add(feedback.speed_rad_s)
         said = self._profile.control.standstill
-        self._at_rest = at_zero if said is None else seen(said, feedback.status)
+        known = power_state(self._state) is not PowerState.UNKNOWN
+        self._at_rest = known and (at_zero if said is None else seen(said, feedback.status))
 
     def _follow_state(self) -> None:
         """A drive that fell out of operation stays out until it is asked in again. Raises DriveFault, once."""
@@ -551,8 +587,23 @@ class ModbusDrive:
         elif self._wish is Wish.ENABLED:
             if power is PowerState.ENABLED:
                 self._was_enabled, self._out_of_operation = True, 0
+                self._follow_remote()
             elif self._was_enabled or power is PowerState.QUICK_STOP:
                 self._wish = Wish.QUICK_STOP       # it may be in operation after all: one word can be wrong
+
+    def _follow_remote(self) -> None:
+        """Raises CommunicationLost, once, where the bus has lost control of an enabled drive."""
+        remote, status = self._profile.control.remote, self._feedback.status
+        if remote is None or seen(remote, status):
+            self._was_remote, self._local = remote is not None, 0
+            return
+        self._local += 1
+        if self._was_remote and self._local == LOCAL_CYCLES:
+            raise CommunicationLost(
+                f"the bus no longer controls the drive: its status {status:04X}h does not show remote control",
+                where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
+                next_step="Was the drive switched to its panel or another source? Give control back, and start anew",
+            )
 
     def _sample(self, time_s: float, age_s: float, half_width_s: float, *, fresh: bool) -> Sample:
         feedback, control = self._feedback, self._profile.control
@@ -569,6 +620,8 @@ class ModbusDrive:
             self._at_rest,
             seen(control.limit_active, feedback.status),
             feedback.status,
+            self._unwrapped.take(time_s, feedback.position_rad)
+            if fresh and self._unwrapped is not None and feedback.position_rad is not None else None,
         )
 
     # -- afterwards ------------------------------------------------------------------------------------------
@@ -583,7 +636,7 @@ class ModbusDrive:
         left: tuple[str, ...] = ()
         power = power_state(self._state)
         try:
-            if power in _NOT_DRIVEN or (power is PowerState.NOT_READY and not self._ever_asked):
+            if power in _NOT_DRIVEN or (power in _NONE_YET and not self._ever_asked):
                 if self._modes:
                     clear_setpoints(Table(), self._access, self._profile, self._off_word())
                 left = self._access.restore()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from drivers.drive import PositionReading
@@ -10,6 +9,7 @@ from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
 from drivers.modbus.access import Access
 from drivers.modbus.codec import WordOrder, from_words, register_name
+from drivers.modbus.cycle import rad_per_count
 from drivers.modbus.pdu import RegisterRefused
 from drivers.preflight import Table
 from profiles.modbus import ModbusProfile, Position
@@ -27,11 +27,17 @@ class Angle(NamedTuple):
 
     @property
     def rad_per_count(self) -> float:
-        return 2.0 * math.pi / self.entry.counts_per_turn
+        """One count, rad."""
+        return rad_per_count(self.entry)
+
+    @property
+    def wraps_rad(self) -> float:
+        """The angle after which it starts over, rad."""
+        return (self.entry.wrap_counts or float(1 << _WIDTHS[self.entry.register_.type])) * self.rad_per_count
 
     def read(self, access: Access, timeout_s: float) -> PositionReading | None:
         """One transaction; None without a good reply."""
-        entry, register = self.entry, self.entry.register_
+        register = self.entry.register_
         function = pdu.READ_HOLDING if register.table == "holding" else pdu.READ_INPUT
         where = register_name(register)
         try:
@@ -40,9 +46,7 @@ class Angle(NamedTuple):
             return None                # the next cycle tells of a line that is gone
         half_s = 0.5 * (answer.received_s - answer.sent_s)
         counts = from_words(answer.words, register.type, self.order)
-        wraps = entry.wrap_counts or float(1 << _WIDTHS[register.type])
-        unit = self.rad_per_count
-        return PositionReading(answer.sent_s + half_s, half_s, counts * unit, wraps * unit, where)
+        return PositionReading(answer.sent_s + half_s, half_s, counts * self.rad_per_count, self.wraps_rad, where)
 
 
 def find_angle(table: Table, access: Access, profile: ModbusProfile) -> Angle | None:

@@ -211,7 +211,10 @@ def check_state(table: Table, access: Access, profile: ModbusProfile, scales: Sc
     faulty = power is PowerState.FAULT
     mend = "Clear the fault's cause, then start with --reset-fault" if faulty else "Wait until the shaft is at rest"
     where = f"{register_name(register)}, {register_name(cycle.speed.register_)}"
-    table.row("state", "no fault, at rest", found, not faulty and not turning, where, mend)
+    known = power is not PowerState.UNKNOWN
+    if not known:
+        mend = "Check the drive behind a gateway, and that --profile is this drive's"
+    table.row("state", "no fault, at rest", found, known and not faulty and not turning, where, mend)
     if control.remote is not None:
         remote = seen(control.remote, status)
         table.row(

@@ -17,7 +17,7 @@ from drivers.modbus.cycle import shown_mode
 from drivers.modbus.link import Link
 from drivers.modbus.pdu import RegisterRefused
 from drivers.modbus.state_machine import decode, power_state, seen
-from drivers.quick_stop import Seen
+from drivers.quick_stop import BLANK_WORDS, Seen
 from profiles.modbus import ModbusProfile, StatusState
 
 NEAR_ZERO_RAD_S, NEAR_ZERO_COUNTS = 0.05, 5
@@ -46,7 +46,8 @@ class ModbusTarget:
     def ask(self, attempt: int) -> None:
         """The quick-stop word under speed control, where there is power to brake with. Raises TdhilError."""
         control = self._profile.control
-        state = decode(control, self._access.read(self._profile.cycle.status.register_) & 0xFFFF)
+        status = self._access.read(self._profile.cycle.status.register_) & 0xFFFF
+        state = decode(control, status) if status else None        # zeros may be a gateway's
         power = power_state(state)
         if state is not None and power not in _POWERED:
             return                     # but one that shows what the profile doesn't know may be under power
@@ -130,6 +131,7 @@ class ModbusTarget:
             near_zero=near,
             standstill=seen(control.standstill, status),
             follows=power is PowerState.ENABLED,
+            blank=status in BLANK_WORDS,
         )
 
     def remarks(self) -> tuple[str, ...]:

@@ -63,6 +63,9 @@ _POWER = {
 }
 
 
+_ALL_ONES = 0xFFFF
+
+
 class Wish(Enum):
     """Where the caller wants the drive to be."""
 
@@ -77,13 +80,29 @@ def seen(bits: Bits | None, status: int) -> bool:
 
 
 def decode(control: Control, status: int) -> StatusState | None:
-    """The first state of the profile's list that fits; None where none does."""
+    """The first state of the profile's list that fits; None where none does, and for FFFFh.
+
+    No drive shows all bits at once: it would be enabled and in fault. A gateway without its drive does.
+    """
+    if status & _ALL_ONES == _ALL_ONES:
+        return None
     return next((state for state in control.states if status & state.mask == state.value), None)
 
 
+def decode_after(control: Control, status: int) -> StatusState | None:
+    """The same of a drive that has been enabled: from then on 0000h is no state either.
+
+    Of the words of each family some bit is set in any state of such a drive (remote, no coast stop, ready). In those of
+    CiA 402 not ready to switch on is over for good, with whatever else in the word.
+    """
+    state = decode(control, status)
+    over = state is not None and control.family == "cia402" and state.means == "not_ready"
+    return None if over or status & _ALL_ONES == 0 else state
+
+
 def power_state(state: StatusState | None) -> PowerState:
-    """What callers above the driver see of it; a pattern of no state counts as not ready."""
-    return PowerState.NOT_READY if state is None else _POWER[state.means]
+    """What callers above the driver see of it."""
+    return PowerState.UNKNOWN if state is None else _POWER[state.means]
 
 
 def controlword_towards(
@@ -96,7 +115,7 @@ def controlword_towards(
     gateway, or a pattern that the profile doesn't know, are no proof that it is off.
     """
     power = power_state(state)
-    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY)
+    under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)
     if wish is Wish.ENABLED:
         if power is PowerState.QUICK_STOP:
             word = control.quick_stop

@@ -147,7 +147,7 @@ class CanopenBench:
             if frame.outgoing:
                 continue
             if frame.identifier == 0x281:
-                mode, demand = struct.unpack("<bh", frame.data)
+                mode, demand, _ = struct.unpack("<bhi", frame.data)
             elif frame.identifier == 0x181:
                 status, torque, speed = struct.unpack("<Hhi", frame.data)
                 shown = {9: Mode.SPEED, 3: Mode.SPEED, 10: Mode.TORQUE, 4: Mode.TORQUE}.get(mode)

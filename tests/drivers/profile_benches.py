@@ -19,7 +19,7 @@ class ProfileBench(CanopenBench):
         found, mode, shown = [], 0, dict(self.MODES)
         for frame in frames:
             if not frame.outgoing and frame.identifier == 0x281:
-                (mode,) = struct.unpack("<b", frame.data)
+                mode, _ = struct.unpack("<bi", frame.data)
             elif not frame.outgoing and frame.identifier == 0x181:
                 status, torque, speed = struct.unpack(self.FEEDBACK, frame.data)
                 found.append((status, speed * self.speed_lsb, torque * self.torque_lsb, None, shown.get(mode)))

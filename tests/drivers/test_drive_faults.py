@@ -70,7 +70,8 @@ def test_what_the_drive_says_unasked_is_raised_once(turning, bench, frame, kind,
 
 
 def test_a_third_party_puts_the_drive_into_pre_operational(turning, bench):
-    bench.foreign(0x000, bytes([0x80, 0x01]))
+    """By a command that this host does not hear (a gateway's)."""
+    bench.simulated.simulator.node.on_frame(0x000, bytes([0x80, 0x01]))
     with pytest.raises(CommunicationLost, match="pre-operational"):
         for _ in range(3):                                # the frames stop at once; the heartbeat tells why
             turning.cycle(speed=2.0)

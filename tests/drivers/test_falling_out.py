@@ -5,6 +5,7 @@ import pytest
 from drivers.canopen.drive import Cia402Drive
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode, PowerState
+from drivers.errors import CommunicationLost
 from tests.drivers.power_machine import ENABLED, FAULT, OFF, READY
 from tests.drivers.scripted_drive import TPDO1
 
@@ -52,8 +53,52 @@ def test_one_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog(drive, 
     """A statusword of zero, whoever made it one, is no proof that the drive is off."""
     armed = peer.value(0x1016, 1)
     peer.tpdo = lambda cycle: TPDO1.pack(0, 0, 50_000)
-    assert cycles(drive, wire) is PowerState.NOT_READY
+    assert cycles(drive, wire) is PowerState.UNKNOWN
     written = len(peer.writes)
     drive.close()
     assert peer.value(0x1016, 1) == armed != 0
     assert len(peer.writes) == written
+
+
+# -- who controls it ---------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_that_is_switched_to_another_control_place_ends_the_run(drive, wire, peer):
+    """Bit 9 of the statusword, which was set in operation."""
+    peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0)
+    with pytest.raises(CommunicationLost, match=r"bit 9 \(remote\) of the statusword 1037h is 0"):
+        cycles(drive, wire, 5)
+    drive.quick_stop()
+    cycles(drive, wire, 20)            # told once
+
+
+def test_a_drive_that_never_sets_that_bit_is_not_judged_by_it(wire, peer, profile):
+    peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0)
+    drive = Cia402Drive(wire, profile, SteppedClock(), node=1)
+    drive.connect()
+    drive.preflight(LIMITS)
+    drive.enable(Mode.SPEED)
+    assert cycles(drive, wire, 100) is PowerState.ENABLED
+
+
+def test_one_frame_without_it_is_an_accident(drive, wire, peer):
+    plain, few = peer.tpdo, iter((True, True, False) * 100)
+    peer.tpdo = lambda cycle: TPDO1.pack(peer.machine.status | 0x1000, 0, 0) if next(few) else plain(cycle)
+    assert cycles(drive, wire, 60) is PowerState.ENABLED
+
+
+@pytest.mark.parametrize("target", [0, 1])
+def test_pre_operational_and_start_in_quick_succession_are_noticed(drive, wire, target):
+    """No heartbeat shows it: the drive is operational again when the next one comes."""
+    wire.put(0x000, bytes((0x80, target)))
+    wire.put(0x000, bytes((0x01, target)))
+    with pytest.raises(CommunicationLost, match="NMT state pre-operational, by a command"):
+        cycles(drive, wire, 3)
+    assert [line for line in drive.remarks() if "NMT start" in line]
+
+
+def test_commands_to_other_nodes_and_a_start_are_no_trouble(drive, wire):
+    wire.put(0x000, bytes((0x80, 5)))
+    wire.put(0x000, bytes((0x01, 0)))
+    assert cycles(drive, wire, 20) is PowerState.ENABLED
+    assert drive.remarks() == ("somebody else sent NMT start to all nodes",)

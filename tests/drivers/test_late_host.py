@@ -273,3 +273,29 @@ def test_a_short_watchdog_leaves_no_slow_rate(wire, peer, profile, fake_time):
 def test_a_named_rate_and_stepped_time_leave_no_choice(wire, peer, profile, fake_time):
     assert Cia402Drive(wire, profile, MonotonicClock(), node=1, rate_hz=250.0).rates_hz == ()
     assert Cia402Drive(wire, profile, SteppedClock(), node=1).rates_hz == ()
+
+
+# -- a stall, and the bus off on waking --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("behind_s", [0.0, 0.001, 0.5])
+def test_a_long_stall_and_a_bus_that_is_off_on_waking(drive, peer, wire, fake_time, behind_s):
+    """25 s away, and the adapter has gone bus-off: the stall is told first, and nothing is sent from then on."""
+    peer.silent = True
+    fake_time.now_s += 25.0
+    wire.put(0x040, bytes(8), behind_s, is_error_frame=True)
+    wire.sent.clear()
+    told = []
+    for _ in range(200):
+        try:
+            drive.exchange(TURN)
+        except CommunicationLost as error:
+            told.append(error.what)
+            drive.quick_stop()
+    assert "stood still for 25" in told[0]
+    assert any("bus-off" in text for text in told)
+    assert [data for data in wire.of(0x201) if data[0] & 0x0F == 0x0F] == [], "an enabling word after a stall"
+    wire.sent.clear()
+    with pytest.raises(CommunicationLost, match="bus-off: nothing is sent"):
+        drive.poll()
+    assert wire.sent == []

@@ -225,7 +225,7 @@ def test_one_status_word_that_makes_no_sense_lets_no_shaft_go(status, speed):
     run.bank.feedback = lambda: (3000, 0)
     run.cycle()
     run.bank.on_show = lambda words: words.update({STATUS: status, SPEED: 0, SPEED + 1: speed})
-    assert run.cycle().state in (PowerState.NOT_READY, PowerState.READY)
+    assert run.cycle().state in (PowerState.UNKNOWN, PowerState.READY)
     run.cycle()
     run.drive.quick_stop()
     run.cycle()
@@ -246,6 +246,13 @@ def test_a_drive_that_was_enabled_and_shows_no_state_is_left_to_its_watchdog():
     run.bank.writes.clear()
     assert any("not known to be disabled" in line for line in run.drive.close())
     assert run.bank.writes == []
+
+
+def test_a_drive_that_is_switched_to_another_control_place_ends_the_run():
+    run = Run().enabled()
+    run.bank.on_show = lambda words: words.update({STATUS: words[STATUS] & ~0x0200})
+    ((_, error),) = errors(run, 20)
+    assert "does not show remote control" in error.what
 
 
 def test_a_turning_shaft_is_braked_before_it_is_disabled():

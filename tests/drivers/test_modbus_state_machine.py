@@ -31,7 +31,7 @@ POWER = {
 def test_every_status_word():
     for low in range(0x100):
         meant = [POWER[state] for state, pattern in STATUS_PATTERNS.items() if matches(low, pattern)]
-        assert power_state(decode(CONTROL, 0xA200 | low)) is (meant[0] if meant else PowerState.NOT_READY)
+        assert power_state(decode(CONTROL, 0xA200 | low)) is (meant[0] if meant else PowerState.UNKNOWN)
 
 
 def walk(machine, wish, cycles=10, turning=False):

@@ -1,16 +1,16 @@
 """The pure codec, against bytes worked out by hand."""
 
 import math
-import struct
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.canopen import pdo as objects
-from drivers.canopen.pdo import Units, consumer_heartbeat, encode_speed, encode_torque, mapping_entry
+from drivers.canopen.pdo import Slow, Units, consumer_heartbeat, encode_speed, encode_torque, mapping_entry
 from drivers.canopen.pdo_mapping import layout
 from drivers.errors import CommandRejected
+from profiles.canopen import STANDARD_POSITION
 
 RPM = math.pi / 30.0
 PLAIN = Units(0.1 * RPM, 1.0)       # 0.1 rpm; 1 ‰ of 1000 N·m
@@ -75,8 +75,10 @@ def test_bytes_of_the_cyclic_frames():
     # 6041h = 1237h · 6077h = 300 ‰ · 606Ch = -1
     assert objects.TPDO1.unpack(bytes.fromhex("37122c01ffffffff")) == (0x1237, 300, -1)
     assert objects.RPDO2.pack(-1).hex() == "ff"
-    assert objects.TPDO2_MODE.unpack(b"\x0a") == (10,)
-    assert objects.TPDO2_MODE_DEMAND.unpack(bytes.fromhex("0a18fc")) == (10, -1000)
+    assert Slow().unpack(b"\x0a") == (10, None, None)
+    assert Slow(demand=True).unpack(bytes.fromhex("0a18fc")) == (10, -1000, None)
+    assert Slow(demand=True, position=STANDARD_POSITION).unpack(bytes.fromhex("0a18fcfeffffff")) == (10, -1000, -2.0)
+    assert Slow(position=STANDARD_POSITION).unpack(bytes.fromhex("0affffff7f")) == (10, None, 2147483647.0)
 
 
 @relaxed
@@ -89,21 +91,27 @@ def test_bytes_of_any_frame(word, torque, speed):
 
 
 def test_mapping_entries():
-    entries = [[f"{mapping_entry(mapped):08X}" for mapped in pdo.mapped] for pdo in layout(with_demand=True)]
+    entries = [[f"{mapping_entry(mapped):08X}" for mapped in pdo.mapped] for pdo in layout(Slow(demand=True))]
     assert entries == [
         ["60400010", "60710010", "60FF0020"],
         ["60410010", "60770010", "606C0020"],
         ["60600008"],
         ["60610008", "60740010"],
     ]
-    assert [mapping_entry(mapped) for mapped in layout(with_demand=False)[3].mapped] == [0x60610008]
+    assert [mapping_entry(mapped) for mapped in layout(Slow())[3].mapped] == [0x60610008]
+    angle = Slow(demand=True, position=STANDARD_POSITION)
+    assert [mapping_entry(mapped) for mapped in layout(angle)[3].mapped] == [0x60610008, 0x60740010, 0x60640020]
 
 
 def test_mapping_and_frames_are_of_one_length():
-    structs = [objects.RPDO1, objects.TPDO1, objects.RPDO2, objects.TPDO2_MODE_DEMAND]
-    for pdo, codec in zip(layout(with_demand=True), structs, strict=True):
+    for slow in (Slow(), Slow(demand=True), Slow(position=STANDARD_POSITION), Slow(True, STANDARD_POSITION)):
+        check_lengths(slow)
+
+
+def check_lengths(slow):
+    structs = [objects.RPDO1, objects.TPDO1, objects.RPDO2, slow]
+    for pdo, codec in zip(layout(slow), structs, strict=True):
         assert sum(mapping_entry(mapped) & 0xFF for mapped in pdo.mapped) == 8 * codec.size
-    assert struct.calcsize("<b") == objects.TPDO2_MODE.size
 
 
 def test_consumer_heartbeat():

@@ -3,6 +3,7 @@
 import pytest
 
 from drivers.canopen.bus import CanLink
+from drivers.canopen.pdo import Slow
 from drivers.canopen.pdo_mapping import layout, write_pdo
 from drivers.canopen.sdo import Objects
 from drivers.clock import SteppedClock
@@ -19,7 +20,7 @@ def written(peer):
 
 
 def test_the_order_for_the_first_pair(objects, peer):
-    first, second = layout(with_demand=True)[:2]
+    first, second = layout(Slow(demand=True))[:2]
     write_pdo(objects, 1, first)
     write_pdo(objects, 1, second)
     assert written(peer) == [
@@ -32,7 +33,7 @@ def test_the_order_for_the_first_pair(objects, peer):
 
 @pytest.mark.parametrize("with_demand", [True, False])
 def test_the_order_for_the_second_pair(objects, peer, with_demand):
-    for pdo in layout(with_demand)[2:]:
+    for pdo in layout(Slow(with_demand))[2:]:
         write_pdo(objects, 1, pdo)
     slow = [("1A01:1", 0x60610008)] + [("1A01:2", 0x60740010)] * with_demand
     assert written(peer) == [
@@ -45,20 +46,20 @@ def test_the_order_for_the_second_pair(objects, peer, with_demand):
     (1, [0x201, 0x181, 0x301, 0x281]), (0x7F, [0x27F, 0x1FF, 0x37F, 0x2FF]),
 ])
 def test_identifiers_of_the_predefined_connection_set(node, identifiers):
-    assert [pdo.identifier(node) for pdo in layout(with_demand=True)] == identifiers
+    assert [pdo.identifier(node) for pdo in layout(Slow(demand=True))] == identifiers
 
 
 def test_a_fixed_mapping_that_says_no(objects, peer):
     peer.refuse_write[0x1600, 0] = 0x06010002
     with pytest.raises(ObjectRefused) as caught:
-        write_pdo(objects, 1, layout(with_demand=True)[0])
+        write_pdo(objects, 1, layout(Slow(demand=True))[0])
     assert caught.value.where == "1600h"
 
 
 def test_a_fixed_mapping_that_says_yes(objects, peer):
     peer.deaf_to |= {(0x1600, sub) for sub in range(9)}
     with pytest.raises(PreflightRefused, match="60400010h") as caught:
-        write_pdo(objects, 1, layout(with_demand=True)[0])
+        write_pdo(objects, 1, layout(Slow(demand=True))[0])
     assert caught.value.where == "1600h"
     assert "fix their mapping" in caught.value.next_step
 
@@ -68,5 +69,5 @@ def test_a_communication_parameter_that_is_not_taken_over(objects, peer, sub):
     """A PDO that stays disabled, or does not follow the SYNC, is as bad as one of the wrong content."""
     peer.deaf_to.add((0x1800, sub))
     with pytest.raises(PreflightRefused) as caught:
-        write_pdo(objects, 1, layout(with_demand=True)[1])
+        write_pdo(objects, 1, layout(Slow(demand=True))[1])
     assert "1800h" in caught.value.where

@@ -145,7 +145,7 @@ def test_torque_of_32_bits(make, monkeypatch, kind):
     run = Run(make(S120Bench))
     found = run.ready()
     mapping = next(check for check in found.checks if check.name == "PDO mapping")
-    assert mapping.wanted == "6040+60FF, 5830+606C, 6041+6061"
+    assert mapping.wanted == "6040+60FF, 5830+606C, 6041+6061+6064"
     run.enable()
     last = run.go(12.0, speed=5.0)
     assert last.torque_nm == pytest.approx(100.0, abs=1.0)

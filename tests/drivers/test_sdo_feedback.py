@@ -150,7 +150,7 @@ def test_a_drive_that_takes_no_writes_is_still_seen(code):
     run.bank.requests.clear()
     poll = run.drive.poll()
     assert poll.fresh and poll.state is PowerState.ENABLED
-    assert [pdu[0] for pdu in run.bank.requests] == [3, 6]           # read, and the word tried by itself
+    assert [pdu[0] for pdu in run.bank.requests] == [3, 6, 3]        # read, the word tried by itself, the angle
     run.bank.machine.state = STOPPING
     assert run.drive.poll().state is PowerState.QUICK_STOP
 

@@ -31,7 +31,7 @@ def test_every_low_byte(high):
     for low in range(0x100):
         fitting = [name for name, pattern in STATUS_PATTERNS.items() if matches(low, pattern)]
         assert len(fitting) <= 1
-        wanted = fitting[0] if fitting else NOT_READY
+        wanted = fitting[0] if fitting else "no valid state"
         shown += bool(fitting)
         assert _short(decode(high << 8 | low).value) == _short(wanted), hex(low)
     # 4 patterns leave bits 4, 5, 7 open, 4 leave bits 4 and 7.
@@ -49,6 +49,7 @@ def test_every_low_byte(high):
         (State.QUICK_STOP_ACTIVE, PowerState.QUICK_STOP),
         (State.FAULT_REACTION_ACTIVE, PowerState.FAULT),
         (State.FAULT, PowerState.FAULT),
+        (State.UNKNOWN, PowerState.UNKNOWN),
     ],
 )
 def test_what_callers_see(state, seen):
@@ -66,6 +67,7 @@ WORDS = {
     State.QUICK_STOP_ACTIVE:     (0x00, 0x02, 0x02),
     State.FAULT_REACTION_ACTIVE: (0x00, 0x00, 0x02),
     State.FAULT:                 (0x00, 0x00, 0x02),
+    State.UNKNOWN:               (0x02, 0x02, 0x02),
 }
 
 
