@@ -46,6 +46,17 @@ INTERNAL_LIMIT = 0x0800
 MODE_SPECIFIC = 0x1000
 
 
+DISABLED_BY_HOST = "power stage off by the host's controlword"
+"""The event of that, at once or after a ramp. A drive that ends a quick stop by itself is none."""
+
+RAMP_SHARE, RAMP_TOLERANCE, RAMP_STEPS, RAMP_GAP_S = 0.35, 0.015, 16, 0.2
+"""A speed setpoint that falls in at least 15 steps, none later than 0.2 s, to 35 % of where it began is a stop: no
+stage goes so far down along a line. Every step lies on the line within 1.5 % of the fall, which a sine does not."""
+
+TURNING_SHARE = 0.05
+"""Of the speed limit: a shaft that turns, for a stop that a script waits for. A sign probe stays below it."""
+
+
 class State(Enum):
     """The states by name; `STATUS` has their statusword bits."""
 
@@ -178,9 +189,13 @@ class Application:
         self.keeps_mode = False        # scripted: 6060h is taken and not followed
         self.on_event: Callable[[str], None] = _ignore
         self.on_fault_reset: Callable[[], None] = lambda: None
+        self.on_stop: Callable[[], None] | None = None      # scripted: the drive is told to come to rest, once
         self._after_stop: State | None = None       # where a stop under way ends
         self._stop_option = 0                       # and the ramp it uses
         self._own_stop = False                      # quick stop begun by the drive itself
+        self._time_s = 0.0
+        self._fall: list[tuple[float, float]] = []      # time and magnitude of a speed setpoint that comes down
+        self._by_host = False                       # the stop under way ends in what the host has ordered
         self._weighed: tuple[int, State] | None = None
         self._slow_for_s = 0.0
         self._in_window_s = 0.0
@@ -195,7 +210,7 @@ class Application:
         if self.state is State.FAULT and fault_reset_edge(before, word):
             self._enter(State.SWITCH_ON_DISABLED)
             self.on_fault_reset()
-        command = decode(word)
+        command, was_on = decode(word), self.energised
         if self._own_stop and command is not Command.ENABLE:
             self._own_stop = False
         coasts = self.mode in {Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
@@ -203,6 +218,9 @@ class Application:
             self._enter(State.SWITCH_ON_DISABLED)
         while self._obey(command):
             pass
+        if was_on and not self.energised:
+            self.on_event(DISABLED_BY_HOST)
+        self._by_host = self._after_stop in {State.READY, State.SWITCHED_ON}
         self._weighed = (word, self.state)
 
     def set_mode(self, code: int) -> bool:
@@ -306,17 +324,24 @@ class Application:
     def step(self, dt_s: float) -> None:
         """One step of at most the control period, with the setpoints as `regulate` left them."""
         self.inverter.step(dt_s)
+        self._time_s += dt_s
         settings = self.settings
         speed = self.inverter.control.filtered_rad_s
         self._slow_for_s = self._slow_for_s + dt_s if abs(speed) < settings.standstill_rad_s else 0.0
         near = abs(speed - self.target_speed_rad_s) < settings.window_rad_s
         self._in_window_s = self._in_window_s + dt_s if near else 0.0
         if self._after_stop is not None and self.standstill and self.inverter.control.at_rest_reference:
+            by_host = self._by_host
             self._enter(self._after_stop)
+            if by_host:
+                self.on_event(DISABLED_BY_HOST)
             self.regulate()
 
     def regulate(self) -> None:
         """Hands state, mode and setpoints to the control loops; called once before the steps of a cycle."""
+        if self.on_stop is not None and self._told_to_rest():
+            tell, self.on_stop = self.on_stop, None
+            tell()
         control, settings = self.inverter.control, self.settings
         control.offset_nm = self.torque_offset_nm if self.mode is Mode.CYCLIC_VELOCITY else 0.0
         if self._after_stop is not None or self.state is State.QUICK_STOP:
@@ -337,6 +362,28 @@ class Application:
             control.torque(self.target_torque_nm, settings.torque_slope_nm_s)
         else:
             control.speed(self.target_speed_rad_s, settings.accel_rad_s2, settings.decel_rad_s2)
+
+    def _told_to_rest(self) -> bool:
+        """The shaft turns, and the host wants it not to: quick stop, halt, no enabling any more, or a speed of zero."""
+        if abs(self.inverter.speed_rad_s) < TURNING_SHARE * self.inverter.control.limits.speed_rad_s:
+            return False
+        if self.state is not State.ENABLED or self.halted or self._after_stop is not None:
+            return True
+        in_speed = self.mode in {Mode.VELOCITY, Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY}
+        return in_speed and (self.target_speed_rad_s == 0.0 or self._ramped_down())
+
+    def _ramped_down(self) -> bool:
+        """The host takes the speed setpoint down along a straight line, as it does above a drill string."""
+        target, fall = abs(self.target_speed_rad_s), self._fall
+        if fall and (target > fall[-1][1] or self._time_s - fall[-1][0] > RAMP_GAP_S):
+            fall.clear()
+        if not fall or target < fall[-1][1]:
+            fall.append((self._time_s, target))
+        if len(fall) < RAMP_STEPS or target > RAMP_SHARE * fall[0][1]:
+            return False
+        (began_s, high), (ended_s, low) = fall[0], fall[-1]
+        slope = (high - low) / (ended_s - began_s)
+        return all(abs(high - slope * (t - began_s) - w) < RAMP_TOLERANCE * (high - low) for t, w in fall)
 
     # -- transitions -------------------------------------------------------------------------------------
 

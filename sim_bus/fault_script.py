@@ -4,6 +4,7 @@
 
     NAME[@WHEN][=VALUE][/DURATION]      heartbeat-lost@hold+2s    frame-loss@acquire+5s=5%/20s    sto@12.5s
     WHEN    12.5s  from power-on    STAGE or STAGE+2s  from the moment at which the host says that the stage begins
+            STAGE may also be stop: from the moment at which the drive is first told to come to rest
             left out: from the start
     DURATION  left out: for good
 """
@@ -16,6 +17,10 @@ from typing import Generic, TypeVar
 
 from profiles import STAGE_NUMBERS, TdhilError
 
+STOP = max(STAGE_NUMBERS.values()) + 1
+"""The number of a moment that no host announces: the drive is told to come to rest while its shaft turns."""
+
+_MOMENTS = {**STAGE_NUMBERS, "stop": STOP}
 _NUMBER = r"\d+(?:\.\d+)?"
 _FAULT = re.compile(
     rf"(?P<name>[a-z][a-z0-9-]*)(?:@(?P<when>[^=/]+))?(?:=(?P<value>[^/]+))?(?:/(?P<duration>{_NUMBER}m?s))?"
@@ -146,12 +151,12 @@ def _moment(when: str | None, text: str) -> Moment:
     if when is None:
         return Moment()
     found = _WHEN.fullmatch(when)
-    if found is None or found["stage"] not in {None, *STAGE_NUMBERS}:
+    if found is None or found["stage"] not in {None, *_MOMENTS}:
         raise FaultRefused(f"{when!r} is no moment", where=f"--fault {text}",
-                           next_step=f"Write 12.5s, or a stage and a time: {', '.join(STAGE_NUMBERS)}, as in hold+2s")
+                           next_step=f"Write 12.5s, or a stage and a time: {', '.join(_MOMENTS)}, as in hold+2s")
     if found["time"] is not None:
         return Moment(0, _seconds(found["time"]))
-    return Moment(STAGE_NUMBERS[str(found["stage"])], _seconds(found["after"] or "0s"))
+    return Moment(_MOMENTS[str(found["stage"])], _seconds(found["after"] or "0s"))
 
 
 def _seconds(text: str) -> float:
@@ -256,7 +261,7 @@ class Kinds(dict[str, Kind[M]]):
     def listing(self) -> str:
         """Every fault with its row and value, for people."""
         lines = [
-            "NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: setup, speed, torque, hold, acquire, hold+2s",
+            f"NAME[@WHEN][=VALUE][/DURATION]; WHEN is 12.5s, or a stage: {', '.join(_MOMENTS)}, hold+2s",
             "", f"{'row':>3}  {'name':<37}what happens",
         ]
         for one in self.listed():

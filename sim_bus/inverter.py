@@ -20,6 +20,7 @@ from sim_bus.params import DriveParams, NoiseParams, RigParams
 from sim_bus.plant import MotorState, build
 from sim_bus.plant import Params as RigidParams
 from sim_bus.plant import State as RigidState
+from sim_bus.reports import Feedback, Lies
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Seeded disturbances: white sensor and torque noise, and a load that wanders (Ornstein–Uhlenbeck).
@@ -102,24 +103,24 @@ class Reporting:
     """Reported speed and torque, renewed with every step and held in between."""
 
     __slots__ = (
-        "_params", "_speed_gain", "_speed_lagged", "_speed_quantum", "_torque_gain", "_torque_lagged",
-        "_torque_quantum", "speed_rad_s", "speed_scale", "torque_nm", "torque_scale",
+        "_dt_s", "_params", "_speed_gain", "_speed_lagged", "_speed_quantum", "_torque_gain", "_torque_lagged",
+        "_torque_quantum", "lies", "speed_rad_s", "torque_nm",
     )
 
-    def __init__(self, rig: RigParams) -> None:
+    def __init__(self, rig: RigParams, lies: Lies) -> None:
         self._params = rig.reporting
+        self.lies = lies
         self._speed_quantum = rig.reporting.speed_quantum_rpm * RPM
         self._torque_quantum = rig.reporting.torque_quantum_permille * rig.drive.rated_torque_nm / 1000.0
         self._speed_lagged = 0.0
         self._torque_lagged = 0.0
         self.speed_rad_s = 0.0
         self.torque_nm = 0.0
-        self.speed_scale = self.torque_scale = 1.0
-        """Scripted: what is reported is multiplied by these."""
         self.prepare(rig.drive.control_period_s)
 
     def prepare(self, dt_s: float) -> None:
         """Fits the lags to a step of ``dt_s``."""
+        self._dt_s = dt_s
         self._speed_gain = lag_gain(dt_s, self._params.speed_lag_s)
         self._torque_gain = lag_gain(dt_s, self._params.torque_lag_s)
 
@@ -128,8 +129,11 @@ class Reporting:
         params = self._params
         self._speed_lagged = speed = self._speed_lagged + self._speed_gain * (speed_rad_s - self._speed_lagged)
         self._torque_lagged = torque = self._torque_lagged + self._torque_gain * (torque_nm - self._torque_lagged)
-        speed = self.speed_scale * (speed + params.speed_noise_rad_s * speed_normal)
-        torque = self.torque_scale * (torque + params.torque_noise_nm * torque_normal)
+        speed += params.speed_noise_rad_s * speed_normal
+        torque += params.torque_noise_nm * torque_normal
+        if self.lies.of_values:
+            speed = self.lies.told(Feedback.SPEED, speed, self._dt_s)
+            torque = self.lies.told(Feedback.TORQUE, torque, self._dt_s)
         quantum = self._speed_quantum
         self.speed_rad_s = round(speed / quantum) * quantum if quantum else speed
         quantum = self._torque_quantum
@@ -355,13 +359,15 @@ class Inverter:
 
     __slots__ = (
         "_bottom_load", "_disturbance", "_dt_s", "_lagged_nm", "_move", "_normals", "_torque_gain", "control",
-        "params", "reporting", "state", "torque_nm",
+        "lies", "params", "reporting", "state", "torque_nm",
     )
 
     def __init__(self, params: RigParams, rng: np.random.Generator) -> None:
         self.params = params
         self.control = Controller(params.drive)
-        self.reporting = Reporting(params)
+        self.lies = Lies()
+        """Scripted: what sensor, power stage and reports make of the truth."""
+        self.reporting = Reporting(params, self.lies)
         plant = build(params.plant)
         self.state: MotorState = plant.rest()
         self._move: Callable[..., MotorState] = plant.step
@@ -379,27 +385,46 @@ class Inverter:
         """The motor shaft's true speed."""
         return self.state.speed_rad_s
 
+    @property
+    def reported_demand_nm(self) -> float:
+        """The torque demand as the drive tells it."""
+        return self.lies.last(Feedback.DEMAND, self.control.demand_nm)
+
+    @property
+    def reported_angle_rad(self) -> float:
+        """The motor shaft's angle as the drive's sensor counts it and the drive tells it."""
+        return self.lies.angle_rad(self.state.angle_rad)
+
     def step(self, dt_s: float) -> None:
         """Everything moves on by ``dt_s`` (at most the control period, see `steps`)."""
         if dt_s != self._dt_s:
             self._prepare(dt_s)
         sensor, ripple, load, speed_noise, torque_noise = next(self._normals)
-        disturbance = self._disturbance
-        speed = self.state.speed_rad_s
+        disturbance, lies = self._disturbance, self.lies
+        speed, angle = self.state.speed_rad_s, self.state.angle_rad
         offset = disturbance.sensor_sd_rad_s * sensor
-        demand = self.control.step(speed + offset, dt_s)
+        measured = lies.measured(speed, offset, dt_s) if lies.of_sensor else speed + offset
+        demand = self.control.step(measured, dt_s)
         if self.control.regulation is Regulation.OFF:
-            torque = self._lagged_nm = 0.0
+            torque = believed = self._lagged_nm = 0.0
         else:
             self._lagged_nm += self._torque_gain * (demand - self._lagged_nm)
-            torque = self._lagged_nm + disturbance.torque_sd_nm * ripple
+            torque, believed = lies.torque(self._lagged_nm + disturbance.torque_sd_nm * ripple,
+                                           stopping=self.control.regulation is Regulation.STOP)
         self.torque_nm = torque
         at_motor = disturbance.wander(load)
         if self._bottom_load is None:
             self.state = state = self._move(self.state, torque, dt_s, at_motor)
         else:
             self.state = state = self._move(self.state, torque, dt_s, at_motor, self._bottom_load.wander(dt_s))
-        self.reporting.step(0.5 * (speed + state.speed_rad_s) + offset, torque, speed_noise, torque_noise)
+        mean = 0.5 * (speed + state.speed_rad_s) + offset
+        if lies.of_sensor:
+            mean = measured
+            lies.turned(state.angle_rad - angle, dt_s)
+        self.reporting.step(mean, believed, speed_noise, torque_noise)
+        if lies.of_values:
+            lies.told(Feedback.DEMAND, self.control.demand_nm, dt_s)
+            lies.told(Feedback.POSITION, lies.counted_rad(state.angle_rad), dt_s)
 
     def steps(self, duration_s: float) -> tuple[int, float]:
         """How many equal steps, none longer than the control period, make up ``duration_s``."""

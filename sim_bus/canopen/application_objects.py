@@ -24,6 +24,7 @@ from sim_bus.canopen.objects import ABORT_VALUE, ObjectStore, key_of
 from sim_bus.cia402 import Application, Settings
 from sim_bus.inverter import RPM
 from sim_bus.params import DriveParams
+from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What one count of each of the drive's objects is, in SI at the shaft; by itself, or as a profile says.
@@ -150,22 +151,23 @@ class ApplicationObjects:
     def _bind_process_data(self) -> None:
         application, store = self._application, self._store
         live, hooks = store.live, store.hooks
-        control, reporting = application.inverter.control, application.inverter.reporting
+        inverter, reporting, word = application.inverter, application.inverter.reporting, application.inverter.lies.word
         units = self._units
         velocity, target, actual = units.velocity, units.target_torque, units.actual_torque
         live[key_of(0x6040)] = lambda: application.controlword
-        live[key_of(0x6041)] = application.statusword
+        live[key_of(0x6041)] = word(Feedback.STATUS, application.statusword, 0xFFFF)
         live[key_of(0x6060)] = live[key_of(0x6061)] = lambda: application.mode.value
         live[key_of(0x606B)] = self._velocity_demand
-        live[key_of(0x606C)] = lambda: clamped(reporting.speed_rad_s / velocity, 32)
-        live[key_of(0x6064)] = lambda: wrapped(application.inverter.state.angle_rad / TURN * counts_per_turn(store))
-        live[key_of(0x6074)] = lambda: clamped(control.demand_nm / target, 16)
-        live[key_of(0x6077)] = lambda: clamped(reporting.torque_nm / actual, 16)
+        live[key_of(0x606C)] = word(Feedback.SPEED, lambda: clamped(reporting.speed_rad_s / velocity, 32))
+        live[key_of(0x6064)] = word(
+            Feedback.POSITION, lambda: wrapped(inverter.reported_angle_rad / TURN * counts_per_turn(store)))
+        live[key_of(0x6074)] = word(Feedback.DEMAND, lambda: clamped(inverter.reported_demand_nm / target, 16))
+        live[key_of(0x6077)] = word(Feedback.TORQUE, lambda: clamped(reporting.torque_nm / actual, 16))
         live[key_of(0x6071)] = lambda: clamped(application.target_torque_nm / target, 16)
         live[key_of(0x60B2)] = lambda: clamped(application.torque_offset_nm / units.torque_offset, 16)
         live[key_of(0x60FF)] = lambda: clamped(application.target_speed_rad_s / velocity, 32)
         live[key_of(0x6042)] = lambda: clamped(application.target_speed_rad_s / velocity, 16)
-        live[key_of(0x6044)] = lambda: clamped(reporting.speed_rad_s / velocity, 16)
+        live[key_of(0x6044)] = word(Feedback.SPEED, lambda: clamped(reporting.speed_rad_s / velocity, 16))
         hooks.update(self.setters)
         hooks[key_of(0x6060)] = self._mode_by_sdo
 

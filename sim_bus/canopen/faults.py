@@ -18,7 +18,8 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_script import Cast, Kind, Kinds, Passing, Scripted, factor, plain, seconds, share
+from sim_bus.fault_script import STOP, Cast, Kind, Kinds, Passing, Scripted, plain, seconds, share
+from sim_bus.reports import Lie, lying
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault may do: change frames on their way in or out, and lay hands on the drive itself.
@@ -162,21 +163,17 @@ class LoadLost(Misbehaviour):
         self.scene.node.inverter.lose_load(self._share)
 
 
-class Reported(Misbehaviour):
-    """What the drive reports is scaled so; what it regulates by isn't."""
+class Lying(Misbehaviour):
+    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
 
-    def __init__(self, *, speed: float = 1.0, torque: float = 1.0) -> None:
-        self._speed, self._torque = speed, torque
+    def __init__(self, lie: Lie) -> None:
+        self._lie = lie
 
     def begin(self) -> None:
-        self._scale(self._speed, self._torque)
+        self._lie.begin(self.scene.node.inverter.lies)
 
     def end(self) -> None:
-        self._scale(1.0, 1.0)
-
-    def _scale(self, speed: float, torque: float) -> None:
-        reporting = self.scene.node.inverter.reporting
-        reporting.speed_scale, reporting.torque_scale = speed, torque
+        self._lie.end(self.scene.node.inverter.lies)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -534,16 +531,14 @@ KINDS: Kinds[Misbehaviour] = Kinds({
                            lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
     "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
                       lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
-    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: Reported(speed=-1.0))),
     "write-not-kept": Kind(45, "a write to an object is answered and not kept",
                            lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
     "reads-back-otherwise": Kind(45, "an object reads back as something else",
                                  lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
     "watchdog-not-armed": Kind(50, "the write to 1016h:1 is answered and not kept",
                                plain(lambda: NotKept(0x1016, 1))),
-    "torque-scale": Kind(0, "the reported torque is multiplied by this",
-                         lambda v: Reported(torque=factor(v)), "1.1", "FACTOR"),
 })
+KINDS.update(lying(Lying))
 make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KINDS.listing
 
 
@@ -570,6 +565,7 @@ class Faults:
         sender.script = self._outgoing
         node.on_time = self.moved
         node.on_stage = self._on_stage
+        node.application.on_stop = lambda: self._on_stage(STOP)
 
     @property
     def waiting(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ What the profile doesn't say stays as in our own EDS. The marker object stays to
 
 
 from collections.abc import Callable
-from math import isfinite
+from math import isfinite, nan
 
 from canopen.objectdictionary import datatypes
 
@@ -15,6 +15,7 @@ from sim_bus.canopen.application_objects import TURN, ObjectUnits, clamped, coun
 from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.canopen.services import LifeGuard
 from sim_bus.cia402 import Application, Mode
+from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The manufacturer's settings of a worn profile: their objects, what they stand at, and what those that limit do.
@@ -266,13 +267,15 @@ class WornProfile:
             store.add(
                 actual.index, actual.sub, DATA_TYPES[actual.type], writable=False, mappable=True, name="Torque actual"
             )
-            reporting, unit = self._application.inverter.reporting, self.units.actual_torque
+            inverter, unit = self._application.inverter, self.units.actual_torque
+            reporting = inverter.reporting
             key = key_of(actual.index, actual.sub)
             if actual.type == "f32":
-                store.live[key] = lambda: reporting.torque_nm / unit
+                store.live[key] = inverter.lies.word(Feedback.TORQUE, lambda: reporting.torque_nm / unit, nan)
             else:
                 bits = int(actual.type[1:])
-                store.live[key] = lambda: clamped(reporting.torque_nm / unit, bits)
+                store.live[key] = inverter.lies.word(
+                    Feedback.TORQUE, lambda: clamped(reporting.torque_nm / unit, bits))
 
     def _speed(self, store: ObjectStore) -> None:
         if self.profile.speed.vl:
@@ -298,14 +301,15 @@ class WornProfile:
         )
 
         def counts() -> float:
-            turned = inverter.state.angle_rad / TURN * (position.counts_per_turn or counts_per_turn(store))
+            turned = inverter.reported_angle_rad / TURN * (position.counts_per_turn or counts_per_turn(store))
             if position.wrap_counts is not None:
                 turned %= position.wrap_counts
             if position.type == "f32":
                 return turned
             return wrapped(turned, int(position.type[1:]), signed=position.type[0] == "i")
 
-        store.live[key_of(position.index, position.sub)] = counts
+        ones = {"f": nan, "i": -1.0, "u": 2.0 ** int(position.type[1:]) - 1.0}[position.type[0]]
+        store.live[key_of(position.index, position.sub)] = inverter.lies.word(Feedback.POSITION, counts, ones)
 
     def _filters(self, store: ObjectStore) -> None:
         """What smooths the reports of the simulated machine, as the profile's drive would tell it."""

@@ -18,6 +18,7 @@ from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
 from sim_bus.cia402 import Mode
 from sim_bus.fault_script import (
+    STOP,
     Cast,
     FaultRefused,
     Kind,
@@ -26,13 +27,13 @@ from sim_bus.fault_script import (
     Moment,
     Passing,
     Scripted,
-    factor,
     plain,
     share,
 )
 from sim_bus.modbus.codec import NONE, Reply
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong, parse
+from sim_bus.reports import Lie, lying
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What a scripted fault of a Modbus drive may do: come between request and reply, and lay hands on the drive itself.
@@ -263,12 +264,9 @@ def load_lost(share: float) -> Act:
     return Act(lambda machine: machine.inverter.lose_load(share))
 
 
-def reported(*, speed: float = 1.0, torque: float = 1.0) -> Act:
-    """What the drive reports is scaled so; what it regulates by isn't."""
-    def scale(machine: Machine, by_speed: float, by_torque: float) -> None:
-        machine.inverter.reporting.speed_scale, machine.inverter.reporting.torque_scale = by_speed, by_torque
-
-    return Act(lambda machine: scale(machine, speed, torque), lambda machine: scale(machine, 1.0, 1.0))
+def lying_drive(lie: Lie) -> Act:
+    """Sensor, power stage or reports of the drive are wrong (`sim_bus.reports`)."""
+    return Act(lambda machine: lie.begin(machine.inverter.lies), lambda machine: lie.end(machine.inverter.lies))
 
 
 def _deaf(machine: Machine, deaf: bool) -> None:
@@ -339,7 +337,6 @@ KINDS: Kinds[Misbehaviour] = Kinds({
     "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
                       lambda v: load_lost(max(0.001, share(v))), "10%", "SHARE"),
     "hot": Kind(35, "motor and drive become so hot, °C", lambda v: hot(_celsius(v)), "150", "CELSIUS"),
-    "encoder-inverted": Kind(36, "the reported speed has the wrong sign", plain(lambda: reported(speed=-1.0))),
     "exception": Kind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
                       lambda v: Refusing(_code(v)), "4", "CODE"),
     "no-reply": Kind(39, "this share of the requests doesn't get through, and nothing comes back",
@@ -364,9 +361,8 @@ KINDS: Kinds[Misbehaviour] = Kinds({
                                  "torque_limit", "PARAMETER"),
     "watchdog-not-armed": Kind(50, "the watchdog's time is written without an error, and keeps what it was",
                                plain(NotArmed)),
-    "torque-scale": Kind(0, "the reported torque is multiplied by this",
-                         lambda v: reported(torque=factor(v)), "1.1", "FACTOR"),
 })
+KINDS.update(lying(lying_drive))
 make, listing = KINDS.make, KINDS.listing
 
 
@@ -431,6 +427,7 @@ class Faults:
         if script:
             machine.on_time = self.moved
             machine.on_stage = self._on_stage
+            machine.application.on_stop = lambda: self._on_stage(STOP)
             self.moved(0)
 
     @property

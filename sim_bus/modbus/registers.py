@@ -28,6 +28,7 @@ from sim_bus.modbus.codec import Layout
 from sim_bus.modbus.control_words import Words
 from sim_bus.modbus.parameters import Parameters
 from sim_bus.modbus.wrong_maps import DeviceFailure, IllegalAddress, IllegalFunction, IllegalValue, Refused, Wrong
+from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Which register holds what: the profile's map laid over the simulated drive, with the wrongs that it has.
@@ -91,20 +92,21 @@ class Map:
 
     def _cycle(self) -> list[Slot]:
         cycle, words, application = self._profile.cycle, self._words, self._application
-        control, reporting = application.inverter.control, application.inverter.reporting
+        inverter, reporting = application.inverter, application.inverter.reporting
         slots = [
             Slot(self._layout(cycle.control.register_), lambda: words.word, words.write, commands=True),
-            Slot(self._layout(cycle.status.register_), self._status),
+            self._lying(Feedback.STATUS, Slot(self._layout(cycle.status.register_), self._status)),
             Slot(self._layout(cycle.speed_setpoint.register_), lambda: self._speed_counts, self._set_speed,
                  commands=True),
-            self._reported(cycle.speed, lambda: reporting.speed_rad_s),
-            self._reported(cycle.torque, lambda: reporting.torque_nm),
+            self._lying(Feedback.SPEED, self._reported(cycle.speed, lambda: reporting.speed_rad_s)),
+            self._lying(Feedback.TORQUE, self._reported(cycle.torque, lambda: reporting.torque_nm)),
         ]
         if cycle.torque_setpoint is not None:
             slots.append(Slot(self._layout(cycle.torque_setpoint.register_), lambda: self._torque_counts,
                               self._set_torque, commands=True))
         if cycle.torque_demand is not None:
-            slots.append(self._reported(cycle.torque_demand, lambda: control.demand_nm))
+            demand = self._reported(cycle.torque_demand, lambda: inverter.reported_demand_nm)
+            slots.append(self._lying(Feedback.DEMAND, demand))
         return slots
 
     def _mode(self) -> list[Slot]:
@@ -134,20 +136,20 @@ class Map:
         return [self._reported(echo, targets[echo.setpoint]) for echo in self._profile.echoes]
 
     def _position(self) -> list[Slot]:
-        """The true shaft's angle in counts; the counter starts over when it is full."""
+        """The sensor's angle in counts; the counter starts over when it is full."""
         position = self._profile.position
         if position is None:
             return []
         layout, inverter = self._layout(position.register_), self._application.inverter
 
         def read() -> int:
-            turned = inverter.state.angle_rad / (2.0 * pi) * position.counts_per_turn
+            turned = inverter.reported_angle_rad / (2.0 * pi) * position.counts_per_turn
             if position.wrap_counts is not None:
                 turned %= position.wrap_counts
             span = layout.highest - layout.lowest + 1
             return (floor(turned) - layout.lowest) % span + layout.lowest
 
-        return [Slot(layout, read)]
+        return [self._lying(Feedback.POSITION, Slot(layout, read))]
 
     def _temperatures(self) -> list[Slot]:
         slots = []
@@ -182,6 +184,13 @@ class Map:
             slots.append(Slot(layout, partial(self._told, layout, one.name),
                               partial(parameters.write, one.name) if writable else None))
         return slots
+
+    def _lying(self, signal: Feedback, slot: Slot) -> Slot:
+        """A slot whose number goes through the scripted distortions of its word."""
+        layout = slot.layout
+        ones = -1 if layout.signed else layout.highest
+        number = self._application.inverter.lies.word(signal, slot.read, ones)
+        return replace(slot, read=lambda: layout.saturated(number()))
 
     # -- helpers -------------------------------------------------------------------------------------------
 

@@ -34,7 +34,7 @@ def test_the_parts_may_be_left_out():
 
 @pytest.mark.parametrize(("text", "said"), [
     ("", "is no fault"), ("STO", "is no fault"), ("sto@", "is no fault"), ("sto@hold+2", "no moment"),
-    ("sto@stop+2s", "no moment"), ("sto@-2s", "no moment"), ("nothing-such", "no fault is called"),
+    ("sto@landing+2s", "no moment"), ("sto@-2s", "no moment"), ("nothing-such", "no fault is called"),
     ("sto=5", "takes no value"), ("frame-loss=200%", "0% to 100%"), ("frame-loss=x", "SHARE"),
     ("emcy=12345", "four hexadecimal"), ("sdo-abort=6072h:999", "an object"), ("torque-scale=0", "0.01 to 100"),
 ])

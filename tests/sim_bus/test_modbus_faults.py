@@ -58,7 +58,7 @@ def test_each_has_a_row_and_a_default(name: str) -> None:
     ("heartbeat-lost", "no fault is called"), ("exception=5", "an exception"), ("exception=x", "such as 4"),
     ("no-reply=101%", "0% to 100%"), ("late-reply=5", "such as 200ms"), ("sto=1", "takes no value"),
     ("scale-10@hold", "from the start"), ("sign/2s", "for good"), ("reads-back-otherwise=A-B", "a parameter"),
-    ("reset", "simulate modbus --tcp"), ("drive-fault@stop", "no moment"), ("", "is no fault"),
+    ("reset", "simulate modbus --tcp"), ("drive-fault@landing", "no moment"), ("", "is no fault"),
 ])
 def test_what_is_refused(text: str, said: str) -> None:
     with pytest.raises(FaultRefused) as caught:

@@ -1,0 +1,347 @@
+"""Combinations of a lying drive: which lie, from when on, on which rig and bus, in which program of tdhil. Pure.
+
+A *program* is what tdhil is asked to do on one simulated rig, short enough for two or three seconds of processor time.
+`product` has every combination; `standard` every lie at every moment, with the programs taking turns; `sample` a seeded
+part of the product. `sim_bus.shaft_judge` judges what the true shaft did.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+
+from sim_bus.reports import LIES
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Programs: the rig as tdhil is told of it, and the plant that turns.
+
+
+@dataclass(frozen=True)
+class Program:
+    """One command line, with ``{folder}`` for the folder in which `files` have been written."""
+
+    name: str
+    arguments: tuple[str, ...]
+    inertia_kg_m2: float
+    coulomb_nm: float
+    torque_nm: float
+    """The rig's torque limit."""
+    speed_max_rad_s: float
+    files: Mapping[str, str] = field(default_factory=dict)
+    string: bool = False
+    position: bool = True
+    """The drive reports a position."""
+    demand: bool = True
+    """The drive reports its torque demand."""
+    modbus: bool = False
+    skipped: frozenset[str] = frozenset()
+    """Stages that this program does without."""
+    torque_mode: bool = True
+    """It commands torque while it measures."""
+
+
+_STRING_PLANT = """\
+plant:
+  kind: string
+  inertia_kg_m2: 1500.0
+  length_m: 2300.0
+  outer_diameter_m: 0.127
+  inner_diameter_m: 0.1086
+  drag_nm_s_rad_m: 0.005
+  bottom: {inertia_kg_m2: 374.0, viscous_nm_s_rad: 4.0, coulomb_nm: 30.0}
+drive:
+  rated_torque_nm: 10000.0
+  torque_limit_nm: 8000.0
+  speed_gain_nm_s_rad: 3000.0
+  speed_integral_gain_nm_rad: 2000.0
+"""
+_PIPE = "load: {kind: string, length_m: 2300, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}\n"
+_STRING_RIG = _PIPE + "make_up_torque_nm: 8000\ntorque_ramp_nm_s: 400\n"
+_TOP_DRIVE = """\
+drive:
+  rated_torque_nm: 20000.0
+  torque_limit_nm: 30000.0
+  speed_limit_rpm: 250.0
+  speed_gain_nm_s_rad: 6000.0
+  speed_integral_gain_nm_rad: 4000.0
+"""
+_BIT_PLANT = """\
+plant:
+  kind: string
+  bottom:
+    friction: stribeck
+    static_nm: 5000.0
+    coulomb_nm: 2500.0
+    stribeck_speed_rad_s: 2.5
+    viscous_nm_s_rad: 20.0
+""" + _TOP_DRIVE
+_BIT_RIG = _PIPE + """\
+make_up_torque_nm: 30000
+torque_ramp_nm_s: 400
+limits:
+  speed_min_rad_s: 15
+  speed_max_rad_s: 26
+  torque_nm: 15000
+  time_s: 1800
+  quick_stop_rad_s2: 1.0
+  probe_torque_nm: 8000
+  probe_travel_rad: 12
+"""
+_TOP_PLANT = """\
+plant: {kind: rigid, inertia_kg_m2: 1500.0, viscous_nm_s_rad: 8.0, coulomb_nm: 60.0}
+""" + _TOP_DRIVE
+_TOP_RIG = """\
+limits:
+  speed_min_rad_s: 0.5
+  speed_max_rad_s: 15.0
+  torque_nm: 15000
+  probe_torque_nm: 1000
+  probe_travel_rad: 3.0
+  time_s: 1500
+  quick_stop_rad_s2: 2.0
+  watchdog_s: 0.5
+"""
+_VIRTUAL_STRING = """\
+sections:
+  - {length_m: 3000, outer_diameter_m: 0.127, inner_diameter_m: 0.1086}
+bottom:
+  inertia_kg_m2: 374
+  friction: stribeck
+  static_nm: 5000
+  coulomb_nm: 2500
+  stribeck_speed_rad_s: 2.5
+  viscous_nm_s_rad: 20
+"""
+
+
+def _interval(value: float, low: float, high: float) -> dict[str, float]:
+    return {"value": value, "low": low, "high": high}
+
+
+_TUNING = json.dumps({
+    "identified": {
+        "inertia_kg_m2": {"value": 1500.0}, "viscous_nm_s_rad": {"value": 8.0}, "coulomb_nm": {"value": 60.0},
+        "speed_lag_s": _interval(0.4, 0.39, 0.41), "torque_lag_s": _interval(0.15, 0.14, 0.16), "gear_ratio": 1.0,
+    },
+    "main_shaft": {"inertia_kg_m2": _interval(1500.0, 1440.0, 1560.0), "viscous_nm_s_rad": 8.0, "coulomb_nm": 60.0,
+                   "inner_lags_s": [0.02, 0.01, 0.003]},
+    "string": {
+        "impedance_nm_s_rad": 296.5008069870491, "stiffness_nm_rad": 314.1278126990153, "echo_s": 1.8877717604148878,
+        "modes_hz": [0.1299478, 0.566667, 1.0790772], "bottom_inertia_kg_m2": 374.0,
+        "bit": {"coulomb_nm": 2500.0, "static_nm": 5000.0},
+    },
+    "controllers": [{
+        "kind": "soft", "refused": None,
+        "at_main_shaft": {"gain_nm_s_rad": 1186.0032, "integral_nm_rad": 999.9749, "compensated_kg_m2": 0.0,
+                          "derivative_filter_s": 0.05},
+        "least_damping": _interval(0.2256, 0.2125, 0.2398),
+        "critical_rpm": {"cure": _interval(57.0, 56.0, 59.0)},
+    }],
+})
+"""As `tdhil tune --json` writes it for this string below this top drive, as far as `tdhil evaluate` reads it."""
+
+_IDENTIFY = ("identify", "--simulate")
+_PLANT, _RIG = ("--plant", "{folder}/plant.yaml"), ("--rig", "{folder}/rig.yaml")
+_RATE = ("--rate", "20")
+_SPEED_ONLY = frozenset({"torque", "hold"})
+_SHORT = ("--periods", "4")
+
+PROGRAMS: Mapping[str, Program] = {one.name: one for one in (
+    Program("identify", (*_IDENTIFY, *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0),
+    Program("identify, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0,
+            demand=False, modbus=True),
+    Program("identify, speed mode, Modbus", (*_IDENTIFY, "--profile", "schneider/atv320", *_RATE, *_SHORT),
+            104.0, 20.0, 400.0, 10.0, position=False, demand=False, modbus=True, skipped=_SPEED_ONLY,
+            torque_mode=False),
+    Program("identify, no position", (*_IDENTIFY, "--profile", "elmo/gold", *_RATE, *_SHORT),
+            104.0, 20.0, 400.0, 10.0, position=False, demand=False, skipped=_SPEED_ONLY, torque_mode=False),
+    Program("identify, string", (*_IDENTIFY, *_RATE, *_SHORT, *_PLANT, *_RIG), 1500.0, 60.0, 4000.0, 10.0,
+            {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True),
+    Program("identify, string, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT, *_PLANT, *_RIG),
+            1500.0, 60.0, 4000.0, 10.0, {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True,
+            demand=False, modbus=True),
+    Program("impedance", (*_IDENTIFY, "--rate", "50", "--impedance", "offset", "--string-impedance", "20.56",
+                          "--periods", "8"), 104.0, 20.0, 400.0, 10.0, skipped=frozenset({"torque"}),
+            torque_mode=False),
+    Program("prbs, string", (*_IDENTIFY, *_RATE, "--excitation", "prbs", "--max-time", "160", *_PLANT, *_RIG),
+            1500.0, 60.0, 15000.0, 26.0, {"plant.yaml": _BIT_PLANT, "rig.yaml": _BIT_RIG}, string=True),
+    Program("virtual string", ("evaluate", "--simulate", "--virtual-string", "{folder}/string.yaml", "--controller",
+                               "{folder}/tune.json", "--use", "soft", "--rate", "50", *_PLANT, *_RIG),
+            1500.0, 60.0, 15000.0, 15.0,
+            {"plant.yaml": _TOP_PLANT, "rig.yaml": _TOP_RIG, "string.yaml": _VIRTUAL_STRING, "tune.json": _TUNING}),
+)}
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Lies with their values. Amounts are shares of the rig's own limits.
+
+
+@dataclass(frozen=True)
+class Told:
+    """A lie with a value; ``of``: the limit that an amount is a share of."""
+
+    name: str
+    value: str = ""
+    of: str = ""
+
+    def text(self, program: Program) -> str:
+        """The value as the fault script takes it."""
+        if not self.of:
+            return self.value
+        whole = program.speed_max_rad_s if self.of == "speed" else program.torque_nm
+        return f"{float(self.value) * whole:g}"
+
+
+def _each(name: str, *values: str, of: str = "") -> tuple[Told, ...]:
+    return tuple(Told(name, value, of) for value in values)
+
+
+TOLD: tuple[Told, ...] = (
+    *(Told(f"{signal}-{way}") for signal in ("speed", "torque", "demand", "position", "sensor")
+      for way in ("lost", "frozen", "sign")),
+    *(Told(f"{signal}-ones") for signal in ("speed", "torque", "demand", "position")),
+    *_each("speed-scale", "0.1", "0.5", "0.9", "2", "10"),
+    *_each("torque-scale", "0.1", "0.5", "0.9", "1.1", "2", "10"),
+    *_each("demand-scale", "0.5", "2"), *_each("position-scale", "0.5", "2"),
+    *_each("sensor-scale", "0.1", "0.5", "0.9", "2", "10"),
+    *_each("speed-offset", "-0.3", "-0.1", "0.1", "0.3", of="speed"),
+    *_each("sensor-offset", "-0.3", "0.3", of="speed"),
+    *_each("torque-offset", "-0.2", "0.2", of="torque"), *_each("demand-offset", "0.2", of="torque"),
+    *_each("position-offset", "3"),
+    *_each("speed-delay", "300ms", "1s", "3s"), *_each("torque-delay", "300ms", "1s"), *_each("demand-delay", "1s"),
+    *_each("position-delay", "1s"), *_each("sensor-delay", "100ms", "500ms"), *_each("feedback-delay", "500ms", "2s"),
+    *_each("speed-coarse", "0.1", of="speed"), *_each("sensor-coarse", "0.1", of="speed"),
+    *_each("torque-coarse", "0.2", of="torque"), *_each("demand-coarse", "0.2", of="torque"),
+    *_each("position-coarse", "3"), *_each("sensor-slips", "30%", "80%"),
+    *(Told(name) for name in (
+        "speed-swapped", "torque-swapped", "speed-torque-swapped", "status-zero", "status-ones", "status-frozen",
+        "feedback-zero", "feedback-ones", "frozen-feedback", "motor-polarity", "quick-stop-inverted")),
+    *_each("torque-constant", "0.5", "0.9", "1.1", "2"), *_each("torque-stuck", "-0.3", "0.3", of="torque"),
+)
+
+MOMENTS = ("", "setup+2s", "speed+12s", "torque+3s", "hold+3s", "acquire+20s", "stop", "stop+500ms")
+"""'' is power-on: so from the start."""
+
+_EARLY_STOP = "emcy@acquire+5s"
+"""A harmless reason to stop, so that a lie in the stop needs no whole run."""
+
+
+@dataclass(frozen=True)
+class Combination:
+    """One run with one lie."""
+
+    number: int
+    program: Program
+    told: Told
+    moment: str
+
+    @property
+    def seed(self) -> int:
+        """Of the simulated rig."""
+        return 1 + self.number % 9973
+
+    @property
+    def fault(self) -> str:
+        """As the fault script has it."""
+        when, value = self.moment and f"@{self.moment}", self.told.text(self.program)
+        return f"{self.told.name}{when}" + (f"={value}" if value else "")
+
+    @property
+    def where(self) -> str:
+        """Which part of the drive is wrong."""
+        if self.told.name.startswith("sensor"):
+            return "sensor"
+        return "power stage" if self.told.name in _POWER_STAGE else "report"
+
+    @property
+    def ends_early(self) -> bool:
+        """Something harmless stops the run; half of those whose lie begins in the stop, where the bus has it."""
+        return self.moment.startswith("stop") and not self.program.modbus and self.number % 2 == 0
+
+    def arguments(self, folder: str) -> list[str]:
+        """The command line without log, trace and format."""
+        faults = [self.fault, *[_EARLY_STOP] * self.ends_early]
+        options = [part for fault in faults for part in ("--fault", fault)]
+        return [one.replace("{folder}", folder) for one in self.program.arguments] + [
+            "--seed", str(self.seed), *options]
+
+    @property
+    def largest_torque_nm(self) -> float:
+        """What the power stage may put on the shaft."""
+        share = float(self.told.value) if self.told.name == "torque-constant" else 1.0
+        return self.program.torque_nm * max(1.0, share)
+
+    def __str__(self) -> str:
+        return f"{self.number}: {self.program.name}: {self.fault}" + " (early stop)" * self.ends_early
+
+
+_POWER_STAGE = {"torque-constant", "motor-polarity", "quick-stop-inverted", "torque-stuck"}
+
+
+@dataclass(frozen=True)
+class Unknowable:
+    """A lie that no arithmetic on the reports can find, and the rules that are not asked of it then."""
+
+    reason: str
+    rules: frozenset[str]
+
+
+UNKNOWABLE: Mapping[str, Unknowable] = {
+    "torque-constant": Unknowable(
+        "demanded, reported and commanded torque agree, and all are the same factor off: J is that factor off",
+        frozenset("c")),
+    "sensor-scale": Unknowable(
+        "the drive's speed control, its speed limiter and its position counter follow one wrong sensor",
+        frozenset("cd")),
+    "torque-scale": Unknowable(
+        "in speed mode no torque is commanded, and this drive reports no torque demand", frozenset("c")),
+}
+"""From power-on or stage 1 on. Later in a run each of them is a change, which can be found."""
+
+
+def unknowable(combination: Combination) -> Unknowable | None:
+    """Why a combination can't be known, if so."""
+    if combination.moment not in {"", "setup+2s"}:
+        return None
+    program, name = combination.program, combination.told.name
+    if name == "torque-scale" and (program.torque_mode or program.demand):
+        return None
+    return UNKNOWABLE.get(name)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _makes_sense(program: Program, told: Told, moment: str) -> bool:
+    """The drive reports that signal, and the run has that moment."""
+    if told.name not in LIES and told.name != "frozen-feedback":
+        raise ValueError(f"no lie is called {told.name}")
+    reported = {"position": program.position, "demand": program.demand}
+    return reported.get(told.name.split("-", maxsplit=1)[0], True) and (
+        moment.split("+", maxsplit=1)[0] not in program.skipped)
+
+
+@cache
+def product() -> tuple[Combination, ...]:
+    """Every combination, numbered."""
+    every = ((program, told, moment) for told in TOLD for moment in MOMENTS for program in PROGRAMS.values()
+             if _makes_sense(program, told, moment))
+    return tuple(Combination(number, *one) for number, one in enumerate(every))
+
+
+def standard() -> Iterator[Combination]:
+    """Every lie at every moment once, the programs taking turns."""
+    groups: dict[tuple[Told, str], list[Combination]] = {}
+    for one in product():
+        groups.setdefault((one.told, one.moment), []).append(one)
+    for number, group in enumerate(groups.values()):
+        yield group[number % len(group)]
+
+
+def sample(count: int, seed: int) -> list[Combination]:
+    """A seeded part of the product."""
+    rng = np.random.default_rng((seed, 0x25))
+    return [product()[number] for number in sorted(rng.choice(len(product()), count, replace=False).tolist())]
