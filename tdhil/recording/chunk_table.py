@@ -6,16 +6,26 @@ What isn't laid out exactly as our own writer lays it out is not decided here: t
 Pure, over bytes that may be hostile; nothing is taken on trust from indexes.
 """
 
+import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from struct import Struct
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.recording.log_messages import DEMAND_SIZE, SAMPLE_SIZE
+from tdhil.recording.log_messages import (
+    COMMAND_SIZE,
+    DEMAND_TAG,
+    ENABLED_STATE,
+    MORE_SIZE,
+    OFFSET_TAG,
+    POSITION_TAG,
+    SAMPLE_SIZE,
+    TORQUE_MODE,
+)
 
 _HEAD: Final = Struct("<BQ")           # opcode:1  length:8
 _MESSAGE_HEAD: Final = 22              # channel:2  sequence:4  log time:8  publish time:8
@@ -31,23 +41,46 @@ _SAMPLE_ROW: Final = np.dtype([
     ("tag7", "u1"), ("limit_active", "u1"), ("tag8", "u1"), ("standstill", "u1"), ("tag9", "u1"), ("state", "u1"),
     ("tag10", "u1"), ("mode", "u1"), ("tag11", "u1"), ("status", "<u4"),
 ])
-"""`log_messages.pack_sample`, byte by byte; a tenth double may follow, behind its tag."""
+"""`log_messages.pack_sample`, byte by byte; torque demand and position may follow, each behind its tag."""
 _TAGS: Final = tuple(
     zip((f"tag{k}" for k in range(1, 12)), (0x09, 0x11, 0x19, 0x21, 0x29, 0x30, 0x38, 0x40, 0x48, 0x50, 0x5D),
         strict=True))
 _VARINTS: Final = ("fresh", "limit_active", "standstill", "state", "mode")
-_DEMAND_TAG: Final = 0x61
+_COMMAND_ROW: Final = np.dtype([
+    ("tag1", "u1"), ("time_s", "<f8"), ("tag2", "u1"), ("speed_rad_s", "<f8"), ("tag3", "u1"), ("torque_nm", "<f8"),
+    ("tag4", "u1"), ("mode", "u1"),
+])
+"""`log_messages.pack_command`, byte by byte; the torque offset may follow, behind its tag."""
+_COMMAND_TAGS: Final = tuple(zip((f"tag{k}" for k in range(1, 5)), (0x09, 0x11, 0x19, 0x20), strict=True))
+_MORE_ROW: Final = np.dtype([("tag", "u1"), ("value", "<f8")])
 
 Offsets = NDArray[np.int64]
 
 
+class TorqueCommand(NamedTuple):
+    """The time of a command, s, and its torque setpoint, N·m; NaN where it asked for another mode than torque."""
+
+    time_s: float
+    torque_nm: float
+
+
+NO_COMMAND: Final = TorqueCommand(math.nan, math.nan)
+
+
 @dataclass(frozen=True)
 class SampleBlock:
-    """Samples in their order: ``values`` (n, 3) time in s, speed in rad/s, torque in N·m; ``flags``: fresh, limited."""
+    """Samples in their order: ``values`` (n, 3) time in s, speed in rad/s, torque in N·m; fresh and limited, (n,).
+
+    ``setpoints`` (n, 2): commanded and demanded torque, N·m, as `RecordingBuilder.add` takes them. ``position_rad``
+    stands in the samples ``positions_at``, which count from the block's first.
+    """
 
     values: NDArray[np.float64]
     fresh: NDArray[np.bool_]
     limited: NDArray[np.bool_]
+    setpoints: NDArray[np.float64]
+    positions_at: NDArray[np.int64]
+    position_rad: NDArray[np.float64]
     first_log_time_ns: int
 
 
@@ -79,12 +112,15 @@ class ChunkTable:
         self._rows = np.searchsorted(self._at, np.concatenate((starts, ends[-1:])))
 
     def messages(
-        self, first: int, last: int, numbers: Mapping[int, int], samples: int, skipped: frozenset[int]
-    ) -> tuple[SampleBlock | None, list[Message], bool] | None:
-        """The samples of the plain chunks from ``first`` to before ``last``, the other messages, and was any of ours?
+        self, first: int, last: int, numbers: Mapping[int, int], samples: int, commands: int, skipped: frozenset[int],
+        before: TorqueCommand,
+    ) -> tuple[SampleBlock | None, TorqueCommand, list[Message], bool] | None:
+        """The samples of the plain chunks from ``first`` to before ``last``, the last command, the other messages, and
+        was any of ours?
 
-        ``numbers``: which channel of the file is which of ours; ``samples``: the one of the samples; ``skipped``: those
-        not wanted. None where a sample isn't laid out exactly as our writer does it.
+        ``numbers``: which channel of the file is which of ours; ``samples``, ``commands``: those of the samples and the
+        commands; ``skipped``: those not wanted; ``before``: the last command before these chunks. None where a sample
+        or a command isn't laid out exactly as our writer does it.
         """
         rows = slice(self._rows[first], self._rows[last])
         at, length = self._at[rows], self._length[rows]
@@ -93,35 +129,79 @@ class ChunkTable:
             known[channel] = number
         head = _taken(self._data, at, _MESSAGE_ROW)
         number_of = known[head["channel"]]
-        is_sample = number_of == samples
+        is_sample, is_command = number_of == samples, number_of == commands
+        commanded = self._commands(at[is_command], length[is_command], before)
+        if commanded is None:
+            return None
         block = None
         if is_sample.any():
-            block = self._samples(at[is_sample], length[is_sample], int(head["log_time_ns"][np.argmax(is_sample)]))
+            # row 0 is the command before these chunks, so the count of commands before a sample is its command's row
+            answered = commanded[np.cumsum(is_command)[is_sample]]
+            block = self._samples(
+                at[is_sample], length[is_sample], answered, int(head["log_time_ns"][np.argmax(is_sample)]))
             if block is None:
                 return None
-        others = np.flatnonzero((number_of != 0) & ~is_sample & ~np.isin(number_of, tuple(skipped)))
+        others = np.flatnonzero((number_of != 0) & ~is_sample & ~is_command & ~np.isin(number_of, tuple(skipped)))
         found = [
             Message(int(number_of[k]), self._data[at[k] + _MESSAGE_HEAD:at[k] + length[k]]) for k in others.tolist()
         ]
-        return block, found, bool(number_of.any())
+        return block, TorqueCommand(*commanded[-1].tolist()), found, bool(number_of.any())
 
-    def _samples(self, at: Offsets, length: Offsets, log_time_ns: int) -> SampleBlock | None:
+    def _commands(self, at: Offsets, length: Offsets, before: TorqueCommand) -> NDArray[np.float64] | None:
+        """(1 + n, 2) time and torque setpoint (NaN: not in torque mode) of ``before`` and of n commands."""
         size = length - _MESSAGE_HEAD
-        more = size == SAMPLE_SIZE + DEMAND_SIZE
-        if not np.all(more | (size == SAMPLE_SIZE)):
+        more = size == COMMAND_SIZE + MORE_SIZE
+        if not np.all(more | (size == COMMAND_SIZE)):
+            return None
+        rows = _taken(self._data, at + _MESSAGE_HEAD, _COMMAND_ROW)
+        exact = bool(all((rows[name] == tag).all() for name, tag in _COMMAND_TAGS) and (rows["mode"] < 0x80).all())
+        if exact and more.any():
+            data = np.frombuffer(self._data, np.uint8)
+            exact = bool((data[at[more] + _MESSAGE_HEAD + COMMAND_SIZE] == OFFSET_TAG).all())
+        if not exact:
+            return None
+        found = np.empty((1 + len(rows), 2))
+        found[0] = before
+        found[1:, 0] = rows["time_s"]
+        found[1:, 1] = np.where(rows["mode"] == TORQUE_MODE, rows["torque_nm"], np.nan)
+        return found
+
+    def _samples(
+        self, at: Offsets, length: Offsets, answered: NDArray[np.float64], log_time_ns: int
+    ) -> SampleBlock | None:
+        size = length - _MESSAGE_HEAD
+        more = (size - SAMPLE_SIZE) // MORE_SIZE
+        if not np.all((size == SAMPLE_SIZE + more * MORE_SIZE) & (more >= 0) & (more <= 2)):
             return None
         rows = _taken(self._data, at + _MESSAGE_HEAD, _SAMPLE_ROW)
         exact = all((rows[name] == tag).all() for name, tag in _TAGS) and all(
             (rows[name] < 0x80).all() for name in _VARINTS)
-        if exact and more.any():
-            data = np.frombuffer(self._data, np.uint8)
-            exact = bool((data[at[more] + _MESSAGE_HEAD + SAMPLE_SIZE] == _DEMAND_TAG).all())
+        one, two = np.flatnonzero(more == 1), np.flatnonzero(more == 2)
+        behind = at + (_MESSAGE_HEAD + SAMPLE_SIZE)
+        single, first = _taken(self._data, behind[one], _MORE_ROW), _taken(self._data, behind[two], _MORE_ROW)
+        second = _taken(self._data, behind[two] + MORE_SIZE, _MORE_ROW)
+        exact = (
+            exact and bool(np.isin(single["tag"], (DEMAND_TAG, POSITION_TAG)).all())
+            and bool((first["tag"] == DEMAND_TAG).all()) and bool((second["tag"] == POSITION_TAG).all())
+        )
         if not exact:
             return None
+        alone = single["tag"] == POSITION_TAG
+        positions_at = np.concatenate((one[alone], two))
+        position_rad = np.concatenate((single["value"][alone], second["value"]))
         values = np.empty((len(rows), 3))
         for column, name in enumerate(("time_s", "speed_rad_s", "torque_nm")):
             values[:, column] = rows[name]
-        return SampleBlock(values, rows["fresh"] != 0, rows["limit_active"] != 0, log_time_ns)
+        enabled = rows["state"] == ENABLED_STATE
+        in_torque = enabled & (rows["mode"] == TORQUE_MODE) & (answered[:, 0] == rows["time_s"])
+        setpoints = np.full((len(rows), 2), np.nan)
+        setpoints[in_torque, 0] = answered[in_torque, 1]
+        setpoints[one[~alone], 1] = single["value"][~alone]
+        setpoints[two, 1] = first["value"]
+        setpoints[~enabled, 1] = np.nan
+        return SampleBlock(
+            values, rows["fresh"] != 0, rows["limit_active"] != 0, setpoints, positions_at, position_rad, log_time_ns
+        )
 
 
 def _taken(data: bytes, at: Offsets, row: np.dtype[np.void]) -> NDArray[np.void]:

@@ -218,6 +218,7 @@ STATES: Final = {
     PowerState.ENABLED: 3,
     PowerState.QUICK_STOP: 4,
     PowerState.FAULT: 5,
+    PowerState.UNKNOWN: 6,
 }
 STATE_OF: Final = {number: state for state, number in STATES.items()}
 
@@ -239,6 +240,7 @@ MESSAGES: Final = {
         "mode": "Mode",
         "status": "fixed32",
         "torque_demand_nm": "double?",
+        "position_rad": "double?",
     },
     "Command": {"time_s": "double", "speed_rad_s": "double", "torque_nm": "double", "mode": "Mode",
                 "torque_offset_nm": "double?"},

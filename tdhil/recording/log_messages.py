@@ -11,7 +11,7 @@ from functools import lru_cache
 from struct import Struct
 from typing import Any, Final, NamedTuple
 
-from drivers import Command, RawFrame, Sample
+from drivers import Command, Mode, PowerState, RawFrame, Sample
 from tdhil.errors import LogError
 from tdhil.recording.builder import plain
 from tdhil.recording.log_format import (
@@ -38,7 +38,8 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 #
 #     Sample   09 time_s:8  11 speed_rad_s:8  19 torque_nm:8  21 age_s:8  29 half_width_s:8
 #              30 fresh:1  38 limit_active:1  40 standstill:1  48 state:1  50 mode:1  5D status:4
-#              [61 torque_demand_nm:8]                                    only where the drive tells it
+#              [61 torque_demand_nm:8]                                    only where the drive reports it
+#              [69 position_rad:8]                                        only where the cycle brought one
 #     Command  09 time_s:8  11 speed_rad_s:8  19 torque_nm:8  20 mode:1
 #              [29 torque_offset_nm:8]                                    only where there is one
 #     Frames   09 time_s:8  { 12 length  Frame } …
@@ -49,33 +50,41 @@ from tdhil.recording.recording import Excitation, Level, Ramp, Stage
 
 
 _SAMPLE = Struct("<BdBdBdBdBd B?B?B?BBBB BI".replace(" ", ""))
-_DEMAND = Struct("<Bd")
+_MORE = Struct("<Bd")
 _COMMAND = Struct("<BdBdBdBB")
-SAMPLE_SIZE: Final = _SAMPLE.size      # bytes without the torque demand, which takes `DEMAND_SIZE` more
-DEMAND_SIZE: Final = _DEMAND.size
+SAMPLE_SIZE: Final = _SAMPLE.size      # bytes without torque demand and position, which take `MORE_SIZE` more each
+COMMAND_SIZE: Final = _COMMAND.size    # bytes without the torque offset, which takes `MORE_SIZE` more
+MORE_SIZE: Final = _MORE.size
+DEMAND_TAG: Final = 0x61
+POSITION_TAG: Final = 0x69
+OFFSET_TAG: Final = 0x29
+TORQUE_MODE: Final = MODES[Mode.TORQUE]
+ENABLED_STATE: Final = STATES[PowerState.ENABLED]
 
 
 def pack_sample(sample: Sample) -> bytes:
     """A `Sample` message."""
     (time_s, age_s, half_width_s, fresh, speed_rad_s, torque_nm, demand_nm,
-     mode, state, standstill, limit_active, status) = sample
+     mode, state, standstill, limit_active, status, position_rad) = sample
     fixed = _SAMPLE.pack(
         0x09, time_s, 0x11, speed_rad_s, 0x19, torque_nm, 0x21, age_s, 0x29, half_width_s,
         0x30, fresh, 0x38, limit_active, 0x40, standstill, 0x48, STATES[state], 0x50, MODES[mode], 0x5D, status,
     )
-    return fixed if demand_nm is None else fixed + _DEMAND.pack(0x61, demand_nm)
+    if demand_nm is not None:
+        fixed += _MORE.pack(DEMAND_TAG, demand_nm)
+    return fixed if position_rad is None else fixed + _MORE.pack(POSITION_TAG, position_rad)
 
 
 def pack_command(time_s: float, command: Command) -> bytes:
     """A `Command` message; ``time_s`` is control time."""
     mode, speed_rad_s, torque_nm, offset_nm = command
     fixed = _COMMAND.pack(0x09, time_s, 0x11, speed_rad_s, 0x19, torque_nm, 0x20, MODES[mode])
-    return fixed if offset_nm == 0.0 else fixed + _DEMAND.pack(0x29, offset_nm)
+    return fixed if offset_nm == 0.0 else fixed + _MORE.pack(OFFSET_TAG, offset_nm)
 
 
 def pack_frames(frames: list[RawFrame]) -> bytes:
     """A `Frames` message of at least one frame; its time is the first one's."""
-    parts = [_DEMAND.pack(0x09, frames[0][0])]
+    parts = [_MORE.pack(0x09, frames[0][0])]
     for time_s, outgoing, identifier, data in frames:
         layout, head, tail = _frame_layout(len(data))
         parts.append(layout.pack(head, time_s, 0x10, outgoing, 0x1D, identifier, tail, data))

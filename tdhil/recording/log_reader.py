@@ -1,6 +1,7 @@
 """run.mcap back into a Recording, from a file that may be whole, cut, damaged or hostile."""
 
 import json
+import math
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -14,9 +15,9 @@ from google.protobuf.message import DecodeError
 
 from drivers import Command, PowerState, RawFrame, Sample
 from tdhil.errors import LogError
-from tdhil.recording import log_format
+from tdhil.recording import log_format, log_messages
 from tdhil.recording.builder import FACTS, RecordingBuilder, structure
-from tdhil.recording.chunk_table import ChunkTable
+from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable, TorqueCommand
 from tdhil.recording.log_format import CHANNELS, CLASSES, MODE_OF, PACKAGE, RECOVERED, STATE_OF, Event, schema_name
 from tdhil.recording.log_messages import TEXT_LIMIT
 from tdhil.recording.mcap_container import MAGIC
@@ -217,12 +218,13 @@ class _Declared:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-SAMPLES: Final = 8_000_000             # 25 bytes each; two hours at 1 kHz
+SAMPLES: Final = 8_000_000             # 41 bytes each, 57 with a position; two hours at 1 kHz
 _CENTURY_NS: Final = 946_684_800 * 10**9       # 2000-01-01
 RARE: Final = 20_000                   # stages, events, problems
 RARE_BYTES: Final = 64 * 2**20         # of everything but samples, commands and frames
 BATCH: Final = 2 * 2**20               # bytes of chunks that are read at once; a longer one is read message by message
-_UNREAD: Final = frozenset({log_format.COMMAND, log_format.CAN, log_format.LOG, log_format.MODBUS})
+_UNREAD: Final = frozenset({log_format.CAN, log_format.LOG, log_format.MODBUS})
+_EVERY_CYCLE: Final = frozenset({log_format.SAMPLE, log_format.COMMAND})
 
 
 @dataclass(frozen=True)
@@ -246,7 +248,7 @@ class LoggedRun:
 
 
 def read_run(path: Path, *, salvage: bool = False, batch: int = BATCH) -> LoggedRun:
-    """Everything but the raw frames and the commands. Raises `LogError` if there is nothing of ours in the file.
+    """Everything but the raw frames and the speed setpoints. Raises `LogError` if there is nothing of ours in the file.
 
     ``salvage``: also where the file's head is damaged. ``batch``: bytes of chunks that are read at once; 0 is
     message by message, which gives the same to the bit and takes five times as long.
@@ -284,8 +286,9 @@ def _sample_of(message: Any) -> Sample:
     demand_nm = message.torque_demand_nm if message.HasField("torque_demand_nm") else None
     return Sample(
         message.time_s, message.age_s, message.half_width_s, message.fresh, message.speed_rad_s,
-        message.torque_nm, demand_nm, MODE_OF.get(message.mode), STATE_OF.get(message.state, PowerState.NOT_READY),
-        message.standstill, message.limit_active, message.status)
+        message.torque_nm, demand_nm, MODE_OF.get(message.mode), STATE_OF.get(message.state, PowerState.UNKNOWN),
+        message.standstill, message.limit_active, message.status,
+        message.position_rad if message.HasField("position_rad") else None)
 
 
 def _messages(path: Path, *wanted: int) -> Iterator[tuple[int, Any]]:
@@ -304,6 +307,7 @@ class _Reading:
         self._texts: dict[int, dict[str, Any]] = {}
         self._events: list[Event] = []
         self._virtual = array("d")
+        self._command = NO_COMMAND
         self._stages: list[Stage] = []
         self._problems: list[str] = []
         self._budget = RARE_BYTES
@@ -312,6 +316,7 @@ class _Reading:
         self._epoch_ns: int | None = None
         self._take: dict[int, Callable[[Any], None]] = {
             log_format.SAMPLE: self._sample,
+            log_format.COMMAND: self._torque_command,
             log_format.STAGE: self._stage,
             log_format.EXCITATION: self._excitation,
             log_format.EVENT: self._event,
@@ -363,16 +368,21 @@ class _Reading:
 
     def _block(self, table: ChunkTable, first: int, last: int, declared: _Declared) -> bool:
         """The same of chunks without declarations; False: nothing was taken, they must be read one by one."""
-        taken = table.messages(first, last, declared.numbers, log_format.SAMPLE, _UNREAD)
+        taken = table.messages(
+            first, last, declared.numbers, log_format.SAMPLE, log_format.COMMAND, _UNREAD, self._command)
         if taken is None:
             return False
-        samples, others, ours = taken
+        samples, command, others, ours = taken
         if samples is not None:
             if len(self._builder) + len(samples.values) >= SAMPLES:
                 return False
-            self._builder.add_block(samples.values, samples.fresh, samples.limited)
+            self._builder.add_block(
+                samples.values, samples.fresh, samples.limited, samples.setpoints, samples.positions_at,
+                samples.position_rad,
+            )
             if self._epoch_ns is None:
                 self._epoch_ns = self._epoch_of(samples.first_log_time_ns)
+        self._command = command
         declared.ours = declared.ours or ours
         for one in others:
             self._message(one.number, one.payload)
@@ -401,7 +411,7 @@ class _Reading:
         try:
             if number in _UNREAD:
                 return
-            if number != log_format.SAMPLE:
+            if number not in _EVERY_CYCLE:
                 self._budget -= len(payload)
                 if self._budget < 0:
                     raise ValueError(f"more than {RARE_BYTES} bytes of such messages")
@@ -413,8 +423,18 @@ class _Reading:
             self._problem(f"a message on {CHANNELS[number][0]} can't be read: {error}")
 
     def _sample(self, message: Any) -> None:
+        enabled = message.state == log_messages.ENABLED_STATE
+        in_torque = enabled and message.mode == log_messages.TORQUE_MODE and self._command.time_s == message.time_s
+        told = enabled and message.HasField("torque_demand_nm")
         self._builder.add_values(
-            message.time_s, message.speed_rad_s, message.torque_nm, fresh=message.fresh, limited=message.limit_active)
+            message.time_s, message.speed_rad_s, message.torque_nm, fresh=message.fresh, limited=message.limit_active,
+            commanded_nm=self._command.torque_nm if in_torque else math.nan,
+            demanded_nm=message.torque_demand_nm if told else math.nan,
+            position_rad=message.position_rad if message.HasField("position_rad") else None)
+
+    def _torque_command(self, message: Any) -> None:
+        in_torque = message.mode == log_messages.TORQUE_MODE
+        self._command = TorqueCommand(message.time_s, message.torque_nm if in_torque else math.nan)
 
     def _virtual_row(self, message: Any) -> None:
         self._virtual.extend(getattr(message, name) for name in log_format.VIRTUAL_COLUMNS)

@@ -20,7 +20,7 @@ from google.protobuf.message import DecodeError
 
 from tdhil.recording import log_format
 from tdhil.recording.builder import structure
-from tdhil.recording.chunk_table import ChunkTable
+from tdhil.recording.chunk_table import NO_COMMAND, ChunkTable
 from tdhil.recording.log_format import CHANNELS, CLASSES, Event
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.mcap_recovery import CHUNK, CHUNK_LIMIT, DATA_END, Contents, chunk_head, contents, read_at
@@ -155,10 +155,10 @@ class LogTail:
     @staticmethod
     def _decoded(chunk: bytes) -> LogNews:
         table = ChunkTable((chunk,))
-        found = table.messages(0, 1, _NUMBERS, log_format.SAMPLE, _SKIPPED)
+        found = table.messages(0, 1, _NUMBERS, log_format.SAMPLE, log_format.COMMAND, _SKIPPED, NO_COMMAND)
         if found is None:
             return LogNews()           # samples of another layout: none of our writer's
-        block, messages, _ = found
+        block, _, messages, _ = found
         events: list[Event] = []
         stages: list[Stage] = []
         texts: dict[int, dict[str, Any]] = {}

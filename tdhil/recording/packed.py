@@ -17,8 +17,10 @@ from tdhil.recording.builder import hints_of, structure
 from tdhil.recording.recording import Recording
 
 _ARRAYS: Final = ("time_s", "speed_rad_s", "torque_nm", "fresh", "limited")
-_KINDS: Final = {"time_s": "f8", "speed_rad_s": "f8", "torque_nm": "f8", "fresh": "?", "limited": "?"}
-_REST: Final = tuple(field.name for field in fields(Recording) if field.name not in _ARRAYS)
+_SOME: Final = ("commanded_torque_nm", "demanded_torque_nm", "position_rad")
+"""Arrays that a recording may be without."""
+_FLAGS: Final = ("fresh", "limited")
+_REST: Final = tuple(field.name for field in fields(Recording) if field.name not in (*_ARRAYS, *_SOME))
 _TEXT: Final = "json"
 
 
@@ -28,6 +30,7 @@ def pack_recording(recording: Recording, beside: Mapping[str, Any]) -> bytes:
     text = json.dumps({"recording": {name: whole[name] for name in _REST}, "beside": dict(beside)})
     file = BytesIO()
     arrays: dict[str, Any] = {name: getattr(recording, name) for name in _ARRAYS}
+    arrays |= {name: array for name in _SOME if (array := getattr(recording, name)) is not None}
     arrays[_TEXT] = np.frombuffer(text.encode(), np.uint8)
     np.savez(file, **arrays)
     return file.getvalue()
@@ -37,10 +40,11 @@ def unpack_recording(path: Path) -> tuple[Recording, dict[str, Any]] | None:
     """The recording and what was kept beside it; None for a file that is missing, damaged, or something else."""
     try:
         with np.load(path, allow_pickle=False) as found:
-            arrays = {name: found[name] for name in _ARRAYS}
+            arrays = {name: found[name] for name in (*_ARRAYS, *_SOME) if name not in _SOME or name in found.files}
             content = json.loads(found[_TEXT].tobytes())
         size = len(arrays["time_s"])
-        if any(one.dtype != np.dtype(_KINDS[name]) or one.shape != (size,) for name, one in arrays.items()):
+        kinds = {name: np.dtype("?" if name in _FLAGS else "f8") for name in arrays}
+        if any(one.dtype != kinds[name] or one.shape != (size,) for name, one in arrays.items()):
             return None
         hints, rest = hints_of(Recording), content["recording"]
         members = {name: structure(hints[name], rest[name]) for name in _REST}

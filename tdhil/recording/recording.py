@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 ABORTED: Final = "aborted"
 """Outcome of a stage that did not come to its end."""
@@ -157,7 +158,11 @@ class Recording:
 
     ``time_s`` (N,) is the SYNC's control time, rising; ``speed_rad_s`` and ``torque_nm`` (N,) are as reported;
     ``fresh`` (N,) is False where a cycle brought no new feedback (such samples are not for identification);
-    ``limited`` (N,) is True where the drive said that an internal limit was active.
+    ``limited`` (N,) is True where the drive said that an internal limit was active. Three arrays (N,) are None where
+    the log has nothing of them, and NaN at samples without a value: ``commanded_torque_nm``, the torque setpoint, N·m,
+    only of samples with the drive enabled and in torque mode; ``demanded_torque_nm``, the drive's own torque demand
+    (6074h), N·m, only of samples with the drive enabled; ``position_rad``, the motor shaft's angle since the first
+    reading, counted apart from the speed, unwrapped.
     """
 
     time_s: FloatArray
@@ -184,6 +189,11 @@ class Recording:
     pipe: Pipe | None = None               # of the drill string that hangs on the shaft, where its sizes are known
     simulated: bool = False
     complete: bool = True                  # False: the log ended before the run did
+    commanded_torque_nm: FloatArray | None = None
+    demanded_torque_nm: FloatArray | None = None
+    position_rad: FloatArray | None = None
+    position_gap_s: float | None = None    # over a longer gap in position_rad the turns are not known; None: over any
+    speed_unit_accepted: bool = False      # though the position contradicted it (--accept-speed-unit)
 
 
 def aborted_stage(recording: Recording) -> Stage | None:
@@ -211,10 +221,17 @@ def before_abort(recording: Recording) -> Recording:
         torque_nm=recording.torque_nm[kept],
         fresh=recording.fresh[kept],
         limited=recording.limited[kept],
+        commanded_torque_nm=_part(recording.commanded_torque_nm, kept),
+        demanded_torque_nm=_part(recording.demanded_torque_nm, kept),
+        position_rad=_part(recording.position_rad, kept),
         excitation=None if excitation is None else _cut(excitation, end_s),
         levels=tuple(Level(one.start_s, min(one.end_s, end_s)) for one in recording.levels if one.start_s < end_s),
         ramps=tuple(Ramp(one.start_s, min(one.end_s, end_s)) for one in recording.ramps if one.start_s < end_s),
     )
+
+
+def _part(signal: FloatArray | None, kept: BoolArray) -> FloatArray | None:
+    return None if signal is None else signal[kept]
 
 
 def _cut(excitation: Excitation, end_s: float) -> Excitation | None:

@@ -6,6 +6,7 @@ import math
 import traceback
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -76,7 +77,10 @@ def _below(kind: type[TdhilError]) -> Iterator[type[TdhilError]]:
 
 
 def _code(value: object) -> int:
-    return value if isinstance(value, int) and value in set(ExitCode) else int(ExitCode.INTERNAL)
+    with suppress(ValueError):
+        if isinstance(value, int):
+            return int(ExitCode(value))
+    return int(ExitCode.INTERNAL)
 
 
 def _number(value: object) -> float:
@@ -108,7 +112,7 @@ class RunLog:
 
     def cycle(self, command: Command, sample: Sample) -> None:
         """One exchange."""
-        self._builder.add(sample)
+        self._builder.add(sample, command)
         self._commanded.append(command.torque_nm)
         self._writer.command(sample.time_s, command)
         self._writer.sample(sample)

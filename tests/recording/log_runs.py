@@ -37,6 +37,8 @@ FACTS = {
     "torque_scale_rel_sd": 0.02,
     "gear_ratio": 10.5,
     "torque_answer": TorqueAnswer(0.15, 0.1 / 3),
+    "position_gap_s": 0.1 / 3,
+    "speed_unit_accepted": True,
     "simulated": True,
 }
 CONFIGURATION = {"drive": "canopen", "rate_hz": 250.0, "ids": [1, 2], "nothing": None}
@@ -48,7 +50,7 @@ def sample(cycle: int, rng: random.Random) -> Sample:
     return Sample(
         time_s, 0.0003, 0.0, rng.random() > 0.01, 3.0 + rng.gauss(0, 0.01), rng.gauss(100, 2),
         None if cycle % 3 else rng.gauss(100, 2), rng.choice((None, *Mode)), rng.choice(list(PowerState)),
-        rng.random() > 0.5, rng.random() > 0.9, rng.getrandbits(16))
+        rng.random() > 0.5, rng.random() > 0.9, rng.getrandbits(16), None if cycle % 5 else rng.gauss(0, 50))
 
 
 def frames(cycle: int, rng: random.Random) -> list[RawFrame]:
@@ -67,13 +69,14 @@ def fill(writer: RunWriter, builder: RecordingBuilder, cycles: int, seed: int = 
     builder.learn(**FACTS)
     writer.configuration(CONFIGURATION, builder.facts)
     for cycle in range(cycles):
-        writer.command(cycle * PERIOD_S, Command(Mode.TORQUE, 3.0, 100.0))
+        command = Command(Mode.TORQUE, 3.0, 100.0)
+        writer.command(cycle * PERIOD_S, command)
         for frame in frames(cycle, rng):
             writer.frame(frame)
             logged.append(frame)
         one = sample(cycle, rng)
         writer.sample(one)
-        builder.add(one)
+        builder.add(one, command)
     for stage in STAGES:
         writer.stage(stage)
         builder.stage(stage)

@@ -19,7 +19,15 @@ from drivers.drive import Command, Mode
 from tdhil.errors import LogError
 from tdhil.recording import chunk_table, log_reader
 from tdhil.recording.log_format import CAN, CLASSES, COMMAND, EVENT, SAMPLE, STAGE, Event
-from tdhil.recording.log_messages import event_message, pack_command, pack_frames, pack_sample, stage_message
+from tdhil.recording.log_messages import (
+    MORE_SIZE,
+    SAMPLE_SIZE,
+    event_message,
+    pack_command,
+    pack_frames,
+    pack_sample,
+    stage_message,
+)
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.mcap_container import LIBRARY, MAGIC
 from tdhil.recording.recording import Stage
@@ -65,11 +73,11 @@ def leaving_zeros_away(seed):
 
 
 def with_one_more_field(seed):
-    return ours(seed) + b"\x68\x01"
+    return ours(seed) + b"\x70\x01"
 
 
 def in_another_order(seed):
-    payload = pack_sample(sample(seed % 5000, random.Random(seed))._replace(torque_demand_nm=None))
+    payload = pack_sample(sample(seed % 5000, random.Random(seed))._replace(torque_demand_nm=None, position_rad=None))
     return payload[9:] + payload[:9]
 
 
@@ -81,11 +89,18 @@ def with_a_long_flag(seed):
 
 
 def of_the_right_length(seed):
-    return random.Random(seed).randbytes(66 if seed % 2 else 75)
+    return random.Random(seed).randbytes((66, 75, 84)[seed % 3])
+
+
+def with_the_angle_first(seed):
+    """Angle and torque demand the other way round, which protobuf reads all the same."""
+    payload = pack_sample(sample(15, random.Random(seed)))
+    assert len(payload) == SAMPLE_SIZE + 2 * MORE_SIZE
+    return payload[:SAMPLE_SIZE] + payload[-MORE_SIZE:] + payload[SAMPLE_SIZE:-MORE_SIZE]
 
 
 WRITERS = (ours, ours, ours, ours, leaving_zeros_away, with_one_more_field, in_another_order, with_a_long_flag,
-           of_the_right_length)
+           of_the_right_length, with_the_angle_first)
 EVENTS = event_message(Event(1.0, "warning", "bus")).payload
 STAGES = stage_message(Stage("setup", 0.0, 1.0, "ok")).payload
 OTHERS = (
@@ -186,7 +201,7 @@ def test_enough_is_enough_on_both_routes(tmp_path, monkeypatch):
 
 def test_the_layout_is_the_writer_s():
     """The row of numpy is what `pack_sample` packs: field by field, for a sample of which no two bytes are alike."""
-    one = sample(1, random.Random(1))._replace(torque_demand_nm=None, time_s=0.1, status=0x1234)
+    one = sample(1, random.Random(1))._replace(torque_demand_nm=None, position_rad=None, time_s=0.1, status=0x1234)
     row = np.frombuffer(pack_sample(one), chunk_table._SAMPLE_ROW)[0]
     for name in ("time_s", "speed_rad_s", "torque_nm", "age_s", "half_width_s", "status"):
         assert row[name] == getattr(one, name)

@@ -98,6 +98,8 @@ def test_samples_as_csv_to_the_last_bit(log, tmp_path):
     samples = list(read_samples(log))
     assert [(float(r["time_s"]), float(r["speed_rad_s"]), float(r["torque_nm"])) for r in rows] == [
         (one.time_s, one.speed_rad_s, one.torque_nm) for one in samples]
+    assert [r["position_rad"] for r in rows] == ["" if one.position_rad is None else repr(one.position_rad)
+                                                for one in samples]
     assert [r["state"] for r in rows] == [one.state.value for one in samples]
     assert {r["commanded_torque_nm"] for r in rows} == {"100.0"}
     assert {r["simulated"] for r in rows} == {"1"}
@@ -113,7 +115,7 @@ def test_samples_as_parquet(log, tmp_path):
     assert (types["torque_nm"], types["state"], types["fresh"]) == ("DOUBLE", "VARCHAR", "BIGINT")
     table = dict(zip(found.columns, zip(*found.fetchall(), strict=True), strict=True))
     samples = list(read_samples(log))
-    for name in ("time_s", "speed_rad_s", "torque_nm", "torque_demand_nm"):
+    for name in ("time_s", "speed_rad_s", "torque_nm", "torque_demand_nm", "position_rad"):
         assert list(table[name]) == [getattr(one, name) for one in samples]
 
 

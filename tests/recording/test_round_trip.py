@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from drivers.drive import Command, Mode
+from drivers.drive import Command, Mode, PowerState
 from tdhil.recording.builder import FACTS as FACT_NAMES
 from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import VIRTUAL_COLUMNS, Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.recording import LagPrior, Recording
+from tdhil.recording.packed import pack_recording, unpack_recording
+from tdhil.recording.recording import LagPrior, Recording, Stage, before_abort
 from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
 from tests.recording.test_wire import SAMPLES
@@ -68,7 +69,71 @@ def test_every_fact_of_a_recording_is_kept():
     assert isinstance(recording.torque_limit_nm, float)
     assert recording.lag_prior == LagPrior(speed_lag_s=0.4, speed_lag_sd_s=0.01, source="drive")
     assert {field.name for field in fields(Recording)} == FACT_NAMES | {
-        "time_s", "speed_rad_s", "torque_nm", "fresh", "limited", "excitation", "levels", "ramps", "stages", "complete"}
+        "time_s", "speed_rad_s", "torque_nm", "fresh", "limited", "excitation", "levels", "ramps", "stages", "complete",
+        "commanded_torque_nm", "demanded_torque_nm", "position_rad"}
+
+
+@pytest.mark.parametrize("batch", [0, 2 * 2**20])
+def test_torque_setpoints_are_those_of_the_sample_s_own_command(tmp_path, batch):
+    """Only with the drive enabled and in torque mode; a sample whose command is lost has none."""
+    path, builder, rng = tmp_path / "run.mcap", RecordingBuilder(), random.Random(4)
+    with RunWriter(path, epoch_ns=0, block=True) as writer:
+        log = [(Command(rng.choice(list(Mode)), 1.0, rng.gauss(50.0, 9.0), rng.choice((0.0, 2.5))), sample(k, rng))
+               for k in range(400)]
+        for cycle, (command, one) in enumerate(log):
+            kept = cycle % 50 != 7
+            if kept:
+                writer.command(one.time_s, command)
+            writer.sample(one)
+            builder.add(one, command if kept else None)
+    recording = read_run(path, batch=batch).recording
+    assert same(recording, builder.recording())
+    for k, (command, one) in enumerate(log):
+        enabled = one.state is PowerState.ENABLED
+        told = enabled and one.mode is Mode.TORQUE and command.mode is Mode.TORQUE and k % 50 != 7
+        assert recording.commanded_torque_nm[k] == command.torque_nm if told else np.isnan(
+            recording.commanded_torque_nm[k])
+        known = enabled and one.torque_demand_nm is not None
+        assert recording.demanded_torque_nm[k] == one.torque_demand_nm if known else np.isnan(
+            recording.demanded_torque_nm[k])
+
+
+def test_angles_stand_where_they_came(tmp_path):
+    """NaN in the samples that brought none; live, replayed and packed alike."""
+    path = tmp_path / "run.mcap"
+    builder = make_run(path, 700)
+    position_rad = read_run(path).recording.position_rad
+    assert position_rad is not None and len(position_rad) == 700
+    told = [math.nan if one.position_rad is None else one.position_rad for one in read_samples(path)]
+    assert np.array_equal(position_rad, told, equal_nan=True)
+    assert np.flatnonzero(np.isfinite(position_rad)).tolist() == list(range(0, 700, 5))
+    packed = tmp_path / "packed.npz"
+    packed.write_bytes(pack_recording(builder.recording(), {}))
+    kept = unpack_recording(packed)
+    assert kept is not None and same(kept[0], builder.recording())
+    assert kept[0].commanded_torque_nm is not None and kept[0].demanded_torque_nm is not None
+
+
+def test_a_log_without_angles_has_none(tmp_path):
+    """As all logs of older releases: this one is from before there was the field."""
+    old = read_run(Path(__file__).parents[1] / "fuzz" / "corpus" / "mcap" / "valid_run.mcap")
+    assert len(old.recording.time_s) > 0
+    assert old.recording.position_rad is None
+    packed = tmp_path / "packed.npz"
+    packed.write_bytes(pack_recording(old.recording, {}))
+    kept = unpack_recording(packed)
+    assert kept is not None and kept[0].position_rad is None
+
+
+def test_what_is_left_of_an_aborted_run_has_its_angles_and_setpoints(tmp_path):
+    builder = RecordingBuilder()
+    for cycle in range(1000):
+        builder.add(sample(cycle, random.Random(cycle)), Command(Mode.TORQUE, 3.0, 100.0))
+    builder.stage(Stage("hold", 0.0, 3.0, "aborted"))
+    kept = before_abort(builder.recording())
+    assert len(kept.time_s) == 500
+    for signal in (kept.position_rad, kept.commanded_torque_nm, kept.demanded_torque_nm):
+        assert signal is not None and len(signal) == 500
 
 
 def test_numpy_numbers_do_not_make_the_live_run_differ(tmp_path):

@@ -14,7 +14,7 @@ NUMBERS = st.floats(width=64)
 SAMPLES = st.builds(
     Sample, NUMBERS, NUMBERS, NUMBERS, st.booleans(), NUMBERS, NUMBERS, st.none() | NUMBERS,
     st.none() | st.sampled_from(Mode), st.sampled_from(PowerState),
-    st.booleans(), st.booleans(), st.integers(0, 0xFFFF))
+    st.booleans(), st.booleans(), st.integers(0, 0xFFFF), st.none() | NUMBERS)
 FRAMES = st.builds(
     RawFrame, NUMBERS, st.booleans(), st.integers(0, 2**32 - 1), st.binary(max_size=300))
 
@@ -34,6 +34,9 @@ def test_sample(sample):
     assert message.HasField("torque_demand_nm") == (sample.torque_demand_nm is not None)
     if sample.torque_demand_nm is not None:
         assert bits(message.torque_demand_nm) == bits(sample.torque_demand_nm)
+    assert message.HasField("position_rad") == (sample.position_rad is not None)
+    if sample.position_rad is not None:
+        assert bits(message.position_rad) == bits(sample.position_rad)
     assert len(message.ListFields()) <= len(MESSAGES["Sample"])
     assert not leftovers(message, pack_sample(sample))
 
@@ -74,9 +77,9 @@ def test_numbers_out_of_range_are_refused():
 
 def test_field_numbers_of_old_files_are_kept():
     """Fields are added at the end: a log of today is read by what comes after."""
-    assert list(MESSAGES["Sample"])[:12] == [
+    assert list(MESSAGES["Sample"])[:13] == [
         "time_s", "speed_rad_s", "torque_nm", "age_s", "half_width_s", "fresh", "limit_active", "standstill",
-        "state", "mode", "status", "torque_demand_nm"]
+        "state", "mode", "status", "torque_demand_nm", "position_rad"]
     assert list(MESSAGES["Segment"])[:8] == [
         "start_s", "end_s", "period_s", "settle_periods", "offset_rad_s", "lines_hz", "amplitudes_rad_s", "phases_rad"]
     assert list(MESSAGES["Stage"])[:5] == ["name", "start_s", "end_s", "outcome", "detail"]
