@@ -1,5 +1,8 @@
 """Recording in, Identification out; pure numpy and scipy, knows no drive and no file."""
 
+from tdhil.estimation.cross_checks import (
+    torque_contradiction as torque_contradiction, torque_ratios as torque_ratios,
+)
 from tdhil.estimation.frequency_domain import torque_answer as torque_answer
 from tdhil.estimation.friction_levels import (
     Levels as Levels, measure_levels as measure_levels, tie_viscous as tie_viscous,

@@ -6,6 +6,7 @@ import numpy as np
 
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.result import (
+    REJECT_P,
     BudgetLine,
     Compliant,
     Estimate,
@@ -16,6 +17,7 @@ from tdhil.estimation.result import (
     Refusal,
     ResidualTest,
     SecondOpinion,
+    TorqueRatio,
     rejects,
 )
 from tdhil.estimation.samples import Samples, Stretch
@@ -45,6 +47,7 @@ class Case:
     warnings: tuple[str, ...] = ()
     levels: Levels | None = None
     sound: bool = False
+    torque_ratios: tuple[TorqueRatio, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +94,8 @@ class Finding:
     torque scale. ``bent``: the model has friction that is no straight line over speed. ``samples_used``: None for the
     case's own. ``preface`` and ``remark`` stand before and after the sentence on the model. ``reading_kg_m2``: by how
     much more J may be off on either side for the moment at which torque is read; ``advice``: instead of the usual.
+    ``contradiction``: what else in the same run contradicts J beyond chance, so that J does not stand.
+    ``reject_p``: the p-value below which the residuals contradict the model.
     """
 
     model: str = "none"
@@ -116,11 +121,13 @@ class Finding:
     friction_curve: tuple[FrictionPoint, ...] = ()
     reading_kg_m2: float = 0.0
     advice: str = ""
+    contradiction: Refusal = _NONE
+    reject_p: float = REJECT_P
 
     @property
     def rejected(self) -> bool:
         """Do the data contradict the model?"""
-        return rejects(self.residual)
+        return rejects(self.residual, self.reject_p)
 
     @property
     def contradicted(self) -> str:

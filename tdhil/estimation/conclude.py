@@ -15,7 +15,8 @@ def conclude(case: Case, finding: Finding) -> Identification:
     """The verdict on whatever was found. An abort goes before all else that the data say: without it they might differ.
 
     ``valid`` where the interval is as narrow as was asked for, ``valid_wide`` where it is bounded, ``model_rejected``
-    by the residuals' p-value, ``not_identifiable`` where a route had to refuse.
+    by the residuals' p-value or where another signal or route of the run contradicts J, ``not_identifiable`` where a
+    route had to refuse.
     """
     inertia = _inertia(case, finding)
     verdict, reason, advice = _judged(case.options, finding, inertia)
@@ -48,6 +49,7 @@ def conclude(case: Case, finding: Finding) -> Identification:
         friction_curve=finding.friction_curve,
         compliant=finding.compliant,
         lines=finding.lines,
+        torque_ratios=case.torque_ratios,
     )
 
 
@@ -73,6 +75,8 @@ def _judged(options: Options, finding: Finding, inertia: InertiaEstimate | None)
     """The verdict, its reason and the advice."""
     if finding.rejected:
         return Verdict.MODEL_REJECTED, finding.contradicted, finding.words.if_rejected
+    if finding.contradiction.reason:
+        return Verdict.MODEL_REJECTED, finding.contradiction.reason, finding.contradiction.advice
     if finding.inertia is None or inertia is None:
         return Verdict.NOT_IDENTIFIABLE, finding.refusal.reason, finding.refusal.advice
     wide = f"wider than ±{options.tolerance:.2%}"

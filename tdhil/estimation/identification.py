@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from tdhil.estimation.case import Case, Finding, PeriodicCase
 from tdhil.estimation.conclude import conclude
-from tdhil.estimation.cross_checks import cross_checked
+from tdhil.estimation.cross_checks import angle_checked, cross_checked, torques_compared, torques_judged
 from tdhil.estimation.data_checks import check_samples
 from tdhil.estimation.impedance import measure_impedance, refusal
 from tdhil.estimation.paper_method import paper_estimate
@@ -25,7 +25,8 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
     """Identify the inertia. Pure: on one machine the same recording gives the same bits. Never raises: it refuses."""
     case = Case(before_abort(recording), options or Options(), aborted_stage(recording))
     try:
-        case = _sampled(case)
+        case = torques_compared(_sampled(case))
+        case = torques_judged(case)
         excitation = case.recording.excitation
         if excitation is None or not excitation.segments:
             case = recorded(case)
@@ -39,10 +40,13 @@ def identify(recording: Recording, options: Options | None = None) -> Identifica
         finding = Finding(refusal=refused.refusal)
     if case.sound:
         finding = cross_checked(finding, case)
+    finding = angle_checked(finding, case)
     found = conclude(case, stretched(finding, case.recording))
     asked = case.recording.impedance
     if asked is None:
         return found
+    if finding.contradiction.reason:
+        return replace(found, impedance=refusal(asked, found.reason, found.advice))
     if isinstance(case, PeriodicCase):
         return replace(found, impedance=measure_impedance(case))
     return replace(found, impedance=refusal(asked, finding.refusal.reason, finding.refusal.advice))

@@ -118,17 +118,17 @@ class ResidualTest:
 
 
 REJECT_P = 0.001
-_DOUBT_P = 0.01
+DOUBT_P = 0.01
 
 
-def rejects(test: ResidualTest | None) -> bool:
+def rejects(test: ResidualTest | None, least_p: float = REJECT_P) -> bool:
     """Do the data contradict the model? Also where the statistic is no number."""
-    return test is not None and not test.p_value >= REJECT_P
+    return test is not None and not test.p_value >= least_p
 
 
 def doubtful(test: ResidualTest | None) -> bool:
     """Do the data only just allow the model, if at all?"""
-    return test is not None and not test.p_value >= _DOUBT_P
+    return rejects(test, DOUBT_P)
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,24 @@ class SecondOpinion:
     inertia_kg_m2: Estimate
     agrees: bool | None
     note: str
+
+
+@dataclass(frozen=True)
+class TorqueRatio:
+    """Reported torque over the ``reference``, commanded (in torque mode) or demanded torque (in speed mode).
+
+    ``surely``: half-width of the ratio's interval at a chance of 1 in 1000 to lie outside. Root mean squares are over
+    the samples that were compared. ``demanded_ratio``: demanded over commanded torque, where both are known and the
+    ratio is off; else None.
+    """
+
+    reference: str
+    ratio: Estimate
+    surely: float
+    reference_rms_nm: float
+    demanded_rms_nm: float | None
+    reported_rms_nm: float
+    demanded_ratio: float | None
 
 
 @dataclass(frozen=True)
@@ -282,3 +300,4 @@ class Identification:
     compliant: Compliant | None = None                  # with the models two-mass and string; ``inertia`` is J_r then
     impedance: DriveImpedance | None = None             # of a run that measured the drive's own
     lines: tuple[LinePoint, ...] = ()                   # rising frequency; for the picture of the report
+    torque_ratios: tuple[TorqueRatio, ...] = ()         # of the signals of torque; empty where no setpoint is known

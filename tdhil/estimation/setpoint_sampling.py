@@ -62,6 +62,17 @@ def worst_share(stepped: SteppedSetpoint, torque_lag_s: float) -> float:
     return min(worst, _MOST) if math.isfinite(worst) else _MOST
 
 
+_CROSSOVER_RAD_S = 5.0
+"""Of a quick speed loop of a top drive, for a drive whose loop is not known: the quicker the loop, the sharper torque
+answers a step. Simulated drives of all profiles stay below half of what follows from it."""
+
+
+def usual_following(period_s: float) -> SteppedSetpoint:
+    """A PI loop with a double pole at half its crossover, with a setpoint that is stepped once in ``period_s``."""
+    first_s = 4.0 / _CROSSOVER_RAD_S
+    return SteppedSetpoint(period_s, first_s, first_s, first_s / _CROSSOVER_RAD_S)
+
+
 def _answer(stepped: SteppedSetpoint, lag_s: float) -> tuple[FloatArray, FloatArray]:
     """Times (N,), _FINE a cycle, and g there, 1/s: (1 + b s)/((1 + a₁ s + a₂ s²)(1 + τ s)) by its poles."""
     step = stepped.period_s / _FINE

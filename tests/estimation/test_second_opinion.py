@@ -11,7 +11,8 @@ from scipy.stats import binom
 
 from tdhil.estimation import Compliant, Estimate, Options
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.cross_checks.momentum import through
+from tdhil.estimation.cross_checks.momentum import Kind, balances, through
+from tdhil.estimation.cross_checks.momentum_fit import Delay, Density, Resolution, fit_momentum
 from tdhil.estimation.cross_checks.second_opinion import disagreements, second_opinions
 from tdhil.estimation.friction_levels import measure_levels
 from tdhil.estimation.samples import Samples, stretches, usable_samples
@@ -210,3 +211,25 @@ def test_nothing_to_go_by_is_no_opinion_and_nothing_raises():
         if name != "ramp":
             assert opinions == ()
         assert all(math.isfinite(o.inertia_kg_m2.high) and o.inertia_kg_m2.value > 0.0 for o in opinions)
+
+
+def test_torque_read_in_step_with_a_speed_setpoint_is_an_unknown_of_its_own():
+    """As at 15 cycles a second: in the rows that a speed setpoint moved, J reads a share too large."""
+    plainly, openly = [], []
+    for recording in usual_runs()[:10]:
+        found = balances(recording, usable_samples(recording))
+        rows = tuple(
+            replace(row, stepped=True, impulse_nm_s=row.impulse_nm_s + 0.08 * TRUE * row.change_rad_s)
+            if row.second.end_s < 24.0 else row for row in found.rows
+        )
+        assert any(abs(row.change_rad_s) > 3.0 for row in rows if row.stepped)
+        read = replace(found, rows=rows)
+        known, rounding = Delay(0.25, 0.018, True), Resolution(0.0, 0.0)
+        plain, open_share = (
+            fit_momentum(read, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95, share) for share in (0.0, 0.08)
+        )
+        assert plain.inertia - TRUE > 0.02 * TRUE
+        assert abs(open_share.inertia - TRUE) <= open_share.half_width
+        plainly.append(plain.inertia)
+        openly.append(open_share.inertia)
+    assert abs(np.mean(openly) - TRUE) < 0.5 * (np.mean(plainly) - TRUE)

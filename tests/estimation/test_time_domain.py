@@ -15,7 +15,7 @@ from tdhil.estimation.time_domain.equation import PARAMETERS, SPEED_LAG, TORQUE_
 from tdhil.estimation.time_domain.fit import search
 from tdhil.estimation.time_domain.solve import solve
 from tdhil.estimation.time_domain.taylor import flat_top
-from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
+from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
 from tdhil.recording.recording import LagPrior
 from tdhil.studies.coverage import plants
 from tdhil.studies.coverage.simulate import simulate as simulate_plan
@@ -38,7 +38,7 @@ def bins_of(recording):
 
 
 def windows_of(recording):
-    return windows(runs(thinned(usable_samples(recording)), recording.speed_resolution_rad_s, 2.5))
+    return place_windows(runs(thinned(usable_samples(recording)), recording.speed_resolution_rad_s, 2.5))
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_the_truth_solves_the_bins_of_short_stretches_at_low_rates_too(rate_hz, 
     turned = np.outer(time, omega) + phase
     speed, rise = 12.0 + np.sin(turned) @ size, np.cos(turned) @ (omega * size)
     stretch = OneWayStretch(Samples(time, speed, 104.0 * rise + 8.0 * speed + 60.0), 1.0)
-    bins = joined([measure(window) for window in windows((stretch,))])
+    bins = joined([measure(window) for window in place_windows((stretch,))])
     assert np.max(bins.hertz) < 0.21 * rate_hz
     truth = np.zeros(PARAMETERS)
     truth[:2], truth[7] = (104.0, 8.0), 60.0

@@ -5,7 +5,12 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from tdhil.estimation.cross_checks.angle_agreement import angle_checked as angle_checked
     from tdhil.estimation.cross_checks.friction_by_speed import Inertia as Inertia, friction_curve as friction_curve
     from tdhil.estimation.cross_checks.second_opinion import cross_checked as cross_checked
+    from tdhil.estimation.cross_checks.torque_agreement import (
+        torque_contradiction as torque_contradiction, torque_ratios as torque_ratios,
+        torques_compared as torques_compared, torques_judged as torques_judged,
+    )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -1,6 +1,6 @@
 """The balances of a run: knots where it turned calmly, swung or coasted, and a row from each to the next."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -187,7 +187,10 @@ class Knot:
 
 @dataclass(frozen=True)
 class Row:
-    """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w²."""
+    """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w².
+
+    ``stepped``: a speed setpoint moved the shaft, a step a cycle, for some of it.
+    """
 
     first: Knot
     second: Knot
@@ -198,6 +201,7 @@ class Row:
     time_s: float             # ∫w
     impulse_nm_s: float       # ∫w T
     energy_s: float
+    stepped: bool = False
 
 
 def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
@@ -313,8 +317,19 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
         apart = first.end_s <= second.start_s + 1e-6 and first.coasting == second.coasting
         if apart and min(least, most) >= low and max(least, most) <= high:
             row = balance(samples, first, second)
-            found += [row] if row is not None else []
+            found += [replace(row, stepped=_stepped(recording, row))] if row is not None else []
     return Balances(tuple(found), direction, calm) if found else None
+
+
+def _stepped(recording: Recording, row: Row) -> bool:
+    """Was a run of ours in speed mode for some of the time? Of a foreign trace nobody knows the setpoint."""
+    if row.kind is Kind.COASTING or not recording.stages:
+        return False
+    commanded = recording.commanded_torque_nm
+    if commanded is None:
+        return True
+    first, last = np.searchsorted(recording.time_s, (row.first.start_s, row.second.end_s))
+    return bool(np.any(np.isnan(commanded[first:last])))
 
 
 def periodic_segments(recording: Recording) -> tuple[Segment, ...]:

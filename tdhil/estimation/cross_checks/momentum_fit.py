@@ -7,6 +7,7 @@ behave otherwise in the changes of speed, and the rows' own scatter is what the 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +19,8 @@ from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01
 _LEAST_DOF = 3.0
+_BEND_SHOWS = 6.6         # of the density: what a bend must explain to be seen, χ² of one degree at 1 %
+_UNSEEN_BEND = 0.03       # of J: friction that bends unseen moves a balance by so much, one standard deviation
 _LEAST_CHANGE = 0.1       # of the greatest speed: rows that change it by less say nothing of J worth a number
 
 
@@ -54,7 +57,8 @@ class Resolution:
 class MomentumFit:
     """J kg·m², its half-width at the confidence asked for, and the delay's part in it (kg·m², one standard deviation).
 
-    ``rows`` is how many changes of speed it rests on; ``density`` is pooled.
+    ``rows`` is how many changes of speed it rests on; ``density`` is pooled. ``bend``: by how much J changes, kg·m²,
+    if friction has a part that grows with the square of the speed.
     """
 
     inertia: float
@@ -63,14 +67,17 @@ class MomentumFit:
     viscous: float
     rows: int
     density: Density
+    bend: float = 0.0
 
 
 def fit_momentum(
-    found: Balances, kind: Kind, levels: Density, delay: Delay, resolution: Resolution, confidence: float
+    found: Balances, kind: Kind, levels: Density, delay: Delay, resolution: Resolution, confidence: float,
+    reading_share: float = 0.0,
 ) -> MomentumFit | None:
     """J from the rows of one kind; the others serve for friction where their speed hardly changes. None if they can't.
 
-    Raises LinAlgError where the rows make no system.
+    ``reading_share``: standard deviation of what slow sampling in step with a speed setpoint does to J in the rows that
+    one moved, as a share of J (`tdhil.estimation.setpoint_sampling`). Raises LinAlgError where the rows make no system.
     """
     fastest = max(abs(row.travel_rad) / row.time_s for row in found.rows)
 
@@ -85,22 +92,38 @@ def fit_momentum(
     inverse = np.linalg.inv(np.linalg.cholesky(covariance))
     impulse = inverse @ np.array([row.impulse_nm_s for row in rows])
 
-    def solve(delay_s: float) -> tuple[FloatArray, FloatArray, float]:
-        design = inverse @ _design(rows, delay_s, found.direction)
+    def solve(delay_s: float, *more: FloatArray, prior: float = 0.0) -> tuple[FloatArray, FloatArray, float]:
+        """``more``: columns beside J, B and T_c; ``prior``: the inverse deviation of the last one, in rows' units."""
+        columns = np.column_stack([_design(rows, delay_s, found.direction), *more])
+        design = inverse @ columns
+        if prior > 0.0:
+            last = np.zeros((1, columns.shape[1]))
+            last[0, -1] = prior
+            design = np.concatenate([design, last])
+        right = np.append(impulse, 0.0) if prior > 0.0 else impulse
         scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
         normal = (design / scale).T @ (design / scale)
         if np.linalg.cond(normal) > 1e12:
             raise np.linalg.LinAlgError("friction and inertia can't be told apart")
         spread: FloatArray = np.linalg.inv(normal) / np.outer(scale, scale)
-        x: FloatArray = spread @ (design.T @ impulse)
-        return x, spread, float(np.sum((impulse - design @ x) ** 2))
+        x: FloatArray = spread @ (design.T @ right)
+        return x, spread, float(np.sum((right - design @ x) ** 2))
 
     x, spread, rest = solve(delay.seconds)
     density = _pooled(levels, rest, len(rows) - 3)
     if density is None or not x[0] > 0.0:
         return None
-    shifted = abs(float(solve(delay.seconds + delay.sd_s)[0][0] - x[0]))
-    design = inverse @ _design(rows, delay.seconds, found.direction)
+    stepped = np.array([row.change_rad_s if row.stepped else 0.0 for row in rows])
+    further: tuple[FloatArray, ...] = ()
+    prior = 0.0
+    if reading_share > 0.0 and np.any(stepped):
+        further, prior = (stepped,), math.sqrt(density.value) / (reading_share * float(x[0]))
+        x, spread, rest = solve(delay.seconds, *further, prior=prior)
+        density = _pooled(levels, rest, len(rows) - 3) or density
+        if not x[0] > 0.0:
+            return None
+    shifted = abs(float(solve(delay.seconds + delay.sd_s, *further, prior=prior)[0][0] - x[0]))
+    design = inverse @ np.column_stack([_design(rows, delay.seconds, found.direction), *further])
     gain = (spread @ design.T @ inverse)[0]                       # ∂J/∂(impulse of each row)
     edges = gain * float(x[0])
     # a rounded speed is wrong at a knot: by the same amount, with opposite sign, in the two rows that share it
@@ -114,7 +137,25 @@ def fit_momentum(
         student_quantile(confidence, density.dof) * scatter,
         student_quantile(confidence, 1e6) * math.hypot(shifted, rounding),
     )
-    return MomentumFit(float(x[0]), half, shifted, float(x[1]), count, density)
+    bent = _bent(solve, rows, delay.seconds, float(x[0]), further, prior, rest, density.value)
+    return MomentumFit(float(x[0]), half, shifted, float(x[1]), count, density, bent)
+
+
+def _bent(
+    solve: Callable[..., tuple[FloatArray, FloatArray, float]], rows: list[Row], delay_s: float, inertia: float,
+    further: tuple[FloatArray, ...], prior: float, rest: float, density: float,
+) -> float:
+    """By how much J may change, kg·m², with friction that has a part ∝ ω|ω|: all of it where the rows show that part.
+
+    Where they do not, what they leave open of it is mostly noise, and counts up to a share of J.
+    """
+    square = np.array([row.travel_rad * abs(row.travel_rad) / row.time_s for row in rows])
+    try:
+        x, _, left = solve(delay_s, square, *further, prior=prior)
+    except np.linalg.LinAlgError:
+        return _UNSEEN_BEND * inertia
+    change = abs(float(x[0]) - inertia)
+    return change if rest - left > _BEND_SHOWS * density else min(change, _UNSEEN_BEND * inertia)
 
 
 def _covariance(rows: list[Row]) -> FloatArray:

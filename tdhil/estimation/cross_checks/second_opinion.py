@@ -28,13 +28,21 @@ from tdhil.estimation.cross_checks.momentum_fit import (
     fit_momentum,
 )
 from tdhil.estimation.frequency_domain import student_quantile
-from tdhil.estimation.result import Estimate, SecondOpinion
-from tdhil.estimation.samples import Samples
+from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
+from tdhil.estimation.samples import Samples, usual_interval
+from tdhil.estimation.setpoint_sampling import NEGLIGIBLE, usual_following, worst_share
 from tdhil.recording import FloatArray, Recording
 
 _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
+Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
+_ACQUISITION = "acquire"  # the stage that J comes from
+_CONTRADICTION = 1e-3
+"""Of the runs: the chance that a sound result is taken back, for noise and friction that bends unseen."""
+
+_ALIKE = 0.05
+"""Of J: a difference below it contradicts nothing. Friction drifts between stages by some percent of J's torque."""
 
 
 def cross_checked(finding: Finding, case: Case) -> Finding:
@@ -42,9 +50,16 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
 
     Not for data that were refused as such: a second opinion would be a number out of them (`Case.sound`).
     """
-    opinions = second_opinions(case, finding)
+    fitted = _fitted_opinions(case, finding)
+    opinions = tuple(opinion for opinion, _ in fitted)
     warnings = (*finding.warnings, *disagreements(opinions, finding))
+    against = (*fitted, *_before_acquisition(case, finding))
     inertia = _inertia(case, finding, opinions)
+    contradiction = _contradiction(against, finding, case.options.confidence)
+    if contradiction.reason:
+        # of a J that does not stand nothing else is told, as where the residuals contradict the model
+        finding = Finding(finding.model, finding.words, finding.residual, lines=finding.lines, bent=finding.bent,
+                          samples_used=finding.samples_used, contradiction=contradiction)
     if inertia is None or case.levels is None:
         return replace(finding, second_opinions=opinions, warnings=warnings)
     curve = friction_curve(case.recording, case.samples, case.levels, inertia, case.options)
@@ -69,17 +84,62 @@ def second_opinions(case: Case, finding: Finding) -> tuple[SecondOpinion, ...]:
     """J by every route that the run has; () where there is none. The finding's own J and lags are looked at, where it
     has them. Never raises.
     """
+    return tuple(opinion for opinion, _ in _fitted_opinions(case, finding))
+
+
+def _fitted_opinions(case: Case, finding: Finding, *, alone: bool = False) -> Fitted:
     levels = case.levels
     try:
-        found = balances(case.recording, case.samples, alone=levels is None or levels.dof < _LEAST_DOF)
+        found = balances(case.recording, case.samples, alone=alone or levels is None or levels.dof < _LEAST_DOF)
         opinions = () if found is None else _opinions(case, found, finding)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError, ZeroDivisionError):
         return ()
     share = _FALSE_ALARM / max(1, len(opinions))
     return tuple(
-        replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, finding, case.options.confidence, share))
-        for opinion in opinions
+        (replace(opinion, agrees=_agrees(opinion.inertia_kg_m2, finding, case.options.confidence, share)), fit)
+        for opinion, fit in opinions
     )
+
+
+def _before_acquisition(case: Case, finding: Finding) -> Fitted:
+    """The same from what was recorded before stage 5 alone.
+
+    Where a signal changes its scale during the run, the balances of the whole run contradict one another, and their
+    interval becomes so wide that J agrees with it. Those of before do not.
+    """
+    begun = next((stage.start_s for stage in case.recording.stages if stage.name == _ACQUISITION), None)
+    if begun is None:
+        return ()
+    before = replace(
+        case, recording=replace(case.recording, excitation=None), samples=case.samples.between(-math.inf, begun))
+    named = _fitted_opinions(before, finding, alone=True)
+    return tuple((replace(opinion, route=f"{opinion.route} before stage 5"), fit) for opinion, fit in named)
+
+
+def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Refusal:
+    """What contradicts J beyond chance and beyond what friction that bends may do to a balance; else nothing.
+
+    The torque's scale is shared by both and cancels.
+    """
+    reference = reference_inertia(finding)
+    for opinion, fit in opinions:
+        own = opinion.inertia_kg_m2
+        if reference is None or opinion.agrees is not False:
+            continue
+        apart = abs(own.value - reference.value)
+        half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
+        wider = Estimate(own.value, own.value - half, own.value + half)
+        share = _CONTRADICTION / len(opinions)
+        if apart > _ALIKE * reference.value and _agrees(wider, finding, confidence, share) is False:
+            return Refusal(
+                f"two routes through the same run contradict each other: J is {reference.value:.4g} kg·m² by the "
+                f"excitation and {own.value:.4g} ({own.low:.4g} to {own.high:.4g}) kg·m² by the {opinion.route}; "
+                "a signal changed its scale during the run, the load changed, or friction is not what the model takes "
+                "it for",
+                "check that speed and torque are reported with one scale in all stages and that the load stays the same"
+                " during the run; then run it again",
+            )
+    return Refusal("", "")
 
 
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
@@ -96,22 +156,40 @@ def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tupl
     )
 
 
-def _opinions(case: Case, found: Balances, finding: Finding) -> tuple[SecondOpinion, ...]:
+def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     recording, levels = case.recording, case.levels
     density = Density(0.0, 0.0) if levels is None else Density(levels.density, levels.dof)
     delay = known_delay(recording, finding)
     resolution = _resolution(recording, case.samples, found)
     steps = recording.excitation is not None and has_plateaus(recording.excitation.kind)
+    share = _reading_share(case, finding)
     opinions = []
     for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
         if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):
             continue
-        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence)
+        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence, share)
         if fit is None or not fit.half_width < _OPEN * fit.inertia:
             continue
         inertia = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
-        opinions.append(SecondOpinion(route, inertia, None, _note(fit, kind, delay)))
+        opinions.append((SecondOpinion(route, inertia, None, _note(fit, kind, delay)), fit))
     return tuple(opinions)
+
+
+def _reading_share(case: Case, finding: Finding) -> float:
+    """Standard deviation of what a stepped speed setpoint may do to the J of the rows that it moved; 0: negligible.
+
+    How the drive follows its setpoint is known of speed mode alone. Where the moment of reading lies is open: the worst
+    one is the bound of a uniform distribution.
+    """
+    stepped = case.recording.stepped_setpoint or usual_following(usual_interval(case.samples.time_s))
+    prior = case.recording.lag_prior
+    lag_s = 0.0
+    if finding.torque_lag_s is not None:
+        lag_s = max(finding.torque_lag_s.low, 0.0)
+    elif prior.torque_lag_s is not None:
+        lag_s = max(prior.torque_lag_s - 2.0 * prior.torque_lag_sd_s, 0.0)
+    share = worst_share(stepped, lag_s)
+    return share / math.sqrt(3.0) if share >= NEGLIGIBLE else 0.0
 
 
 def known_delay(recording: Recording, finding: Finding) -> Delay:

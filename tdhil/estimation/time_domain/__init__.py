@@ -1,3 +1,9 @@
 """Identification of any record, periodic or not: the time domain's route."""
 
+from tdhil.estimation.time_domain.fit import smoothed as smoothed
 from tdhil.estimation.time_domain.identify import identify_record as identify_record, recorded as recorded
+from tdhil.estimation.time_domain.taylor import ComplexArray as ComplexArray, polynomial as polynomial
+from tdhil.estimation.time_domain.windows import (
+    Bins as Bins, OneWayStretch as OneWayStretch, joined as joined, measure as measure, place_windows as place_windows,
+    thinned as thinned,
+)

@@ -21,11 +21,12 @@ from tdhil.estimation.frequency_domain import (
     simultaneous,
     torque_scale_line,
 )
-from tdhil.estimation.result import Estimate, Options, Refused
+from tdhil.estimation.result import DOUBT_P, Estimate, Options, Refused
 from tdhil.estimation.samples import Samples, left_out_warnings, log_warnings
 from tdhil.estimation.time_domain.equation import SKEW, SPEED_LAG, TORQUE_LAG
 from tdhil.estimation.time_domain.solve import Solved, solve
-from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, runs, thinned, windows
+from tdhil.estimation.time_domain.stick_slip import refuse_stick_slip
+from tdhil.estimation.time_domain.windows import OneWayStretch, joined, measure, place_windows, runs, thinned
 from tdhil.recording import BoolArray, FloatArray, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -155,19 +156,24 @@ _WIDE = {
 def recorded(case: Case) -> Case:
     """The case with what is wrong with its record but leaves a number that stands."""
     recording = case.recording
-    warnings = (*log_warnings(recording), *left_out_warnings(recording))
+    warnings = (*case.warnings, *log_warnings(recording), *left_out_warnings(recording))
     # Pulses and coasting of our own have calm between them, which a foreign trace need not have.
     return replace(case, warnings=warnings, sound=recording.excitation is not None)
 
 
 def identify_record(case: Case) -> Finding:
-    """What a record without periodic excitation tells of a rigid shaft. Raises Refused where it leaves J open."""
+    """What a record without periodic excitation tells of a rigid shaft. Raises Refused where it leaves J open.
+
+    Stick-slip is refused by name: friction is no constant where the shaft sticks, and the answers of such records miss
+    the true inertia more often than they state, whatever the residual test says.
+    """
     if not shaft_model(case.options.model).lags:
         raise Refused(
             "the paper's method takes the reported signals as they are; without periodic excitation nothing tests that",
             "identify with the rigid model, which includes reporting lags",
         )
     check_signals(case.recording, case.samples)
+    refuse_stick_slip(case.samples, case.recording.speed_resolution_rad_s, case.recording.torque_resolution_nm)
     few = thinned(case.samples)
     found = _runs(few, case.recording)
     solved, conditions = _solved(case.recording, few, found, case.options)
@@ -196,7 +202,7 @@ def _solved(recording: Recording, samples: Samples, found: tuple[OneWayStretch, 
 
     And what J is conditional on by that.
     """
-    placed = windows(found)
+    placed = place_windows(found)
     if not placed:
         return None, ()
     bins = joined([measure(window) for window in placed])
@@ -232,7 +238,9 @@ def _finding(solved: Solved, case: Case) -> Finding:
         "explains the record",
         digits=2,
     )
-    bare = Finding(MODEL, words, solved.residual, warnings=_caveats(solved))
+    if solved.residual is None:
+        raise Refused("the record has too few frequencies to test the model that J comes from", ADVICE)
+    bare = Finding(MODEL, words, solved.residual, warnings=_caveats(solved), reject_p=DOUBT_P)
     if bare.rejected:
         return bare
     scale = torque_scale_line(solved.inertia.value, case.recording.torque_scale_rel_sd, case.options.confidence)

@@ -43,7 +43,7 @@ from tdhil.recording import FloatArray
 # leaves so much more that F says it is no chance, then the data contradict it.
 
 
-_GROUP = 6
+_GROUPS = (6, 4, 3)      # bins a group: the most that leave enough groups; a machine that stops often has few in a row
 _FIRST = 2       # bins of a window below it are friction's, constant and all
 
 
@@ -53,13 +53,18 @@ def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTe
     ``factor``: by how much more than its noise model says the inertia scatters over time. Noise that comes with the
     motion is shared by many bins, so F is divided by factor², and its degrees of freedom are taken as half as many.
     """
+    tests = (_local_test(problem, theta, factor, group) for group in _GROUPS)
+    return next((test for test in tests if test is not None), None)
+
+
+def _local_test(problem: Problem, theta: FloatArray, factor: float, group: int) -> ResidualTest | None:
     found = evaluate(theta, problem.bins)
     bins, variance = problem.bins, problem.variance
     by_model, by_line, dof_model, dof_line = 0.0, 0.0, 0, 0
     for number in np.unique(bins.window):
         mine = np.flatnonzero((bins.window == number) & (bins.hertz > 0.0))[_FIRST - 1 :]
-        for first in range(0, len(mine) - _GROUP + 1, _GROUP):
-            part = mine[first : first + _GROUP]
+        for first in range(0, len(mine) - group + 1, group):
+            part = mine[first : first + group]
             weight = 1.0 / np.sqrt(variance[part])
             s = bins.s[part]
             lines = np.stack([bins.speed[part, 0],
@@ -69,8 +74,8 @@ def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTe
             left = error - u @ (u.conj().T @ error)
             by_model += 2.0 * float(np.sum(np.abs(error) ** 2))
             by_line += 2.0 * float(np.sum(np.abs(left) ** 2))
-            dof_model += 2 * _GROUP
-            dof_line += 2 * (_GROUP - 2)
+            dof_model += 2 * group
+            dof_line += 2 * (group - 2)
     fitted = len(problem.free)
     extra = dof_model - fitted - dof_line
     if dof_line < 8 or extra < 2 or by_line <= 0.0:

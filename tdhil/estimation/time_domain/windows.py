@@ -53,12 +53,12 @@ class OneWayStretch:
         return float(self.samples.time_s[-1] - self.samples.time_s[0])
 
 
-def thinned(samples: Samples) -> Samples:
+def thinned(samples: Samples, most: int = _MOST_SAMPLES) -> Samples:
     """At most some 200 000 samples, never below 50 Hz: means over groups of neighbours, their time included."""
     count = len(samples)
     length = float(samples.time_s[-1] - samples.time_s[0])
     rate = count / length if length > 0.0 else 0.0
-    group = int(min(count / _MOST_SAMPLES, rate / _LEAST_RATE_HZ))
+    group = int(min(count / most, rate / _LEAST_RATE_HZ))
     if group < 2:
         return samples
     whole = count // group * group
@@ -180,7 +180,7 @@ def joined(parts: list[Bins]) -> Bins:
                   for name in ("s", "speed", "torque", "level", "bend", "energy", "window")))
 
 
-def windows(found: tuple[OneWayStretch, ...]) -> tuple[Window, ...]:
+def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[Window, ...]:
     """All windows of all runs, in the order of time."""
     placed: list[Window] = []
     for run in found:

@@ -1,0 +1,132 @@
+"""The reported speed held against the shaft's angle, stage by stage.
+
+Over a stretch the angle moves as far as the integral of the true speed. A reported speed that lags by τ, whatever its
+filter, is late by the same way at both ends,
+
+    ∫ω_rep dt = Δθ/k − τ Δω_rep,
+
+so that a stretch whose ends are equally fast gives the ratio k of true to reported speed without any knowledge of τ.
+For other stretches the longest plausible lag bounds the error.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from tdhil.config import SPEED_UNIT_TOLERANCE
+from tdhil.estimation.case import Case, Finding
+from tdhil.estimation.result import Refusal
+from tdhil.estimation.samples import Samples, excited_window, usable_samples
+from tdhil.recording import Recording
+
+_LAG_S = 0.5              # the longest lag of a reported speed that is plausible
+_END_S = 0.5              # at either end of a stretch, over which its speed is averaged
+_LEAST_S = 2.0            # of a stretch
+_LEAST_READINGS = 8       # of the angle in a stretch
+_LONGEST_GAP_S = 0.3      # without a sample of the speed: over it the way is not known
+_ALIKE = 0.02             # of the ratio of a stage, by which that of another may differ: both are rounded
+
+
+@dataclass(frozen=True)
+class AngleRatio:
+    """Angle over the integral of the reported speed in one stretch, with what bounds its error on either side."""
+
+    where: str
+    value: float
+    half_width: float
+
+
+def angle_ratio(recording: Recording, samples: Samples, where: str, start_s: float, end_s: float) -> AngleRatio | None:
+    """Between the first and the last angle of a stretch; None where there are too few, or the speed has a hole."""
+    angle = recording.position_rad
+    if angle is None:
+        return None
+    known = np.isfinite(angle) & recording.fresh & (recording.time_s >= start_s) & (recording.time_s <= end_s)
+    time, turned = recording.time_s[known], angle[known]
+    if len(time) < _LEAST_READINGS or time[-1] - time[0] < _LEAST_S:
+        return None
+    begin, end = float(time[0]), float(time[-1])
+    inside = samples.between(begin - 1e-9, end + 1e-9)
+    if len(inside) < _LEAST_READINGS or float(np.max(np.diff(inside.time_s), initial=0.0)) > _LONGEST_GAP_S:
+        return None
+    way = float(np.trapezoid(inside.speed_rad_s, inside.time_s))
+    # a sample may be missing at either end; there the speed is carried on
+    way += float(inside.speed_rad_s[0]) * (float(inside.time_s[0]) - begin)
+    way += float(inside.speed_rad_s[-1]) * (end - float(inside.time_s[-1]))
+    ends = [samples.between(at, at + _END_S).speed_rad_s for at in (begin, end - _END_S)]
+    steps = np.abs(np.diff(turned))
+    count = float(np.min(steps[steps > 0.0], initial=math.inf))
+    if not all(len(part) for part in ends) or not math.isfinite(count) or way == 0.0:
+        return None
+    change = abs(float(np.mean(ends[1])) - float(np.mean(ends[0])))
+    ratio = float(turned[-1] - turned[0]) / way
+    # an angle that turns without steps has a smallest change that is no count; the median one bounds both
+    open_rad = 2.0 * min(count, float(np.median(steps))) + _LAG_S * change * abs(ratio)
+    open_rad += 0.5 * recording.speed_resolution_rad_s * (end - begin)
+    return AngleRatio(where, ratio, open_rad / abs(way))
+
+
+def _unbroken(recording: Recording, where: str, start_s: float, end_s: float) -> list[tuple[str, float, float]]:
+    """The parts of a stretch in which no turn of the shaft is lost: none has a longer gap than the angle allows."""
+    angle, gap_s = recording.position_rad, recording.position_gap_s
+    if angle is None or gap_s is None:
+        return [(where, start_s, end_s)]
+    time = recording.time_s
+    told = time[np.isfinite(angle) & (time >= start_s) & (time <= end_s)]
+    parts = np.split(told, np.flatnonzero(np.diff(told) > gap_s) + 1)
+    return [(where, float(part[0]), float(part[-1])) for part in parts if len(part)]
+
+
+def angle_ratios(recording: Recording) -> tuple[tuple[AngleRatio, ...], tuple[AngleRatio, ...]]:
+    """Of the steady levels, and of stage 5: its segments, or all of it where it has none."""
+    if recording.position_rad is None:
+        return (), ()
+    samples = usable_samples(recording)
+    steady = [("stage 2", level.start_s, level.end_s) for level in recording.levels]
+    segments = () if recording.excitation is None else recording.excitation.segments
+    excited = [("stage 5", *excited_window(segment)) for segment in segments] or [
+        ("stage 5", stage.start_s, stage.end_s) for stage in recording.stages if stage.name == "acquire"
+    ]
+    found = tuple(
+        tuple(one for row in rows for part in _unbroken(recording, *row)
+              if (one := angle_ratio(recording, samples, *part)) is not None)
+        for rows in (steady, excited)
+    )
+    return found[0], found[1]
+
+
+def angle_contradiction(recording: Recording) -> Refusal | None:
+    """What is wrong where the angle contradicts the speed that J comes from; None where it does not, or is not told."""
+    steady, excited = angle_ratios(recording)
+    for one in excited:
+        if not recording.speed_unit_accepted and abs(one.value - 1.0) > SPEED_UNIT_TOLERANCE + one.half_width:
+            return Refusal(
+                f"the reported speed contradicts the shaft's angle: in {one.where} the angle moved {one.value:.4g}"
+                f" times as far as the reported speed says (±{one.half_width:.2g}, tolerance"
+                f" ±{SPEED_UNIT_TOLERANCE:g})",
+                "check the unit of speed and the counts per turn in the profile, and the encoder's coupling",
+            )
+        for other in (*steady, *excited):
+            if abs(one.value - other.value) > _ALIKE * abs(other.value) + one.half_width + other.half_width:
+                return Refusal(
+                    "the reported speed changed its scale during the run: the angle moved "
+                    f"{one.value:.4g} ± {one.half_width:.2g} times as far as the reported speed says in {one.where},"
+                    f" and {other.value:.4g} ± {other.half_width:.2g} times as far in {other.where} before or after",
+                    "check the encoder, its coupling and its supply, and which program writes to the drive; then run it"
+                    " again",
+                )
+    return None
+
+
+def angle_checked(finding: Finding, case: Case) -> Finding:
+    """The finding, taken back where the angle contradicts the speed that it rests on. Never raises."""
+    if finding.inertia is None or case.recording.position_rad is None:
+        return finding
+    contradiction = angle_contradiction(case.recording)
+    if contradiction is None:
+        return finding
+    return Finding(
+        finding.model, finding.words, finding.residual, lines=finding.lines, samples_used=finding.samples_used,
+        warnings=finding.warnings, contradiction=contradiction,
+    )

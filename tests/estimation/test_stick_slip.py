@@ -1,0 +1,100 @@
+"""Records of a shaft in stick-slip: none is answered with a wrong interval, most are named, sound ones never."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tdhil.estimation import Estimate, Options, ResidualTest, Verdict, identify
+from tdhil.estimation.case import Case
+from tdhil.estimation.conclude import conclude
+from tdhil.estimation.result import Refused
+from tdhil.estimation.samples import usable_samples
+from tdhil.estimation.time_domain.fit import search
+from tdhil.estimation.time_domain.identify import _finding
+from tdhil.estimation.time_domain.solve import Solved, local_test
+from tdhil.estimation.time_domain.stick_slip import find_stick_slip
+from tdhil.estimation.time_domain.windows import joined, measure, place_windows, runs, thinned
+from tests.estimation.record_bench import FIELD, HEAVY, MOTIONS, SERVO, simulate
+from tests.estimation.stick_slip_bench import every_shaft
+from tests.estimation.stick_slip_bench import simulate as in_stick_slip
+
+ANSWERED = (Verdict.VALID, Verdict.VALID_WIDE)
+
+
+def named(recording):
+    return find_stick_slip(
+        usable_samples(recording), recording.speed_resolution_rad_s, recording.torque_resolution_nm)
+
+
+def check(shafts):
+    """No wrong interval; how many were named."""
+    count = 0
+    for shaft, recording in zip(shafts, in_stick_slip(shafts), strict=True):
+        found = identify(recording, Options())
+        assert (found.verdict in ANSWERED) == (found.inertia is not None)
+        if found.inertia is not None:
+            assert found.inertia.low <= shaft.inertia_kg_m2 <= found.inertia.high, shaft
+            assert found.residual.p_value >= 0.01
+        elif "stick-slip" in found.reason:
+            assert "turn faster" in found.advice
+            count += 1
+    return count
+
+
+def test_stick_slip_is_named_and_never_answered_wrong():
+    shafts = every_shaft()[::9]
+    assert check(shafts) >= 0.6 * len(shafts)
+
+
+@pytest.mark.heavy
+def test_none_of_108_records_in_stick_slip_is_answered_wrong():
+    shafts = every_shaft()
+    assert len(shafts) == 108
+    assert check(shafts) >= 0.7 * len(shafts)
+
+
+@pytest.mark.parametrize("machine", [FIELD, SERVO, HEAVY], ids=lambda machine: machine.name)
+def test_sound_records_are_never_called_stick_slip(machine):
+    """Among them starts from standstill, coasting to standstill, and speeds that go through zero."""
+    for motion in (*MOTIONS, "foreign"):
+        for recording in simulate(machine, motion, [1, 2]):
+            assert named(recording) is None, motion
+
+
+def solved(residual):
+    number = Estimate(100.0, 99.0, 101.0)
+    lag = Estimate(0.1, 0.05, 0.15)
+    return Solved(number, number, None, lag, lag, lag, residual, (), False, False, 40)
+
+
+def case():
+    (recording,) = simulate(FIELD, "speed steps", [1])
+    return Case(recording, Options(), samples=usable_samples(recording))
+
+
+def test_an_answer_that_could_not_be_tested_is_none():
+    with pytest.raises(Refused, match="too few frequencies to test the model"):
+        _finding(solved(None), case())
+
+
+@pytest.mark.parametrize(("p_value", "stands"), [(0.0034, False), (0.0099, False), (0.011, True)])
+def test_an_answer_whose_residual_test_fails_at_one_percent_is_none(p_value, stands):
+    one = case()
+    found = conclude(one, _finding(solved(ResidualTest(3.0, 5.0, p_value)), one))
+    assert (found.inertia is not None) == stands
+    assert (found.verdict is Verdict.MODEL_REJECTED) == (not stands)
+
+
+def test_a_record_with_few_frequencies_in_a_row_is_tested_as_well():
+    """A machine that stops often has short windows; the test's larger groups of frequencies do not fit into them."""
+    (recording,) = simulate(FIELD, "speed steps", [1])
+    samples = thinned(usable_samples(recording))
+    placed = place_windows(runs(samples, recording.speed_resolution_rad_s, 2.5))
+    bins = joined([measure(window) for window in placed])
+    found = search(bins, (), float(np.ptp(samples.torque_nm)))[-1]
+    part = found.problem.bins
+    short = replace(found.problem, bins=replace(part, window=np.arange(len(part)) // 5))
+    test = local_test(short, found.fit.theta, 1.0)
+    assert test is not None
+    assert test.p_value > 0.001

@@ -1,0 +1,210 @@
+"""Commanded, demanded and reported torque, speed and angle: signals that contradict each other give no valid J."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tdhil.estimation import Options, Verdict, identify, torque_contradiction, torque_ratios
+from tdhil.recording.recording import Recording, Stage
+from tests.estimation.shaft_bench import DT
+from tests.estimation.stages_bench import Stages, run_stages, turn
+
+FINE_S = 0.002
+LAGS = {
+    "none": (), "one pole": (0.5,), "two poles": (0.25, 0.15), "average": ("average", 0.4), "dead time": ("late", 0.3),
+}
+
+
+def lagged(signal, lag):
+    """By exact sampling of each, on a grid of its own."""
+    if lag[:1] == ("average",):
+        count = round(lag[1] / FINE_S)
+        return lfilter(np.full(count, 1.0 / count), [1.0], signal - signal[0]) + signal[0]
+    if lag[:1] == ("late",):
+        count = round(lag[1] / FINE_S)
+        return np.concatenate([np.full(count, signal[0]), signal[:-count]])
+    for tau in lag:
+        keep = np.exp(-FINE_S / tau)
+        signal = lfilter([1.0 - keep], [1.0, -keep], signal - signal[0]) + signal[0]
+    return signal
+
+
+def record(scale, seed, lag=(0.5,), rate_hz=100.0, offset=4.0, limit=None):
+    """Two minutes in torque mode: a swing of some lines about two means, held from cycle to cycle."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(120.0 / FINE_S)) * FINE_S
+    wanted = np.where(time < 60.0, 90.0, 120.0)
+    for hertz in (0.1, 0.2, 0.3, 0.5):
+        wanted = wanted + 25.0 * np.cos(2.0 * np.pi * (hertz * time + rng.random()))
+    each = round(1.0 / (rate_hz * FINE_S))
+    held = np.repeat(wanted[::each], each)[: len(time)]
+    true = held if limit is None else np.minimum(held, limit)
+    told = offset + scale * lagged(true, lag)
+    at = slice(None, None, each)
+    torque = np.round(told[at] + 2.0 * rng.standard_normal(len(told[at])))
+    flags = np.ones(len(torque), dtype=bool)
+    limited = ~flags
+    if limit is not None:      # and for three seconds more, as a drive that shows it does
+        limited = np.convolve(held[at] > limit, np.ones(round(3.0 * rate_hz)))[: len(torque)] > 0
+    return Recording(
+        time[at], np.full(len(torque), 5.0), torque, flags, limited, torque_resolution_nm=1.0,
+        torque_scale_rel_sd=0.02, commanded_torque_nm=np.round(held[at], 1),
+    )
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 12.5])
+@pytest.mark.parametrize("lag", list(LAGS.values()), ids=list(LAGS))
+def test_the_ratio_covers_whatever_lags_between(lag, rate_hz):
+    errors, halves = [], []
+    for seed in range(12):
+        scale = 0.9 + 0.02 * seed
+        (found,) = torque_ratios(record(scale, seed, lag, rate_hz), 0.95)
+        errors.append(abs(found.ratio.value - scale))
+        halves.append(found.surely)
+        assert found.reference == "commanded"
+    assert np.all(np.array(errors) <= np.array(halves))
+    assert max(halves) < 0.02
+
+
+def test_samples_at_a_limit_are_left_out():
+    (found,) = torque_ratios(record(1.0, 3, (0.15,), limit=150.0), 0.95)
+    assert abs(found.ratio.value - 1.0) <= found.surely < 0.02
+
+
+def test_of_what_nobody_knows_nothing_is_claimed():
+    one = record(0.5, 1)
+    assert torque_ratios(replace(one, commanded_torque_nm=None), 0.95) == ()
+    steady = np.full(len(one.time_s), 90.0)
+    assert torque_ratios(replace(one, commanded_torque_nm=steady), 0.95) == ()
+
+
+def test_in_speed_mode_the_demanded_torque_is_the_reference():
+    one = record(0.8, 2, (0.15,))
+    demanded = replace(one, commanded_torque_nm=None, demanded_torque_nm=one.commanded_torque_nm)
+    (found,) = torque_ratios(demanded, 0.95)
+    assert (found.reference, found.demanded_ratio) == ("demanded", None)
+    said = torque_contradiction((found,), 0.02)
+    assert "of the demanded torque" in said.reason
+    assert "commanded torque would tell which of the two is wrong" in said.advice
+
+
+@pytest.mark.parametrize(("by_demanded", "by_reported", "alone"), [
+    (1.0, 0.5, "the reported torque stands alone"), (0.5, 0.5, "the commanded torque stands alone"),
+    (0.75, 0.5, "no two of the three fit"),
+])
+def test_the_signal_that_stands_alone_is_named(by_demanded, by_reported, alone):
+    one = record(by_reported, 4, (0.1,))
+    three = replace(one, demanded_torque_nm=by_demanded * one.commanded_torque_nm)
+    said = torque_contradiction(torque_ratios(three, 0.95), 0.02)
+    assert alone in said.reason
+    assert "commanded 1" in said.reason
+    assert "N·m" in said.reason
+    assert "per_lsb" in said.advice
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Of the bench: recordings with the torque that the motor was given for a setpoint."""
+    seeds = [1, 2]
+    stages = Stages()
+    motion, _, given = turn(stages, seeds)
+    found = []
+    for k, one in enumerate(run_stages(stages, seeds, rate_hz=100.0)):
+        commanded = np.interp(one.time_s, np.arange(len(given)) * DT, given[:, k])
+        commanded[one.time_s < 24.0] = np.nan
+        found.append(replace(one, commanded_torque_nm=commanded, torque_scale_rel_sd=0.02, stages=(
+            Stage("speed", 0.0, 24.0, "ok"), Stage("acquire", 43.0, motion.segments[-1].end_s, "ok"))))
+    return found
+
+
+def test_a_sound_run_has_the_same_bits_with_its_setpoints_and_without(runs):
+    for one in runs:
+        with_them, without = identify(one), identify(replace(one, commanded_torque_nm=None))
+        assert len(with_them.torque_ratios) == 1
+        assert with_them.inertia == without.inertia
+        assert with_them.inertia.low <= 104.0 <= with_them.inertia.high
+
+
+@pytest.mark.parametrize("scale", [0.5, 0.9, 1.1, 2.0])
+def test_a_reported_torque_beyond_its_scale_is_never_valid(runs, scale):
+    found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
+    assert (found.verdict, found.inertia) == (Verdict.NOT_IDENTIFIABLE, None)
+    assert "contradict each other" in found.reason
+    assert found.torque_ratios[0].ratio.value == pytest.approx(scale, rel=0.01)
+
+
+@pytest.mark.parametrize("scale", [0.97, 1.035])
+def test_a_difference_that_the_scale_allows_widens_it_until_both_torques_fit(runs, scale):
+    found = identify(replace(runs[0], torque_nm=scale * runs[0].torque_nm), Options(tolerance=0.2))
+    assert found.verdict is Verdict.VALID
+    assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
+    assert any("torque scale was widened from 2.00%" in warning for warning in found.warnings)
+
+
+def test_a_larger_stated_uncertainty_of_the_scale_is_an_answer(runs):
+    one = replace(runs[0], torque_nm=0.9 * runs[0].torque_nm, torque_scale_rel_sd=0.06)
+    found = identify(one, Options(tolerance=0.3))
+    assert found.verdict is Verdict.VALID
+    assert found.inertia.low_total <= 104.0 <= found.inertia.high_total
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.85, 2.0])
+def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor):
+    for one in runs:
+        speed = np.where(one.time_s < 43.0, 1.0, factor) * one.speed_rad_s
+        found = identify(replace(one, speed_rad_s=speed), Options(tolerance=0.2))
+        assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
+        assert "two routes through the same run contradict each other" in found.reason
+
+
+@pytest.fixture(scope="module")
+def turned(runs):
+    """The same with the shaft's angle: the integral of the true speed, counted, in every fifth sample."""
+    (shaft,) = (turn(Stages(), [1])[1],)
+    grid = np.arange(len(shaft.speed)) * DT
+    angle = np.interp(runs[0].time_s, grid, np.cumsum(shaft.speed[:, 0]) * DT)
+    angle = np.floor(angle / 0.002) * 0.002
+    angle[np.arange(len(angle)) % 5 != 0] = np.nan
+    return replace(runs[0], position_rad=angle)
+
+
+def test_an_angle_that_fits_changes_nothing(turned):
+    assert identify(turned) == identify(replace(turned, position_rad=None))
+
+
+@pytest.mark.parametrize(("factor", "said"), [
+    (0.9, "contradicts the shaft's angle"), (1.15, "contradicts the shaft's angle"), (0.94, "changed its scale"),
+])
+def test_a_speed_that_the_angle_contradicts_is_never_valid(turned, factor, said):
+    speed = np.where(turned.time_s < 43.0, 1.0, factor) * turned.speed_rad_s
+    found = identify(replace(turned, speed_rad_s=speed, stages=()), Options(tolerance=0.2))
+    assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
+    assert said in found.reason
+
+
+def test_turns_that_are_lost_in_a_gap_of_the_angle_contradict_nothing(turned):
+    """A counter that starts over with each turn: in a gap longer than its range allows, a turn is lost."""
+    lost = turned.position_rad.copy()
+    for gap in (60.0, 75.0, 90.0):
+        lost[np.abs(turned.time_s - gap) < 0.2] = np.nan
+        lost[turned.time_s > gap] -= 2.0 * np.pi * 3
+    broken = replace(turned, position_rad=lost, position_gap_s=0.3)
+    assert identify(broken).verdict is Verdict.VALID
+    assert identify(replace(broken, position_gap_s=None)).verdict is Verdict.MODEL_REJECTED
+    speed = np.where(turned.time_s < 43.0, 1.0, 0.9) * turned.speed_rad_s
+    assert identify(replace(broken, speed_rad_s=speed, stages=())).verdict is Verdict.MODEL_REJECTED
+
+
+@pytest.mark.parametrize("counts", [0.5, 2.0, 10.0])
+def test_counts_that_the_operator_takes_as_wrong_contradict_nothing(turned, counts):
+    """--accept-speed-unit: the unit of speed is right, that of the angle is not; a change of scale is still seen."""
+    wrong = replace(turned, position_rad=counts * turned.position_rad)
+    assert identify(wrong).verdict is Verdict.MODEL_REJECTED
+    accepted = replace(wrong, speed_unit_accepted=True)
+    assert identify(accepted).verdict is Verdict.VALID
+    speed = np.where(turned.time_s < 43.0, 1.0, 0.9) * turned.speed_rad_s
+    found = identify(replace(accepted, speed_rad_s=speed, stages=()))
+    assert (found.verdict, found.inertia) == (Verdict.MODEL_REJECTED, None)
+    assert "changed its scale" in found.reason
