@@ -76,6 +76,7 @@ class ControlLoop:
         """One exchange of the stop sequence: unguarded, and neither log nor display may keep it from going on."""
         sample = self.drive.exchange(command)
         try:
+            self.guard.observer.see(command, sample)
             self.log.cycle(command, sample)
             if self._telling is not None:
                 self._note(self._telling)

@@ -35,19 +35,15 @@ from drivers import (
     Mode,
     ModeNotConfirmed,
     PowerState,
+    ReportsContradict,
     Sample,
 )
 from tdhil.run.excitation import MotionLimits, RigGuess
+from tdhil.run.observer import AT_LIMIT_SHARE, Observer, Signal
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 
 LONGEST_AGE_S = 0.25
 """Feedback may be missing for this long at most; the drive goes on by itself meanwhile, at what it was last told."""
-
-FROZEN_S = 0.5
-"""Feedback that stays the same to the last bit for so long, while the setpoint moves, is none (row 19)."""
-
-FROZEN_SHARE = 0.1
-"""Share of the limit that the setpoint must have moved by, for feedback to count as frozen."""
 
 LIMITED_S = 0.5
 """In torque mode the drive's internal limit may act for so long: a torque that is not the commanded one moves the shaft
@@ -67,9 +63,6 @@ NEARER_SHARE = 0.02
 
 FOLLOW_MEAN_S, FOLLOW_BLOCK_S = 0.5, 0.1
 """What is compared is the mean reported speed over the first, with the reference in blocks of the second."""
-
-AT_LIMIT_SHARE = 0.9
-"""Of the torque limit, from which on the torque counts as being at it."""
 
 LIGHTEN = (
     "Lift the bit off bottom, take weight off it, or turn faster (limits.speed_min_rad_s); a wider speed window leaves"
@@ -116,7 +109,7 @@ class Guard:
         # Half of what the drive's watchdog grants the host, and never on account of two lost frames.
         self._stale_limit = max(3, math.ceil(min(LONGEST_AGE_S, 0.5 * limits.watchdog_s) / period_s))
         self._stale = 0
-        self._still: _Still | None = None
+        self.observer = Observer(limits, period_s, speed_resolution_rad_s, torque_resolution_nm, assumptions)
         self._limited_since_s: float | None = None
         self._mode = _ModeShown()
         self._following = _Following(limits, period_s, speed_resolution_rad_s, assumptions)
@@ -139,6 +132,15 @@ class Guard:
         """Arithmetic goes on beside the loop and makes it late: that alone is no reason to stop."""
         self.host_late: Callable[[], str] = lambda: ""
         """How late this computer has been, in words, where it doesn't keep up (`drivers.clock.how_late`)."""
+
+    def know(self, model: RigGuess) -> None:
+        """Take stage 2's rough model, for the prediction of speed and for the observer."""
+        self.model = model
+        self.observer.know(model)
+
+    def allow_torque_offset(self, largest_nm: float) -> None:
+        """Let the stage command a torque offset of up to ``largest_nm`` in speed mode, either way."""
+        self.torque_offset_nm = self.observer.swinging_offset_nm = largest_nm
 
     def check_command(self, command: Command) -> None:
         """Raise CommandRejected for a setpoint that must not reach the bus, LimitHit for a braking torque too soon."""
@@ -205,6 +207,7 @@ class Guard:
 
     def check_sample(self, command: Command, sample: Sample) -> None:
         """Raise what the sample shows: CommunicationLost, DriveFault or LimitHit."""
+        self.observer.see(command, sample)
         where = f"guard at {sample.time_s:.3f} s"
         self._check_age(sample, where)
         if self.expected is not None and sample.state is not self.expected:
@@ -233,7 +236,7 @@ class Guard:
                 next_step="Raise limits.time_s in rig.yaml or ask for fewer periods",
             )
         self._check_mode(command, sample)
-        self._check_frozen(command, sample, where)
+        self._check_reports(where)
         self._check_limited(command, sample)
         if self.torque_offset_nm > 0.0 and command.mode is Mode.SPEED:
             self._following.reset()
@@ -344,29 +347,19 @@ class Guard:
                 else "Check the drive's supply and the bus; the drive's own watchdog stops the shaft",
             )
 
-    def _check_frozen(self, command: Command, sample: Sample, where: str) -> None:
-        """Values that no longer follow: a gateway, or a drive's process image, that repeats its last one."""
-        seen, torque_mode = (sample.speed_rad_s, sample.torque_nm), command.mode is Mode.TORQUE
-        with_offset = self.torque_offset_nm > 0.0 and not torque_mode
-        setpoint = command.torque_nm if torque_mode else command.speed_rad_s
-        if with_offset:
-            setpoint = command.torque_offset_nm
-        still = self._still
-        if still is None or still.seen != seen or still.mode is not command.mode or sample.limit_active:
-            self._still = _Still(seen, command.mode, sample.time_s, setpoint)
+    def _check_reports(self, where: str) -> None:
+        """Raise what the observer found.
+
+        CommunicationLost for feedback that repeats, LimitHit for a shaft that became lighter, ReportsContradict else.
+        """
+        doubt = self.observer.doubt
+        if doubt is None:
             return
-        still.lowest, still.highest = min(still.lowest, setpoint), max(still.highest, setpoint)
-        limit = self._limits.torque_nm if torque_mode else self._limits.speed_max_rad_s
-        if with_offset:
-            limit = self.torque_offset_nm
-        moved = still.highest - still.lowest > FROZEN_SHARE * limit
-        if moved and sample.time_s - still.since_s >= FROZEN_S:
-            raise CommunicationLost(
-                f"the feedback has been frozen at {seen[0]:.3f} rad/s and {seen[1]:.1f} N·m for {FROZEN_S:g} s,"
-                " while the setpoint moved",
-                where=where,
-                next_step="Does a gateway repeat old values? Check the bus and the drive; is the shaft locked?",
-            )
+        if Signal.ALL in doubt.signals:
+            raise CommunicationLost(doubt.what, where=where, next_step=doubt.helps)
+        if doubt.lighter:
+            raise LimitHit(doubt.what, where=where, next_step=f"The shaft was stopped. {doubt.helps}")
+        raise ReportsContradict(doubt.what, where=where, next_step=f"The shaft was stopped. {doubt.helps}")
 
     def _check_mode(self, command: Command, sample: Sample) -> None:
         if self.expected is not PowerState.ENABLED:
@@ -426,16 +419,6 @@ class Guard:
                 where=f"statusword {sample.status:04X}h, bit 11, at {sample.time_s:.3f} s",
                 next_step="Which limit of the drive acts (torque, current, speed, voltage)? Look at its panel",
             )
-
-
-class _Still:
-    """Feedback that hasn't changed since ``since_s``, and how far the setpoint has moved meanwhile."""
-
-    def __init__(self, seen: tuple[float, float], mode: Mode, since_s: float, setpoint: float) -> None:
-        self.seen = seen
-        self.mode = mode
-        self.since_s = since_s
-        self.lowest = self.highest = setpoint
 
 
 class _ModeShown:

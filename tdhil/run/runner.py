@@ -5,6 +5,7 @@ The first cause is kept: what goes wrong while stopping is reported beside it, n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -144,6 +145,7 @@ class Runner:
             mode = choose_mode(task.request, limits, preflight)
             self._before_echo = told_before_echo(task.request.kind)
             _, torque_offset = measure_offsets(loop, limits)
+            loop.guard.observer.torque_offset_nm = torque_offset
             program = None if task.evaluation is None else self._program(task, task.evaluation, loop, preflight)
             self._log.learn(torque_offset_nm=torque_offset)
             self._confirm(task, preflight, lambda: self._idle(loop))
@@ -332,6 +334,7 @@ class Runner:
             torque_resolution_nm=preflight.torque_resolution_nm,
             torque_limit_nm=limits.torque_nm,
             lag_prior=self._prior,
+            position_gap_s=preflight.position_gap_s if math.isfinite(preflight.position_gap_s) else None,
         )
         guard = Guard(
             limits,
@@ -340,6 +343,7 @@ class Runner:
             preflight.torque_resolution_nm,
             task.assumptions,
         )
+        guard.observer.position(preflight.position_resolution_rad, preflight.position_gap_s)
         guard.no_braking = NOT_YET
         if isinstance(self._drive, Timed):
             guard.host_late = self._drive.host_late

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, NoReturn
 
 from drivers import Command, Mode, Positioned, PositionReading, PreflightRefused, Sample
+from tdhil.config import SPEED_UNIT_TOLERANCE
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.settings import ControlAssumptions, MachineLimits
 from tdhil.run.task import ConfirmSpeed, Say, nobody_sees
@@ -164,8 +165,7 @@ class Angles:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-TOLERANCE = 0.1
-"""Of one, that the angle and the speed may differ by."""
+TOLERANCE = SPEED_UNIT_TOLERANCE
 NOTED = 0.02
 """A difference beyond this is told: the inertia is wrong by as much if it is the speed that is off."""
 SLOW_SHARE = 0.05
@@ -402,6 +402,7 @@ class SpeedUnitCheck:
             return
         open_share = 0.5 * self._resolution_rad_s / max(abs(command.speed_rad_s), 1e-9) + ratio.half_width
         off = abs(value - 1.0)
+        self._loop.guard.observer.compare_position(value)
         if off > TOLERANCE + open_share:
             self._contradicted(value, command)
         else:
@@ -428,6 +429,7 @@ class SpeedUnitCheck:
         if not self._onlooker.accepted or fastest > self._limits.speed_max_rad_s:
             self._refuse(what, command, step)
         self._seen(BY_NAME, value, self._angles.where)
+        self._loop.log.learn(speed_unit_accepted=True)
         self._log(f"{what}; the unit was accepted by {BY_NAME}")
         self._onlooker.say(f"{what}; the unit was accepted by {BY_NAME}")
 

@@ -32,10 +32,24 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers import Command, CommandRejected, Drive, Mode, Polled, PowerState, Sample, StopNotConfirmed, StopsFeeding
+from drivers import (
+    Command,
+    CommandRejected,
+    Drive,
+    Mode,
+    Polled,
+    Positioned,
+    PowerState,
+    RemovesTorque,
+    Sample,
+    StopNotConfirmed,
+    StopsFeeding,
+)
 from tdhil.run.control_loop import ControlLoop
 from tdhil.run.guard import kept_within
+from tdhil.run.observer import Signal
 from tdhil.run.settings import ControlAssumptions, MachineLimits
+from tdhil.run.standstill import NO_TORQUE, Standstill
 from tdhil.run.string_release import MEAN_S, StringRelease, StringReleaseLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -188,7 +202,17 @@ swing meanwhile. On a long ramp this share of it, from the highest speed, if tha
 MOST_INTERRUPTIONS = 5
 """The sequence begins anew after an exception of its own so many times; a request made twice does no harm."""
 
-_NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT, PowerState.NOT_READY)
+POSITION_EVERY_S = 0.25
+"""A position that does not come with the cycle is asked for so often while standstill is watched, s."""
+
+TORQUE_BACK_S = 0.2
+"""Before a quick stop whose speed signal is in doubt, zero torque is commanded for so long, s: some cycles, and the
+drive's own torque ramp."""
+
+REPEAT_S = 1.0
+"""The quick stop is asked for again after so long while the drive shows no valid state, s."""
+
+_STOPPING = (PowerState.QUICK_STOP, *NO_TORQUE)
 _REST = Command(Mode.SPEED, 0.0, 0.0)
 
 
@@ -240,6 +264,8 @@ class StopSequence:
             )
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
         self._trapped_nm = 0.0
+        self._position_due_s = self._repeat_due_s = -math.inf
+        self._torque_removed = False
         self._trouble: list[str] = []
         self._polls = FeedbackPolls(loop.drive, loop.period_s)
         self._slowing = Slowing(self._at_rest_rad_s)
@@ -269,12 +295,13 @@ class StopSequence:
 
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
-        if self._string is not None and self._slow_down():
+        self._loop.guard.observer.begin_stop()
+        if self._string is not None and not self._speed_doubted and self._slow_down():
             self._let_go(self._string)
         at_rest_s = self._decelerate()
-        disabled = stays = False
+        disabled, stays = self._torque_removed, False
         if at_rest_s is not None and not self._wound_up():
-            disabled = self._disable()
+            disabled = self._disable(self._loop.drive.disable)
             stays = disabled and self._stays_at_rest()
         return StopReport(stays, at_rest_s, disabled, tuple(self._trouble), self._trapped_nm)
 
@@ -296,7 +323,10 @@ class StopSequence:
                 patience.wait(self._loop.period_s)
                 continue
             regulated = sample.mode is Mode.SPEED
-            if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S):
+            if sample.state is not PowerState.ENABLED or (not regulated and since_s > MODE_S) or self._speed_doubted:
+                return False
+            self._ask_position(sample.time_s)
+            if self._loop.guard.observer.runs_away(sample):
                 return False
             patience.see(sample.speed_rad_s, self._loop.period_s)
             if regulated and speed == 0.0 and sample.speed_rad_s * came_from <= self._at_rest_rad_s:
@@ -315,7 +345,7 @@ class StopSequence:
         """Yield to what the string holds, until nothing is left or the bounds are reached."""
         going = StringRelease(string, self._at_rest_rad_s, self._loop.period_s)
         command = _REST
-        while not (going.done or going.failed):
+        while not (going.done or going.failed or self._speed_doubted):
             sample = self._exchange(command)
             if sample is None:
                 command = _REST
@@ -336,7 +366,7 @@ class StopSequence:
     def _wound_up(self) -> bool:
         """Does the drive hold a torque that disabling would let go at once?"""
         last = self._loop.last
-        if self._string is None or not self._held or last is None or last.state in _NO_TORQUE:
+        if self._string is None or not self._held or last is None or last.state in NO_TORQUE:
             return False
         held_nm = math.fsum(self._held) / len(self._held) - self._string.torque_offset_nm
         if abs(held_nm) <= 2.0 * self._string.residual_nm:
@@ -349,6 +379,8 @@ class StopSequence:
     # -- with any load -----------------------------------------------------------------------------------------
 
     def _decelerate(self) -> float | None:
+        if self._speed_doubted and self._string is None:
+            self._take_torque_back()
         if not self._quick_stop_in_torque_mode:
             for _ in range(self._loop.cycles(MODE_S)):
                 sample = self._exchange(_REST)
@@ -360,11 +392,27 @@ class StopSequence:
             at_rest_s = self._see_rest(asked)
         return at_rest_s
 
+    def _take_torque_back(self) -> None:
+        """Command zero torque in torque mode first.
+
+        Speed control would go on holding the torque that flows, with a speed signal that does not answer.
+        """
+        last = self._loop.last
+        if last is None or last.mode is not Mode.TORQUE or last.state is not PowerState.ENABLED:
+            return
+        for _ in range(self._loop.cycles(TORQUE_BACK_S)):
+            self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
+
+    @property
+    def _speed_doubted(self) -> bool:
+        """Whether the drive's speed control cannot be relied on: its report of speed contradicts another."""
+        return not self._loop.guard.observer.believable
+
     def _see_rest(self, asked: bool) -> float | None:
-        patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
+        observer = self._loop.guard.observer
+        rest = Standstill(observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
+        patience = StopTimeout(self._enough_s + rest.settle_s - self._settle_s, self._at_rest_rad_s)
         braking = Slowing(self._at_rest_rad_s, self._unmoved_s)
-        quiet_since_s: float | None = None
-        heard_s = 0.0
         while not patience.over:
             asked = asked or self._ask(self._loop.drive.quick_stop)
             sample = self._exchange(_REST, or_poll=True)
@@ -374,25 +422,83 @@ class StopSequence:
                     return None
                 patience.wait(self._loop.period_s)
                 continue
+            self._ask_position(sample.time_s)
+            if sample.state not in _STOPPING and sample.time_s >= self._repeat_due_s:
+                self._repeat_due_s, asked = sample.time_s + REPEAT_S, False
+            if self._removes_torque(sample):
+                return None
+            speed_rad_s = observer.speed_rad_s(sample)
             if not self._gets_slower(sample):
                 return None
-            patience.see(sample.speed_rad_s, self._loop.period_s)
-            if not braking.see(sample.time_s, sample.speed_rad_s) and self._leave_to_watchdog(sample):
+            patience.see(speed_rad_s, self._loop.period_s)
+            if not braking.see(sample.time_s, speed_rad_s) and self._leave_to_watchdog(sample):
                 patience = StopTimeout(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
-            # Single lost frames don't unsay what the others showed; a longer gap does.
-            unheard_s, heard_s = sample.time_s - heard_s, sample.time_s
-            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
-                quiet_since_s = None
-            elif quiet_since_s is None or unheard_s > self._longest_gap_s:
-                quiet_since_s = sample.time_s
-            elif sample.time_s - quiet_since_s >= self._settle_s and (sample.standstill or sample.state in _NO_TORQUE):
+            if rest.see(sample) and self._poll_agrees(rest):
                 return sample.time_s
-        self._trouble.append(f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop")
+        if observer.doubt is not None and not observer.believable:
+            self._trouble.append(
+                f"standstill cannot be confirmed: {observer.doubt.what}. The drive was not disabled"
+            )
+        elif patience.waited_s:
+            self._trouble.append(
+                f"the shaft was not seen at rest within {patience.waited_s:.1f} s of the quick stop"
+            )
         return None
+
+    def _ask_position(self, now_s: float) -> None:
+        """A position that does not come with the cycle: one question beside it, now and then."""
+        drive = self._loop.drive
+        coming = self._loop.guard.observer.heard_position(now_s, 2.0 * POSITION_EVERY_S)
+        if coming or now_s < self._position_due_s or not isinstance(drive, Positioned) or not self._fed:
+            return
+        self._position_due_s = now_s + POSITION_EVERY_S
+        try:
+            reading = drive.read_position()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return
+        if reading is not None:
+            self._loop.guard.observer.see_reading(reading)
+
+    def _poll_agrees(self, rest: Standstill) -> bool:
+        """Before the drive is disabled, a single request must show standstill too, where the drive answers it."""
+        drive = self._loop.drive
+        if self._polls.standing or not isinstance(drive, Polled):
+            return True
+        try:
+            sample = drive.poll()
+        except BaseException as error:  # whatever it is, the stop goes on
+            self._note(error)
+            return True
+        if sample is None or rest.quiet(sample):
+            return True
+        self._trouble.append(
+            f"the cycle reports standstill, a single request {sample.speed_rad_s:.3f} rad/s: the drive was not disabled"
+        )
+        return False
+
+    def _removes_torque(self, sample: Sample) -> bool:
+        """Switch the torque of a shaft off that accelerates against the quick stop.
+
+        See `docs/decisions` for when that is done above a drill string.
+        """
+        how = self._loop.guard.observer.runs_away(sample)
+        if not how:
+            return False
+        self._trouble.append(
+            f"torque removed: the shaft accelerates against the quick stop ({how}). It runs out without a brake"
+        )
+        drive = self._loop.drive
+        self._torque_removed = self._disable(drive.remove_torque if isinstance(drive, RemovesTorque) else drive.disable)
+        return True
 
     def _leave_to_watchdog(self, sample: Sample) -> bool:
         """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
         drive = self._loop.drive
+        # The drive's watchdog brakes by the same speed signal: with that in doubt the torque is watched from here.
+        doubt = self._loop.guard.observer.doubt
+        if doubt is not None and Signal.ALL not in doubt.signals:
+            return False
         if not (self._fed and self._watched and isinstance(drive, StopsFeeding)):
             return False
         try:
@@ -411,10 +517,10 @@ class StopSequence:
         )
         return True
 
-    def _disable(self) -> bool:
-        asked = self._ask(self._loop.drive.disable)
+    def _disable(self, request: Callable[[], None]) -> bool:
+        asked = self._ask(request)
         for _ in range(self._loop.cycles(3.0)):
-            asked = asked or self._ask(self._loop.drive.disable)
+            asked = asked or self._ask(request)
             sample = self._exchange(_REST, or_poll=True)
             if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
@@ -437,7 +543,7 @@ class StopSequence:
             apart_s = sample.time_s - heard_s if self._polls.standing else 0.0
             quiet_s += max(self._loop.period_s, min(self._longest_gap_s, apart_s))
             heard_s = sample.time_s
-            if not abs(sample.speed_rad_s) <= self._at_rest_rad_s:
+            if not abs(self._loop.guard.observer.speed_rad_s(sample)) <= self._at_rest_rad_s:
                 quiet_s = 0.0
                 if not told:
                     told = True
@@ -471,6 +577,8 @@ class StopSequence:
             self._note(error)
         if sample is None or not sample.fresh or (or_poll and self._polls.only):
             sample = self._poll() if or_poll else None
+            if sample is not None:
+                self._loop.guard.observer.see(command, sample)
         else:
             self._polls.heard()
             self._slowing.reset()
@@ -506,7 +614,8 @@ class StopSequence:
         if sample is None or told is None:
             return False
         rest = self._at_rest_rad_s
-        self._polls.only = abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest
+        other_state = sample.state in _STOPPING and told.state not in _STOPPING
+        self._polls.only = other_state or (abs(sample.speed_rad_s) <= rest and not abs(told.speed_rad_s) <= rest)
         if self._polls.only:
             self._held.clear()
             self._trouble.append(

@@ -191,7 +191,8 @@ class Outcome(StrEnum):
     NOT_FOUND = "not_found"
     """No critical speed: the bit did not stick, or never turned."""
     INVALID = "invalid"
-    """What turned was not the string: the torque limit acted, or the rig isn't the one that was identified."""
+    """What turned was not the string: the torque limit acted, the rig isn't the one that was identified, or the drive's
+    torque signals contradict each other."""
 
 
 @dataclass(frozen=True)
@@ -231,8 +232,11 @@ FOREIGN_SHARE = 0.1
 """Of the torque that moves the shaft, that may be unknown: more, and the rig isn't the one that was identified."""
 
 
-def evaluate(rows: Array, case: EvaluationCase, program: Program) -> Evaluation:
-    """What the log of a run shows. ValueError where no row is there."""
+def evaluate(rows: Array, case: EvaluationCase, program: Program, contradiction: str = "") -> Evaluation:
+    """What the log of a run shows. ValueError where no row is there.
+
+    ``contradiction``: how the drive's torque signals contradict each other, if they do; then nothing is as predicted.
+    """
     if not len(rows):
         raise ValueError("the virtual string was never turned")
     column = {name: rows[:, number] for number, name in enumerate(COLUMNS)}
@@ -256,6 +260,8 @@ def evaluate(rows: Array, case: EvaluationCase, program: Program) -> Evaluation:
     foreign = unknown / max(1e-9, float(np.sqrt(np.mean(net[coupled] ** 2)))) if coupled.any() else 0.0
     reached = float(set_rad_s.max())
     outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached)
+    if contradiction:
+        outcome, why = Outcome.INVALID, contradiction
     return Evaluation(
         outcome, why, critical, ramp, trials, _rms(column["drive_nm"][holding]),
         _rms(column["drive_nm"][steady][-round(10.0 / period_s) :]), None if decay is None else decay[0],

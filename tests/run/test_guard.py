@@ -364,7 +364,8 @@ def test_a_torque_offset_moves_the_shaft_from_its_reference_and_the_window_is_he
 
 def test_feedback_that_stands_still_while_the_torque_offset_moves_is_none():
     watch = guard()
-    watch.expected, watch.torque_offset_nm = PowerState.ENABLED, 20.0
+    watch.expected = PowerState.ENABLED
+    watch.allow_torque_offset(20.0)
     with pytest.raises(CommunicationLost, match="frozen"):
         for cycle in range(200):
             command = OFFSET._replace(torque_offset_nm=0.1 * cycle)

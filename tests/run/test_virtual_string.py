@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.drive import Mode
-from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRefused
+from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRefused, ReportsContradict
 from tdhil.run.runner import Runner
 from tdhil.run.settings import ExcitationRequest
 from tdhil.run.task import Task
@@ -97,8 +97,8 @@ def frozen(first):
 
 
 @pytest.mark.parametrize(("name", "cause", "said"), [
-    ("powerless", LimitHit, "does not do what its torque says|the loop swings"),
-    ("frozen", (LimitHit, CommunicationLost), "frozen|does not do"),
+    ("powerless", ReportsContradict, "does not do what the torque accounts for|contradict each other"),
+    ("frozen", (ReportsContradict, CommunicationLost), "frozen|does not do"),
     ("deaf", CommunicationLost, "no feedback"),
     ("off", DriveFault, "left the state"),
 ])

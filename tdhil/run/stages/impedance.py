@@ -116,7 +116,7 @@ def run_pilot(
         loop.cycle(Command(Mode.SPEED, transition.reference(step * loop.period_s)[0], 0.0))
     steady = Command(Mode.SPEED, mean, 0.0)
     wait_until_steady(loop, steady, mean, max(2.0 * speed_resolution_rad_s, 0.01 * mean), timeout_s=60.0)
-    loop.guard.torque_offset_nm = largest_offset_nm(limits)
+    loop.guard.allow_torque_offset(largest_offset_nm(limits))
     size = PILOT_SHARE * limits.torque_nm / _peak(np.ones(len(HARMONICS)), PHASES_RAD)
     drive = _Drive(loop, _Wave(np.full(len(HARMONICS), size), PHASES_RAD, mean, speed_resolution_rad_s))
     seen = drive.run(PILOT_PERIODS * PERIOD_S, fade_in_s=PERIOD_S)

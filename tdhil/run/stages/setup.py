@@ -17,6 +17,8 @@ from tdhil.run.stages.steady import trace
 STANDSTILL_S = 1.0
 RAMP_S = 5.0
 """The probe torque is reached after this long, if nothing moves before."""
+TORQUE_SEEN_S = 0.5
+"""A torque beyond the probe's, in speed mode, ends it after so long; and the torque is off again after so long, s."""
 
 
 def measure_offsets(loop: ControlLoop, limits: MachineLimits) -> tuple[float, float]:
@@ -41,6 +43,7 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
     recent: deque[float] = deque(maxlen=loop.cycles(0.1))
     travel_rad = 0.0
     torque_nm = speed_rad_s = 0.0
+    strained = 0
     before_s = loop.enable(mode, Command(mode, 0.0, 0.0)).time_s
     for step in range(1, loop.cycles(RAMP_S + 2.0) + 1):
         share = min(1.0, step * loop.period_s / RAMP_S)
@@ -62,11 +65,18 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
             raise _wrong_way(mean_rad_s)
         if mean_rad_s > threshold_rad_s:
             return torque_nm if mode is Mode.TORQUE else None
+        # In speed mode the drive itself raises the torque: no further than the probe may go.
+        if mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0:
+            strained = strained + 1
+            if strained >= loop.cycles(TORQUE_SEEN_S):
+                break
         if abs(travel_rad) > limits.probe_travel_rad:
+            _end_torque(loop, mode)
             raise PreflightRefused(
                 f"the shaft travelled {travel_rad:.2f} rad without a clear direction", where="sign probe",
                 next_step="Is the speed signal noisy, or its scale wrong?",
             )
+    _end_torque(loop, mode)
     raise PreflightRefused(
         f"the shaft did not move up to {limits.probe_torque_nm:g} N·m"
         if mode is Mode.TORQUE
@@ -76,6 +86,12 @@ def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resol
         if mode is Mode.TORQUE
         else "Is the brake released, the drive's enable there, and its lowest speed below this one?",
     )
+
+
+def _end_torque(loop: ControlLoop, mode: Mode) -> None:
+    """Command zero torque before the stop: its speed control would go on with the torque that flows."""
+    if mode is Mode.TORQUE:
+        loop.hold(Command(Mode.TORQUE, 0.0, 0.0), TORQUE_SEEN_S)
 
 
 def _wrong_way(speed_rad_s: float) -> PreflightRefused:

@@ -191,7 +191,8 @@ def run_speed(
         _course(low_samples, ramped, high_held, mean_speeds(limits)),
         swing,
     )
-    loop.guard.model, loop.guard.disturbed = model, result.disturbed
+    loop.guard.know(model)
+    loop.guard.disturbed = result.disturbed
     return result
 
 

@@ -117,7 +117,8 @@ def run_virtual_string(
     torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
     host.begin(speed, torque)
     if case.own_loop:
-        torque, loop.guard.torque_offset_nm = 0.0, limits.torque_nm
+        torque = 0.0
+        loop.guard.allow_torque_offset(limits.torque_nm)
     phase: Phase = host.phase
     clamped = False
     while host.phase is not Phase.DONE:
@@ -150,6 +151,7 @@ class _Watch:
         resolution_rad_s: float, noise_rad_s: float,
     ) -> None:
         assert case.string.bit is not None
+        self._observer = loop.guard.observer
         self._strange_rad_s = max(
             STRANGE_SHARE * limits.speed_max_rad_s, STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s
         )
@@ -162,13 +164,7 @@ class _Watch:
 
     def see(self, host: HostLoop, sample: Sample) -> None:
         where = f"virtual string at {sample.time_s:.3f} s"
-        apart = abs(host.innovation_rad_s) * self._gear
-        if not apart <= self._strange_rad_s:
-            raise LimitHit(
-                f"the shaft does not do what its torque says: {apart:.2f} rad/s away from what was expected",
-                where=where, next_step="The shaft was stopped. Is the torque lost or limited, or is this another rig "
-                "than the one that was identified?",
-            )
+        self._observer.expected(host.innovation_rad_s * self._gear, self._strange_rad_s, sample)
         if not host.put_in_j <= self._most_j:
             raise LimitHit(
                 f"the loop's errors have put {host.put_in_j:.0f} J into the shaft", where=where,
