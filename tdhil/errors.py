@@ -9,7 +9,8 @@
     │   └── DriveHeld               in `tdhil.session`: another process has the drive; names it  4
     ├── CommunicationLost           no statusword for 5 cycles; adapter unplugged                5
     ├── DriveFault                  EMCY 7305h in motion; state machine stuck                    6
-    │   └── ModeNotConfirmed        6061h did not follow 6060h in time                           6
+    │   ├── ModeNotConfirmed        6061h did not follow 6060h in time                           6
+    │   └── ReportsContradict       reported speed and reported torque cannot both be true       6
     ├── LimitHit                    speed left its window; torque or time limit reached          7
     ├── StopNotConfirmed            the shaft was not seen at rest after the stop sequence       8
     ├── CommandRejected             a NaN setpoint; never reached the bus, and a mistake of ours 1
@@ -19,7 +20,7 @@
     │   ├── LogRefused              too little space to begin with; nothing moved                4
     │   └── NothingRecoverable      not one message of the file can be read                     10
     ├── TuningRefused               `tdhil tune`: such gains would make the string swing        11
-    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT, SIGTSTP (143)
+    └── Interrupted                 Ctrl-C (130); SIGTERM, SIGHUP, SIGQUIT, SIGTSTP (143); signal n (128 + n)
 
 Codes 3 (partial result) and 9 (not identifiable, model rejected) belong to results, which are no errors; a log that
 broke off ends with 3 as well, since what it holds can be replayed.
@@ -38,6 +39,9 @@ from drivers import (
     StopNotConfirmed,
     TdhilError,
 )
+
+SIGNALS, HIGHEST_SIGNAL = 128, 64
+"""An exit code above the first says which signal ended the process."""
 
 
 class ExitCode(IntEnum):
@@ -58,6 +62,15 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130           # Ctrl-C (SIGINT)
     TERMINATED = 143            # SIGTERM, SIGHUP, SIGQUIT (Ctrl-\), SIGTSTP (Ctrl-Z)
 
+    @classmethod
+    def _missing_(cls, value: object) -> "ExitCode | None":
+        """128 + n for any other signal that ended a run, as shells have it."""
+        if not (isinstance(value, int) and SIGNALS < value <= SIGNALS + HIGHEST_SIGNAL):
+            return None
+        member = int.__new__(cls, value)
+        member._name_, member._value_ = f"SIGNAL_{value - SIGNALS}", value
+        return member
+
 
 class UsageError(TdhilError):
     """The command line asks for something that can't be, or for two things that exclude each other."""
@@ -70,13 +83,27 @@ class Interrupted(TdhilError):
     """
 
     def __init__(self, number: int, why: str = "", *, next_step: str = "") -> None:
-        self.signal = signal.Signals(number)
-        how = "Ctrl-C" if self.signal is signal.SIGINT else self.signal.name
+        self.signal = int(number)
+        how = "Ctrl-C" if number == signal.SIGINT else _signal_name(self.signal)
         super().__init__(f"interrupted: {why}" if why else f"interrupted by {how}", next_step=next_step)
 
     @property
     def exit_code(self) -> ExitCode:
-        return ExitCode.INTERRUPTED if self.signal is signal.SIGINT else ExitCode.TERMINATED
+        """130 for Ctrl-C, 143 for those that ask a program to end, 128 + n for any other."""
+        if _signal_name(self.signal) in _ASK_TO_END:
+            return ExitCode.TERMINATED
+        return ExitCode(SIGNALS + self.signal)
+
+
+_ASK_TO_END = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")
+
+
+def _signal_name(number: int) -> str:
+    """Its name; real-time signals have none."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 _CODES: dict[type[BaseException], ExitCode] = {
@@ -95,7 +122,7 @@ _VALUES = frozenset(int(code) for code in ExitCode)
 def exit_code(error: BaseException) -> ExitCode:
     """The exit code for ``error``: its own attribute, else that of its nearest class in the table, else 1."""
     own = getattr(error, "exit_code", None)
-    if isinstance(own, int) and own in _VALUES:
+    if isinstance(own, int) and (own in _VALUES or isinstance(own, ExitCode)):
         return ExitCode(own)
     for kind in type(error).__mro__:
         if kind in _CODES:

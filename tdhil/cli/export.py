@@ -20,7 +20,7 @@ SUFFIXES: Final = {"candump": ".log", "asc": ".asc", "csv": ".csv", "parquet": "
 COLUMNS: Final = (
     "time_s", "speed_rad_s", "torque_nm", "torque_demand_nm", "commanded_speed_rad_s", "commanded_torque_nm",
     "mode", "state", "status", "fresh", "limit_active", "standstill", "age_s", "half_width_s",
-    "simulated",
+    "simulated", "position_rad",
 )
 """Of a table; the first three are what `tdhil replay` reads of a CSV."""
 
@@ -112,6 +112,7 @@ def _rows(path: Path, simulated: int) -> Iterator[tuple[Any, ...]]:
             one.time_s, one.speed_rad_s, one.torque_nm, one.torque_demand_nm, speed, torque,
             None if one.mode is None else one.mode.value, one.state.value, one.status, int(one.fresh),
             int(one.limit_active), int(one.standstill), one.age_s, one.half_width_s, simulated,
+            one.position_rad,
         )
 
 

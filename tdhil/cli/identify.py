@@ -19,7 +19,7 @@ from tdhil.session import PeerPlan, bus_kinds
 if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
     from tdhil.run import RunOutcome
-    from tdhil.session import Connection, RunRequest
+    from tdhil.session import Connection, Ending, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
 
 
@@ -199,16 +199,25 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
 
 
 def _run(request: RunRequest, console: Console, report: Path | None) -> int:
-    from tdhil.cli.results import print_result, save_report
-    from tdhil.session import RunSession, TerminalAttendant
+    import tdhil.cli.main as entry
+    from tdhil.session import Ending, RunSession, TerminalAttendant
 
     options = request.options
     attendant = TerminalAttendant(
         console, yes=options.yes, gear_ratio=1.0 if request.rig is None else request.rig.gear.ratio
     )
-    session = RunSession(request, attendant, report=report is not None)
+    with Ending(own_process=entry.process.own) as ending:
+        session = RunSession(request, attendant, report=report is not None)
+        return ending.code(_finish(session, ending, options, console, report))
+
+
+def _finish(
+    session: RunSession, ending: Ending, options: RunOptions, console: Console, report: Path | None
+) -> int:
+    from tdhil.cli.results import print_result, save_report
+
     try:
-        outcome = session.move()
+        outcome = session.move(ending.request)
         document: dict[str, Any] | None = None
         if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
             code = _failed(outcome, str(session.path), options.json, console)
@@ -217,8 +226,10 @@ def _run(request: RunRequest, console: Console, report: Path | None) -> int:
                 found = session.conclude()
             document, code = found.document, int(found.exit_code)
     except BaseException:
+        ending.calm()
         session.abandon()
         raise
+    ending.calm()
     try:
         if document is not None:
             print_result(document, options.json)

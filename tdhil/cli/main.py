@@ -7,11 +7,13 @@ import errno
 import json
 import logging
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
+from types import SimpleNamespace
 from typing import NoReturn
 
 from tdhil.cli.streams import sheltered
@@ -43,6 +45,10 @@ _COMMANDS = {
 }
 
 
+process = SimpleNamespace(own=False)
+"""``own``: this process is the command's own, and nothing but its end follows; set by `console`."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; the exit code (`tdhil.errors.ExitCode`). No traceback for anything a user can cause."""
     namespace = argparse.Namespace()
@@ -52,6 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             code = _main(arguments, namespace)
             sys.stdout.flush()
         except KeyboardInterrupt:
+            _hear_no_more()
             print("tdhil: interrupted", file=sys.stderr)  # noqa: T201
             return 130
         except BrokenPipeError:
@@ -153,6 +160,12 @@ def _report(error: Exception, as_json: bool) -> int:
     return int(code)
 
 
+def _hear_no_more() -> None:
+    """The process ends with its code, however often Ctrl-C is pressed meanwhile."""
+    if process.own:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def leave(code: int) -> NoReturn:
     """The end of the process, at once also where arithmetic that was left alone goes on in a thread."""
     background = sys.modules.get("tdhil.run.background")
@@ -166,7 +179,13 @@ def leave(code: int) -> NoReturn:
 
 def console() -> NoReturn:
     """`tdhil` in a shell."""
-    leave(main())
+    process.own = True
+    try:
+        code = main()
+    except KeyboardInterrupt:          # a second one, while the first was handled
+        code = int(ExitCode.INTERRUPTED)
+    _hear_no_more()
+    leave(code)
 
 
 if __name__ == "__main__":

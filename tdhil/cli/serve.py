@@ -38,9 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--allowed-host", action="append", default=[], metavar="NAME",
                         help="another name that browsers know this host by; again for more")
     parser.set_defaults(run=run)
-    kinds = parser.add_subparsers(dest="kind", metavar="users|tokens")
+    kinds = parser.add_subparsers(dest="kind", metavar="users|tokens|audit")
     _add_accounts(kinds, "users", "people, who log in with a password", passwd=True)
     _add_accounts(kinds, "tokens", "machines, which send a token", passwd=False)
+    audit = kinds.add_parser("audit", allow_abbrev=False, help="check the audit's chain, and print its head to be kept",
+                             description="Check the audit's chain, and print its head (NUMBER:HASH). Keep it on another"
+                             " computer.")
+    audit.add_argument("--head", metavar="NUMBER:HASH", help="a head that was kept: the chain must have it")
+    audit.add_argument("--data", type=Path, metavar="DIR", default=argparse.SUPPRESS,
+                       help=f"the service's folder (default: {DATA})")
+    audit.set_defaults(run=run_audit)
 
 
 def _add_accounts(kinds: argparse._SubParsersAction[argparse.ArgumentParser], kind: str, what: str, *, passwd: bool,
@@ -126,6 +133,28 @@ def run_accounts(namespace: argparse.Namespace) -> int:
     if first:
         print("From now on tdhil serve asks for a login on this folder, and needs --tls-cert and --tls-key.",  # noqa: T201
               file=sys.stderr)
+    return 0
+
+
+def run_audit(namespace: argparse.Namespace) -> int:
+    """Print the head of the audit's chain. Raises LogBroken where the chain doesn't hold."""
+    from tdhil.errors import LogBroken
+    from tdhil.service import Audit, Head, require_folder
+
+    require_folder(namespace.data)
+    audit = Audit(namespace.data.resolve() / "audit")
+    kept = None if namespace.head is None else Head.of(namespace.head)
+    if (broken := audit.verify(kept)) is not None:
+        place = f"{broken.file}:{broken.line}" if broken.file else str(namespace.data)
+        raise LogBroken(f"the audit's chain doesn't hold: {broken.why}", where=place,
+                        next_step="Keep the folder as it is. Compare it with a backup")
+    head, made = audit.head(), audit.made()
+    if head is None:
+        print("The audit has no line yet.", file=sys.stderr)  # noqa: T201
+        return 0
+    print(f"The chain holds: {head.number} lines, its key was made {made}. Keep this head on another computer:",  # noqa: T201
+          file=sys.stderr)
+    print(head)  # noqa: T201
     return 0
 
 

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     )
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
-        EXCITATIONS as EXCITATIONS, MODELS as MODELS, has_plateaus as has_plateaus, imported as imported, load as load,
+        EXCITATIONS as EXCITATIONS, MODELS as MODELS, SPEED_UNIT_TOLERANCE as SPEED_UNIT_TOLERANCE,
+        has_plateaus as has_plateaus, imported as imported, load as load,
         told_before_echo as told_before_echo,
     )
     from tdhil.config.rig import (

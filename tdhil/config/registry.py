@@ -93,6 +93,11 @@ def names(registry: Mapping[str, Entry], *, periodic: bool = False) -> list[str]
     return [name for name, entry in registry.items() if entry.periodic or not periodic]
 
 
+SPEED_UNIT_TOLERANCE = 0.1
+"""Of one, that the ratio of the shaft's angle to the integral of its reported speed may differ by. Encoders, gears and
+slip of sound rigs are within a few per cent; units that are wrong are off by 2, 4, 2π, 10, 60."""
+
+
 def has_plateaus(excitation: str) -> bool:
     """Does the speed rest at levels within a period? Not of an excitation that nobody knows any more."""
     return excitation in EXCITATIONS and EXCITATIONS[excitation].plateaus

@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any, Final
 
+from tdhil.csv_text import cell_of, text_of
 from tdhil.errors import LogBroken, LogUnopened, UsageError
 from tdhil.fleet.rows import COLUMNS, FleetRow, row_from_json
 
@@ -206,6 +207,8 @@ def _cell(value: Any) -> str:
     """Numbers as Python writes them: read back, they are the same to the last bit."""
     if isinstance(value, bool):
         return "true" if value else "false"
+    if isinstance(value, str):
+        return cell_of(value)
     return "" if value is None else repr(float(value)) if isinstance(value, float) else str(value)
 
 
@@ -218,6 +221,8 @@ def _read_csv(path: Path) -> list[dict[str, Any]]:
 def _value(kind: type, text: str) -> Any:
     if text == "":
         return None
+    if kind is str:
+        return text_of(text)
     return text == "true" if kind is bool else kind(text)
 
 

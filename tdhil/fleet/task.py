@@ -21,7 +21,7 @@ from tdhil.version import __version__
 if TYPE_CHECKING:
     from tdhil.session import RunRecord
 
-_CACHE_FORMAT: Final = 1
+_CACHE_FORMAT: Final = 2
 _BLOCK: Final = 2**20
 
 

@@ -45,6 +45,7 @@ def result_document(
         "impedance": None if found.impedance is None else asdict(found.impedance) | {
             "verdict": found.impedance.verdict.value
         },
+        "torque_ratios": [asdict(ratio) for ratio in found.torque_ratios],
         "lines": [asdict(line) for line in found.lines],
         "periods_used": found.periods_used,
         "samples_used": found.samples_used,

@@ -29,7 +29,7 @@ from starlette.responses import Response
 from tdhil.errors import TdhilError
 from tdhil.service.accounts import ROLES, Accounts, AccountsFile, Role, matches, role_at_least
 from tdhil.service.answers import CSRF_HEADER
-from tdhil.service.states import NotAllowed, NotLoggedIn, TooManyTries
+from tdhil.service.states import NotAllowed, NotLoggedIn, TooManyRuns, TooManyTries
 from tdhil.service.store import read_json, write_json
 
 SESSION_S: Final = 12 * 3600.0
@@ -126,6 +126,46 @@ class Tries:
                 self._good.clear()
             self._good.add((name, address))
             self._tried.pop(("pair", name, address), None)
+
+
+class Pace:
+    """How many runs that show a code may be requested: by one user, and from one address.
+
+    A run takes three wrong codes. So a user has at most 120 tries a day for one of a million codes, and each run that
+    was requested is on the terminal at the rig and in the audit.
+    """
+
+    LIMITS: Final = ((600.0, 10, 30), (86_400.0, 40, 120))
+    """(window in s, runs of a user, runs of an address)."""
+    _MOST = 10_000
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._begun: dict[tuple[str, str], deque[float]] = {}
+        self._lock = threading.Lock()
+
+    def begin(self, who: str, address: str, rig: str) -> None:
+        """Count one. Raises TooManyRuns; then it doesn't count."""
+        with self._lock:
+            now_s = self._clock()
+            longest_s = self.LIMITS[-1][0]
+            if len(self._begun) > self._MOST:
+                self._begun = {key: times for key, times in self._begun.items() if now_s - times[-1] < longest_s}
+            wait_s, counts = 0.0, []
+            for key in (("user", who), ("address", address)):
+                times = self._begun.get(key, deque())
+                counts.append((key, times))
+                for window_s, of_user, of_address in self.LIMITS:
+                    most = of_user if key[0] == "user" else of_address
+                    if len(times) >= most:
+                        wait_s = max(wait_s, window_s - (now_s - times[-most]))
+            if wait_s > 0.0:
+                raise TooManyRuns(max(wait_s, 1.0), rig)
+            for key, times in counts:
+                times.append(now_s)
+                while now_s - times[0] >= longest_s:
+                    times.popleft()
+                self._begun[key] = times
 
 
 class Access:

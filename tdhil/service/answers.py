@@ -14,10 +14,11 @@ from typing import Any, ClassVar, Final, Literal
 from pydantic import ConfigDict, TypeAdapter
 
 from tdhil.service.accounts import Role
+from tdhil.service.audit import Broken, Entry
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.states import Check, Confirmation, Entered, State, Stop, Told, Watch
-from tdhil.service.store import Broken, Entry, Summary
+from tdhil.service.store import Summary
 from tdhil.version import __version__
 
 # mypy takes these for plain dataclasses; pydantic makes the schemas from their annotations.
@@ -169,15 +170,21 @@ class LeaseView:
 
 @dataclass(frozen=True)
 class AuditView:
-    """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold."""
+    """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold.
+
+    ``head``: the last line as NUMBER:HASH, to be kept on another computer and sent as ``head`` later; None where the
+    chain's end doesn't hold. ``key_made``: when the chain's key was made.
+    """
 
     entries: list[Entry]
     broken: Broken | None
+    head: str | None = None
+    key_made: str | None = None
 
 
 @dataclass(frozen=True)
 class HealthView:
-    """Is it there, and what is it doing?"""
+    """Is it there, and what is it doing? ``live``: the runs that have not ended; empty for who is not logged in."""
 
     status: Literal["ok"]
     version: str
@@ -383,9 +390,10 @@ ROUTES: Final = (
     Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
           OPTIONS, (403, 404, 409, 422)),
     Route("POST", "/rigs/{rig}/runs", "start", "Ask for a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
-          (403, 404, 409, 422), headers={"Idempotency-Key": "the same key gives the same run, and no second one"}),
-    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without one, tdhil stop on its drive", "viewer",
-          {200: StoppedView}, Nothing, (403, 404, 503)),
+          (403, 404, 409, 422, 429, 503, 507),
+          headers={"Idempotency-Key": "the same key gives the same run, and no second one"}),
+    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without one, tdhil stop on its drive, which"
+          " takes an operator where no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
     Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
           query={"rig": "of this rig only", "state": "in this state only", "limit": "at most so many (100)"}),
     Route("GET", "/runs/compare", "compare", "Runs side by side", "viewer", {200: CompareView}, errors=(404, 422),
@@ -396,7 +404,7 @@ ROUTES: Final = (
     Route("POST", "/runs/{run}/lease", "renew", "Say, once a second, that the page of a watched run is seen",
           "operator", {200: LeaseView}, LeaseBody, (403, 404, 409, 422, 503)),
     Route("POST", "/runs/{run}/stop", "stop", "Have it brake. This is no emergency stop", "viewer", {200: RunView},
-          Nothing, (403, 404, 503)),
+          Nothing, (403, 404, 503, 504)),
     Route("POST", "/runs/{run}/sign-off", "sign_off", "Take a stop that wasn't confirmed upon oneself", "engineer",
           {200: RunView}, SignOffBody, (403, 404, 409, 422)),
     Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result stays", "operator",
@@ -432,7 +440,7 @@ ROUTES: Final = (
     Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table", "viewer",
           _file("text/csv"), errors=(404,), headers=_RANGE),
     Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
-          query={"limit": "at most so many lines (200)"}),
+          query={"limit": "at most so many lines (200)", "head": "NUMBER:HASH of before, which the chain must have"}),
     Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,
           (401, 403, 422, 429)),
     Route("POST", "/logout", "logout", "End the session", None, {200: MeView}, Nothing, (403, 422)),

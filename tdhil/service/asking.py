@@ -279,12 +279,16 @@ def binding_of(request: RunRequest, rig_sha256: str, preflight: Any, plan: Mappi
     return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()
 
 
+def is_as_it_was(path: Path, sha256: str) -> bool:
+    """Is the rig's file still there, with the content of this hash?"""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+    except OSError:
+        return False
+
+
 def refuse_changed(path: Path, sha256: str) -> None:
     """The rig's file is what it was when the run was asked for. Raises PreflightRefused."""
-    try:
-        same = hashlib.sha256(path.read_bytes()).hexdigest() == sha256
-    except OSError:
-        same = False
-    if not same:
+    if not is_as_it_was(path, sha256):
         raise PreflightRefused("the rig's file was changed after the run was asked for", where=path.name,
                                next_step="Ask for it again; nothing has moved")

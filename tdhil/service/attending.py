@@ -80,6 +80,11 @@ class Board:
     def stop(self, **known: Any) -> None:
         self.change(lambda status: replace(status, stop=replace(status.stop, **known)))
 
+    def stop_seen(self) -> None:
+        """Note when the drive first answered a stop; a later stop leaves that time as it is."""
+        at = now()
+        self.change(lambda status: replace(status, stop=replace(status.stop, seen=status.stop.seen or at)))
+
     def close(self) -> None:
         """All of it is written, or can't be."""
         self._end = True
@@ -147,6 +152,7 @@ class Watcher:
         who = preflight.identity
         self._board.know(
             preflight=checks, simulated=who.simulated, identity=visible(who.name),
+            identity_numbers=(who.vendor, who.product, who.revision, who.serial),
             safe_action=preflight.safe_action.replace("_", " "),
         )
 
@@ -170,7 +176,7 @@ class Watcher:
             sample.state is PowerState.QUICK_STOP or (command.mode is Mode.SPEED and command.speed_rad_s == 0.0)
         ):
             self._looking = False
-            self._board.stop(seen=now())
+            self._board.stop_seen()
 
     def planned(self, plan: Any) -> None:
         expected_s = float(plan.duration_s) + 5.0

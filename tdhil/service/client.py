@@ -172,8 +172,10 @@ class Client:
                 file.write(piece)
         return target
 
-    def audit(self, limit: int = 200) -> dict[str, Any]:
-        return self._object("GET", f"/audit?limit={limit}")
+    def audit(self, limit: int = 200, *, head: str | None = None) -> dict[str, Any]:
+        """The latest lines, and whether the chain holds. ``head``: one that was kept, which the chain must have."""
+        asked = {"limit": limit} if head is None else {"limit": limit, "head": head}
+        return self._object("GET", f"/audit?{urlencode(asked)}")
 
     def _object(
         self, method: str, path: str, body: Mapping[str, Any] | None = None, headers: Mapping[str, str] | None = None

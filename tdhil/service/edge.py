@@ -22,7 +22,16 @@ from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
 from tdhil.service.access import Access, token_in
 from tdhil.service.answers import OPTIONS, ErrorView, Route, adapter, plain
-from tdhil.service.states import Conflict, NotAllowed, NotLoggedIn, NotThere, Told, TooManyTries
+from tdhil.service.states import (
+    Conflict,
+    NoRoom,
+    NotAllowed,
+    NotLoggedIn,
+    NotReacting,
+    NotThere,
+    Told,
+    TooManyTries,
+)
 from tdhil.service.wire import Refused
 
 if TYPE_CHECKING:
@@ -125,8 +134,8 @@ def status_of(error: BaseException) -> int:
         return int(error.status_code)
     for kind, status in (
         (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
-        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (CommunicationLost, 503),
-        (LogError, 503),
+        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (NotReacting, 504), (CommunicationLost, 503),
+        (NoRoom, 507), (LogError, 503),
     ):
         if isinstance(error, kind):
             return status

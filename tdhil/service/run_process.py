@@ -31,7 +31,7 @@ from tdhil.service.attending import (
     tell,
 )
 from tdhil.service.states import State, Status, Told, Watch, end_of, now, way_to
-from tdhil.service.store import Request, Store, read_json, write_json
+from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
 from tdhil.service.wire import STOP_FILE, Listener
 
 if TYPE_CHECKING:
@@ -130,12 +130,12 @@ class RunProcess:
 
     def _run(self) -> int:
         from tdhil.report import has_extra
-        from tdhil.session import RunSession
+        from tdhil.session import RunSession, kept_connection
 
         os.chdir(self.folder)
         path = Path(self.request.rig_file)
-        refuse_changed(path, self.request.rig_sha256)
         rig = read_rig(path)
+        refuse_changed(path, self.request.rig_sha256)      # after it was read: what was read is what was requested
         self.stop.check(next_step="Nothing has moved")
         self.board.to(State.PREFLIGHT)
         self._asked = asked = run_request(rig, self.request.options, left_in=self.store.folder)
@@ -147,6 +147,8 @@ class RunProcess:
             write_json(self.folder / "plan.json", self._plan)
             self.board.know(expected_half_width=self._plan["expected_half_width"],
                             expected_s={**EXPECTED_S, "acquire": self._plan["duration_s"] + 5.0})
+        if not asked.peer.embedded:        # before its bus is opened: a later stop goes to this drive and no other
+            write_json(self.folder / CONNECTION_FILE, kept_connection(asked.options, asked.connection))
         report = has_extra()
         self.stop.check(next_step="Nothing has moved")
         session = RunSession(asked, self.attendant, report=report)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,8 @@ from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     import uvicorn
+
+    from tdhil.service.door import Room
 
 NEEDED = ("starlette", "uvicorn", "websockets", "prometheus_client", "jinja2")
 HOST, PORT = "127.0.0.1", 8420
@@ -136,8 +139,10 @@ def serve(
 
     from tdhil.service.access import Access
     from tdhil.service.asking import Rigs
+    from tdhil.service.audit import Audit
+    from tdhil.service.door import Room, raise_limit
     from tdhil.service.mqtt import Broker, Publisher
-    from tdhil.service.store import Audit, Index, Store
+    from tdhil.service.store import Index, Store
     from tdhil.service.supervisor import Supervisor
     from tdhil.service.web import Web
 
@@ -146,6 +151,7 @@ def serve(
     store.prepare()
     alone = _alone(store.folder)
     supervisor = Supervisor(store, Rigs(rigs), Audit(store.folder / "audit"), Index(store), say=say)
+    room = Room.of(raise_limit())
     web = Web(supervisor, hosts=allowed, viewers=viewers, access=Access(store.folder, login=accounts, say=say),
               logs={str(one): one for one in logs})
     publisher = None if broker is None else Publisher(broker, web.told, say)
@@ -164,7 +170,7 @@ def serve(
     if publisher is not None:
         publisher.start()
     try:
-        _uvicorn(web.asgi, listening, supervisor.brake, say, tls)
+        _uvicorn(web.asgi, listening, supervisor.brake, say, tls, room)
     finally:
         if publisher is not None:
             publisher.close()
@@ -208,20 +214,37 @@ def check_idle(data: Path, say: Say) -> int:
 
 
 def _uvicorn(
-    app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say, tls: Tls | None = None
+    app: Any, listening: socket.socket, brake: Callable[[str], bool], say: Say, tls: Tls | None, room: Room
 ) -> None:
     import uvicorn
 
+    from tdhil.service.door import HEADER_LIMIT, Door
+
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_ping_interval=10.0,
-        ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on", server_header=False, date_header=True,
-        h11_max_incomplete_event_size=32 * 1024, proxy_headers=False,      # who asks is who is connected
+        app, log_level="warning", access_log=False, http="h11", ws="websockets-sansio",
+        ws_max_size=4096, ws_ping_interval=10.0, ws_ping_timeout=SILENT_S, timeout_graceful_shutdown=2, lifespan="on",
+        server_header=False, date_header=True,
+        h11_max_incomplete_event_size=2 * HEADER_LIMIT, proxy_headers=False,      # who asks is who is connected
         ssl_certfile=None if tls is None else tls.cert, ssl_keyfile=None if tls is None else tls.key,
     )
     if tls is not None:
         config.load()
         config.ssl = tls.context()             # the one that was looked at, with the ciphers of Python
-    server = uvicorn.Server(config)
+    door = Door(listening, room, say, tls=config.ssl if tls is not None else None)
+
+    class Server(uvicorn.Server):  # type: ignore[misc]
+        """uvicorn behind our own door: it accepts nothing itself."""
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets=[])
+            door.open(partial(config.http_protocol_class, config=config, server_state=self.server_state,
+                              app_state=self.lifespan.state))
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            door.close()
+            await super().shutdown(sockets)
+
+    server = Server(config)
     former = {number: signal.signal(number, _ender(server, brake, say)) for number in (signal.SIGINT, signal.SIGTERM)}
     object.__setattr__(server, "capture_signals", _nothing_captured)       # SIGTERM brakes before it ends anything
     try:
@@ -257,6 +280,8 @@ def _ender(server: uvicorn.Server, brake: Callable[[str], bool], say: Say) -> Ca
 
 
 def _listen(host: str, port: int) -> socket.socket:
+    from tdhil.service.door import BACKLOG
+
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     found = socket.socket(family, socket.SOCK_STREAM)
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -269,7 +294,7 @@ def _listen(host: str, port: int) -> socket.socket:
         raise UsageError(f"can't be listened on ({getattr(error, 'strerror', None) or error})",
                          where=f"{host}:{port}",
                          next_step="Is tdhil serve running already? Name another --port") from error
-    found.listen(128)
+    found.listen(BACKLOG)
     return found
 
 

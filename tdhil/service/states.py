@@ -17,8 +17,8 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
-from drivers import PreflightRefused
-from tdhil.errors import ExitCode, TdhilError
+from drivers import CommunicationLost, PreflightRefused
+from tdhil.errors import HIGHEST_SIGNAL, SIGNALS, ExitCode, TdhilError
 
 
 class State(StrEnum):
@@ -150,6 +150,7 @@ class Status:
     expected_s: Mapping[str, float] = field(default_factory=dict)     # of each stage, control time
     preflight: tuple[Check, ...] = ()
     identity: str = ""
+    identity_numbers: tuple[int, ...] = ()     # vendor, product, revision, serial; zeros where the drive has none
     safe_action: str = ""
     expected_half_width: float | None = None
     confirmation: Confirmation | None = None
@@ -202,6 +203,7 @@ class Status:
         ):
             if known.get(name) is not None:
                 known[name] = kind(**known[name])
+        known["identity_numbers"] = tuple(known.get("identity_numbers", ()))
         known["preflight"] = tuple(Check(**one) for one in known.get("preflight", ()))
         return Status(history=history, **known)
 
@@ -214,7 +216,7 @@ def end_of(exit_code: int, *, stop_confirmed: bool | None) -> State:
         return State.DONE
     if exit_code in (ExitCode.REFUSED, ExitCode.USAGE):
         return State.REFUSED
-    if exit_code in (ExitCode.INTERRUPTED, ExitCode.TERMINATED):
+    if SIGNALS < exit_code <= SIGNALS + HIGHEST_SIGNAL:
         return State.STOPPED
     return State.FAILED
 
@@ -250,6 +252,10 @@ def iso(time_s: float) -> str:
 #     ├── NotAllowed                  another host, another origin, not over HTTP, not his role exit 4, HTTP 403
 #     │   ├── NotLoggedIn             nobody knows who asks                                     exit 4, HTTP 401
 #     │   └── TooManyTries            of passwords; ``wait_s`` says how long                    exit 4, HTTP 429
+#     │       └── TooManyRuns         of those that show a code                                 exit 4, HTTP 429
+#     ├── NoRoom                      the disk is full                                          exit 4, HTTP 507
+#     ├── CommunicationLost
+#     │   └── NotReacting             the run's process stands still                            exit 5, HTTP 504
 #     └── PreflightRefused
 #         └── Conflict                another run has the rig; the code is void                 exit 4, HTTP 409
 
@@ -277,6 +283,26 @@ class TooManyTries(NotAllowed):
         self.wait_s = wait_s
         super().__init__("too many tries", where="login", next_step=f"Again in {wait_s:.0f} s."
                          " Who is logged in already can stop all the same; so does the hard-wired stop")
+
+
+class TooManyRuns(TooManyTries):
+    """Of those that show a code at the rig."""
+
+    def __init__(self, wait_s: float, rig: str) -> None:
+        NotAllowed.__init__(
+            self, "too many runs that show a code were requested", where=f"rig {rig}",
+            next_step=f"Nothing was started. Again in {wait_s:.0f} s, or run it at the rig: tdhil identify")
+        self.wait_s = wait_s
+
+
+class NoRoom(TdhilError):
+    """The disk is full."""
+
+    exit_code = ExitCode.REFUSED
+
+
+class NotReacting(CommunicationLost):
+    """The run's process stands still: what was asked of it is not done by it."""
 
 
 class Conflict(PreflightRefused):

@@ -2,14 +2,13 @@
 
 ::
 
-    runs/<id>/request.json, state.json, confirm.json, signed_off.json, result.json, run.mcap, report.html, replays/
-    audit/<year>-<month>.jsonl, audit/head.json
+    runs/<id>/request.json, state.json, connection.json, confirm.json, signed_off.json, result.json, run.mcap,
+              report.html, replays/
     index.sqlite
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -18,7 +17,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +30,8 @@ ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 _FILE_LIMIT: Final = 16 * 2**20
 RESERVE: Final = 2**16
 """Bytes of the disk that are kept for how a run ended."""
+CONNECTION_FILE: Final = "connection.json"
+"""In a run's folder: where its drive is, for a stop of it (`tdhil.session.kept`)."""
 _RESERVE, _USED = ".reserve", ".state.json"
 
 
@@ -243,112 +244,6 @@ class Store:
         folder = self.place(run) / "replays"
         found = [(path.stem, read_json(path)) for path in sorted(folder.glob("[0-9]*.json"))]
         return [(name, plain) for name, plain in found if plain is not None]
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Who asked, confirmed, stopped, downloaded, when. Each line bears the hash of the one before, and its own.
-
-
-FIRST: Final = "0" * 64
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One line. ``details`` is plain data."""
-
-    number: int
-    at: str
-    who: str
-    what: str
-    run: str | None
-    rig: str | None
-    details: Mapping[str, Any] = field(default_factory=dict)
-    before: str = FIRST
-    hash: str = ""
-
-    def hashed(self) -> Entry:
-        plain = {name: value for name, value in asdict(self).items() if name != "hash"}
-        found = hashlib.sha256(json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()).hexdigest()
-        return Entry(**{**plain, "hash": found})
-
-
-@dataclass(frozen=True)
-class Broken:
-    """Where the chain doesn't hold: the file, its line (from 1), and why."""
-
-    file: str
-    line: int
-    why: str
-
-
-class Audit:
-    """The chain of one service. Only one process writes it: the web."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._lock = threading.Lock()
-        self._last: tuple[int, str] | None = None
-
-    def note(
-        self, who: str, what: str, *, run: str | None = None, rig: str | None = None, **details: Any
-    ) -> None:
-        """Add a line, on the disk when this returns. Raises OSError."""
-        with self._lock:
-            number, before = self._last or self._end()
-            at = now()
-            entry = Entry(number + 1, at, who[:80], what, run, rig, details, before).hashed()
-            path = self._folder / f"{at[:7]}.jsonl"
-            with path.open("ab") as file:
-                file.write(json.dumps(asdict(entry), ensure_ascii=False).encode() + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-            self._last = (entry.number, entry.hash)
-            write_json(self._folder / "head.json", {"number": entry.number, "hash": entry.hash})
-
-    def entries(self) -> Iterator[Entry]:
-        """All that can be read, in order."""
-        for _, _, entry in self._lines():
-            if isinstance(entry, Entry):
-                yield entry
-
-    def verify(self) -> Broken | None:
-        """The first place where a line was changed, taken out or put in; None where the chain holds."""
-        number, before, at = 0, FIRST, ("", 0)
-        for file, line, entry in self._lines():
-            if isinstance(entry, str):
-                return Broken(file, line, entry)
-            if entry.number != number + 1 or entry.before != before:
-                return Broken(file, line, "it doesn't follow the line before")
-            if entry.hashed().hash != entry.hash:
-                return Broken(file, line, "it was changed after it was written")
-            number, before, at = entry.number, entry.hash, (file, line)
-        head = read_json(self._folder / "head.json")
-        told = (head or {}).get("number", 0)
-        if told == number - 1 or (told, (head or {}).get("hash", FIRST)) == (number, before):
-            return None        # a killed process may leave a line whose head wasn't written; never a head without it
-        return Broken(*at, f"the chain ends with line {number}, and its head says {told}")
-
-    def _end(self) -> tuple[int, str]:
-        last = (0, FIRST)
-        for entry in self.entries():
-            last = (entry.number, entry.hash)
-        return last
-
-    def _lines(self) -> Iterator[tuple[str, int, Entry | str]]:
-        for path in sorted(self._folder.glob("????-??.jsonl")):
-            with path.open("rb") as file:
-                for line, text in enumerate(file, start=1):
-                    yield path.name, line, _entry(text)
-
-
-def _entry(text: bytes) -> Entry | str:
-    try:
-        plain = json.loads(text)
-        if text != json.dumps(plain, ensure_ascii=False).encode() + b"\n":
-            return "it was changed after it was written"
-        return Entry(**plain)
-    except (ValueError, TypeError, RecursionError):
-        return "it can't be read"
 
 
 # ---------------------------------------------------------------------------------------------------------------------

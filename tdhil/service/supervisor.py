@@ -6,9 +6,12 @@ that was killed finds everything again, and nothing moves by that.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -22,11 +25,26 @@ from typing import Any, Final
 
 from drivers import CommunicationLost
 from tdhil.errors import ExitCode, LogError, UsageError
-from tdhil.service.asking import RigFile, Rigs, edited, options_of, require_motion
+from tdhil.service.access import Pace
+from tdhil.service.asking import RigFile, Rigs, edited, is_as_it_was, options_of, require_motion
+from tdhil.service.audit import Audit
 from tdhil.service.console import Console
-from tdhil.service.states import MAY_TURN, Conflict, NotThere, State, Status, Told, Watch, blocking, now, way_to
-from tdhil.service.store import Audit, Index, Request, Store, write_json, write_whole
-from tdhil.service.wire import STOP_FILE, Refused, ask, lives, signal_stop, take_life
+from tdhil.service.states import (
+    MAY_TURN,
+    Conflict,
+    NoRoom,
+    NotReacting,
+    NotThere,
+    State,
+    Status,
+    Told,
+    Watch,
+    blocking,
+    now,
+    way_to,
+)
+from tdhil.service.store import CONNECTION_FILE, Index, Request, Store, read_json, write_json, write_whole
+from tdhil.service.wire import STOP_FILE, Refused, ask, lives, send_signal, stands_still, take_life
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
@@ -37,6 +55,7 @@ STOP_S: Final = 60.0
 """What `tdhil stop` may take for a shaft that turns on."""
 KEYS: Final = 500
 """So many runs back an Idempotency-Key is known."""
+SIMULATED_STOP: Final = "nothing turns: the drive is simulated, and ended with its run"
 Say = Callable[[str], None]
 
 
@@ -56,17 +75,19 @@ class Supervisor:
         command: Callable[[Path], list[str]] | None = None,
     ) -> None:
         self.store, self.rigs, self.audit, self.index = store, rigs, audit, index
-        self._say = say
+        self.say = say
         self._command = command or (lambda folder: [sys.executable, "-m", "tdhil.service.run_process", str(folder)])
         self._asking = threading.Lock()
         self._children: dict[str, subprocess.Popen[bytes]] = {}
         self._live: dict[str, None] = {}               # in the order in which they began
         self._console = Console(store, say)
         self._lost: set[str] = set()
+        self._stops: dict[str, tuple[str, str]] = {}   # (who, when) asked a frozen run to stop
         self._unconfirmed: dict[str, Status] = {}      # runs whose stop nobody saw through
         self._unindexed: set[str] = set()
         self._to_index: set[str] = set()               # those that have just ended
         self._braking = False
+        self.pace = Pace()
         self.not_at_rest: list[str] = []               # of those that `brake` stopped
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -83,6 +104,7 @@ class Supervisor:
                     self._live[run] = None
                 elif status.state is State.STOP_NOT_CONFIRMED:
                     self._unconfirmed[run] = status
+        self._in_background(self._begin_audit)
         self._in_background(self._rebuild_index)       # what a web that was killed left out of it
         self._thread = threading.Thread(target=self._look, name="runs", daemon=True)
         self._thread.start()
@@ -107,14 +129,14 @@ class Supervisor:
             with suppress(Exception):
                 self.stop(run, who)
         if stopping:
-            self._say(f"Braking: run {', '.join(stopping)}. It waits for rest, {within_s:.0f} s at most."
+            self.say(f"Braking: run {', '.join(stopping)}. It waits for rest, {within_s:.0f} s at most."
                       " If a shaft turns on, use the hard-wired stop.")
         end_s = time.monotonic() + within_s
         while self.live() and time.monotonic() < end_s:
             time.sleep(LOOK_S)
         for run in stopping:
             state = self.store.status(run).state
-            self._say(f"run {run}: {state}")
+            self.say(f"run {run}: {state}")
             if run in self._live or state is State.STOP_NOT_CONFIRMED:
                 self.not_at_rest.append(run)
         return not self.live()
@@ -137,8 +159,12 @@ class Supervisor:
                     return run
         return None
 
-    def start_run(self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None) -> Asked:
-        """Begin a run. Raises NotThere, NotAllowed, UsageError, DataFileError, and Conflict, naming the holder."""
+    def start_run(
+        self, rig_id: str, asked: Mapping[str, Any], who: str, key: str | None = None, address: str = "",
+    ) -> Asked:
+        """Begin a run. Raises NotThere, NotAllowed, UsageError, DataFileError, NoRoom for a full disk, and Conflict,
+        naming the holder. ``address``: from where it was requested.
+        """
         options = options_of(asked)
         rig = self.rigs.get(rig_id)
         require_motion(rig)
@@ -152,18 +178,38 @@ class Supervisor:
             if self._braking:
                 raise Conflict("the service is ending", next_step="Start tdhil serve again")
             self.refuse_busy(rig)
-            run = self.store.new_id()
-            request = Request(run, rig.id, str(rig.path.resolve()), rig.sha256, options, who, now(), rig.simulated,
-                              rig.motion, key)
-            self.store.begin(request)
+            simulated = rig.simulated
+            if not simulated or rig.motion == "watched":           # it shows a code
+                self.pace.begin(who, address, rig.id)
+            request = self._write_down(Request("", rig.id, str(rig.path.resolve()), rig.sha256, options, who, now(),
+                                               simulated, rig.motion, key))
+            run = request.id
             try:
                 self._begin(run)
             except OSError as error:
                 told = Told.of(Conflict(f"the run's process can't be started ({error})", where=f"run {run}"))
-                self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=told, exit_code=1))
+                with suppress(OSError):
+                    self.store.save(way_to(self.store.status(run), State.FAILED, now(), error=told, exit_code=1))
                 raise Conflict(told.what, where=told.where) from error
         self.note(who, "asked", run, rig.id, options=options)
         return Asked(request, new=True)
+
+    def _write_down(self, request: Request) -> Request:
+        """Give the run an id and a folder. Raises NoRoom, and LogError where the folder can't be written."""
+        run = ""
+        try:
+            run = self.store.new_id()
+            request = replace(request, id=run)
+            self.store.begin(request)
+        except OSError as error:
+            if run:
+                shutil.rmtree(self.store.runs / run, ignore_errors=True)
+            what = f"the run can't be written down ({error.strerror or error})"
+            where = f"--data {self.store.folder}"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise NoRoom(what, where=where, next_step="Nothing was started. Free some of the disk") from error
+            raise LogError(what, where=where, next_step="Nothing was started. See to that folder") from error
+        return request
 
     def refuse_busy(self, rig: RigFile) -> None:
         """Raises Conflict where the rig has a run, is held by another program, or waits for a signature."""
@@ -186,6 +232,11 @@ class Supervisor:
     def holder(rig: RigFile) -> Holder | None:
         """Who holds the rig's drive by the lock."""
         return holder_of(rig.address)
+
+    def nobody_moves(self, rig: RigFile) -> bool:
+        """Is it known that no tdhil of this computer moves the rig's real drive, and that no stop of it is open?"""
+        address = rig.address
+        return address is not None and holder_of(address) is None and self.blocked(rig.id) is None
 
     def blocked(self, rig_id: str) -> str | None:
         """The run that blocks the rig until it is signed off."""
@@ -223,7 +274,9 @@ class Supervisor:
     def stop(self, run: str, who: str) -> Status:
         """Have the run brake. By the socket; where that doesn't answer, by SIGTERM; both return at once.
 
-        Raises NotThere, and CommunicationLost where neither reached it.
+        A process that stands still (SIGSTOP, a debugger) can't brake, and must not go on later: it is killed, and its
+        drive is stopped as of any run whose process was lost (decision 0022). Raises NotReacting then, NotThere, and
+        CommunicationLost where neither reached it.
         """
         folder = self.store.place(run)
         wish = {"do": "stop", "by": who}
@@ -233,23 +286,72 @@ class Supervisor:
             except (Refused, CommunicationLost):
                 if (status := self.store.status(run)).ended:
                     return status
+                self._kill_frozen(status, who)
                 # Its process may be about to begin. It looks for this file once it listens: one of us sees the other.
                 write_json(folder / STOP_FILE, {"by": who, "at": now()})
                 found = ask(folder, wish, timeout_s=1.0)
             status = Status.of_plain(found["status"])
+        except NotReacting:
+            raise
         except (Refused, CommunicationLost, OSError) as error:
             status = self.store.status(run)
             begins = status.state is State.REQUESTED and (folder / STOP_FILE).exists()
-            reached = begins or (status.pid is not None and signal_stop(status.pid, folder))
+            reached = begins or (status.pid is not None and send_signal(status.pid, folder, signal.SIGTERM))
             if not status.ended and not reached and lives(folder):
                 raise CommunicationLost(str(error), where=f"run {run}", next_step="Use the hard-wired stop") from error
         self.note(who, "stop asked", run, status.rig)
         return status
 
+    def _kill_frozen(self, status: Status, who: str) -> None:
+        """Kill the run's process if it stands still; `_look` does the rest. Raises NotReacting then."""
+        if status.pid is None or not stands_still(status.pid):
+            return
+        self._stops[status.id] = (who, now())
+        folder = self.store.place(status.id)
+        killed = send_signal(status.pid, folder, signal.SIGKILL)
+        self.note(who, "stop asked", status.id, status.rig, process="stood still", killed=killed)
+        watchdog = next((f" ({one.found})" for one in status.preflight if "watchdog" in one.name.lower()), "")
+        done = ("The service ended the process and sends tdhil stop to the run's drive" if killed else
+                "The service could not end the process, and sends nothing to the drive")
+        raise NotReacting(
+            f"the run's process doesn't react: it was stopped, by SIGSTOP or a debugger. The drive's watchdog{watchdog}"
+            f" stops the shaft. {done}", where=f"run {status.id}",
+            next_step="See that the shaft comes to rest. If it turns, use the hard-wired stop")
+
     def stop_drive(self, rig: RigFile, who: str) -> tuple[int, str]:
-        """`tdhil stop` on a rig that has no run of this service: its exit code, and what was seen."""
+        """`tdhil stop` on a rig that has no run of this service: its exit code, and what was seen.
+
+        A rig that a run blocks has the drive of that run stopped, on the run's own connection.
+        """
         self.note(who, "stop asked", None, rig.id)
-        return _stop_drive(rig.path, simulated=rig.simulated)
+        if (bad := self.blocked(rig.id)) is not None:
+            seen, said = self._stop_drive_of(self.store.request(bad), self.store.status(bad))
+            return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
+        if rig.simulated:
+            return int(ExitCode.OK), SIMULATED_STOP
+        seen, said = _stop_seen(_tdhil_stop(rig.path))
+        return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
+
+    def _stop_drive_of(self, request: Request, status: Status) -> tuple[bool, str]:
+        """Stop the drive of a run, on the run's own connection. Was it seen at rest, and what is there to say?
+
+        Never seen at rest where the rig's file was changed since: nobody knows then which shaft that was.
+        """
+        if request.simulated:
+            return True, SIMULATED_STOP
+        path, kept = Path(request.rig_file), self.store.place(request.id) / CONNECTION_FILE
+        same = is_as_it_was(path, request.rig_sha256)
+        changed = f"{path.name} was changed or removed after the run was requested"
+        if kept.exists():
+            identity = [",".join(map(str, status.identity_numbers))] if any(status.identity_numbers) else []
+            seen, said = _stop_seen([sys.executable, "-m", "tdhil.service.drive_stop", str(kept), *identity])
+            if same:
+                return seen, said
+            return False, (f"{said}, on the connection that the run had ({_address_in(kept)}); {changed}, so tdhil"
+                           " can't know whether this is still the rig's shaft")
+        if not same:
+            return False, f"{changed}, and the run had not kept where its drive is: no stop was sent"
+        return _stop_seen(_tdhil_stop(path))
 
     def sign_off(self, run: str, who: str, note: str) -> None:
         """Take a stop that wasn't confirmed upon oneself. Raises NotThere and Conflict."""
@@ -321,7 +423,7 @@ class Supervisor:
                 try:
                     self._look_at(run)
                 except Exception as error:     # of one run: the others are looked after all the same
-                    self._say(f"run {run}: {type(error).__name__}: {error}")
+                    self.say(f"run {run}: {type(error).__name__}: {error}")
 
     def _look_at(self, run: str) -> None:
         folder = self.store.place(run)
@@ -357,18 +459,19 @@ class Supervisor:
     def _died(self, run: str, status: Status) -> Status:
         """The run's process is gone. First the shaft, then the rest."""
         request = self.store.request(run)
-        self._say(f"run {run}: its process is gone; stopping the drive")
-        code, said = _stop_drive(Path(request.rig_file), simulated=request.simulated)
-        seen = code == ExitCode.OK
+        self.say(f"run {run}: its process is gone; stopping the drive")
+        seen, said = self._stop_drive_of(request, status)
         state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED
         what = f"the process of the run was lost while it was {status.state}; {said}"
-        told = Told("CommunicationLost", what, what, f"run {run}",
-                    "" if seen else "Use the hard-wired stop, then sign it off", int(ExitCode.COMMUNICATION))
-        stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None)
+        next_step = "" if seen else "Use the hard-wired stop. See that every shaft is at rest, then sign it off"
+        told = Told("CommunicationLost", what, what, f"run {run}", next_step, int(ExitCode.COMMUNICATION))
+        by, asked = self._stops.pop(run, (status.stop.by, status.stop.asked))
+        first = {} if status.stop.asked is not None else {"by": by, "asked": asked}
+        stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None, **first)
         status = way_to(status, state, now(), error=told, exit_code=int(told.exit_code), stop=stop, confirmation=None)
         self._save(status)
         self.store.release(run)
-        self._say(f"run {run}: {what}")
+        self.say(f"run {run}: {what}")
         self._in_background(lambda: self._recover(run))
         return status
 
@@ -381,7 +484,7 @@ class Supervisor:
                 return
             except OSError as error:
                 if not told:
-                    self._say(f"run {status.id}: its end can't be written yet: {error}")
+                    self.say(f"run {status.id}: its end can't be written yet: {error}")
                 told = True
                 self._end.wait(1.0)
 
@@ -416,11 +519,17 @@ class Supervisor:
             try:
                 self.audit.note(who, what, run=run, rig=rig, **details)
             except OSError as error:
-                self._say(f"the audit can't be written: {error}")
+                self.say(f"the audit can't be written: {error}")
             if run is not None:
                 self._index(run)
 
         self._in_background(write)
+
+    def _begin_audit(self) -> None:
+        try:
+            self.audit.begin()
+        except OSError as error:
+            self.say(f"the audit can't be written: {error}")
 
     def _index(self, run: str) -> None:
         try:
@@ -428,7 +537,7 @@ class Supervisor:
             self._unindexed.discard(run)
         except Exception as error:             # locked, or a full disk: the files have it, and it is tried again
             if run not in self._unindexed:
-                self._say(f"the index has to wait: {error}")
+                self.say(f"the index has to wait: {error}")
             self._unindexed.add(run)
         self._to_index.discard(run)
 
@@ -440,7 +549,7 @@ class Supervisor:
         try:
             self.index.rebuild()
         except Exception as error:
-            self._say(f"the index can't be made: {error}")
+            self.say(f"the index can't be made: {error}")
 
     def _in_background(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, daemon=True)
@@ -456,16 +565,27 @@ class Supervisor:
         return bool(holders())
 
 
-def _stop_drive(rig_file: Path, *, simulated: bool) -> tuple[int, str]:
-    """`tdhil stop` on a rig's drive, in a process of its own (the web opens no bus): exit code, and what was seen."""
-    if simulated:
-        return int(ExitCode.OK), "nothing turns: the drive is simulated, and ended with its run"
-    command = [sys.executable, "-m", "tdhil", "stop", "--rig", str(rig_file), "--json"]
+def _tdhil_stop(rig_file: Path) -> list[str]:
+    return [sys.executable, "-m", "tdhil", "stop", "--rig", str(rig_file), "--json"]
+
+
+def _stop_seen(command: list[str]) -> tuple[bool, str]:
+    """Run a stop in a process of its own (the web opens no bus): was the shaft seen at rest, and what is said of it?"""
     try:
         done = subprocess.run(command, capture_output=True, timeout=STOP_S, check=False,
                               stdin=subprocess.DEVNULL, start_new_session=True)
     except (OSError, subprocess.TimeoutExpired) as error:
-        return int(ExitCode.STOP_NOT_CONFIRMED), f"tdhil stop: {error}"
+        return False, f"tdhil stop: {error}"
     if done.returncode == ExitCode.OK:
-        return int(ExitCode.OK), "tdhil stop saw the shaft at rest"
-    return int(ExitCode.STOP_NOT_CONFIRMED), "tdhil stop did NOT see the shaft at rest"
+        return True, "tdhil stop saw the shaft at rest"
+    found: Any = None
+    with suppress(ValueError):
+        found = json.loads(done.stdout)
+    if isinstance(found, dict) and found.get("same_drive") is False:
+        return False, (f"another drive is there than the run had (identity {found.get('identity')}): tdhil stop saw ITS"
+                       " shaft, and not that of the run")
+    return False, "tdhil stop did NOT see the shaft at rest"
+
+
+def _address_in(kept: Path) -> str:
+    return str((read_json(kept) or {}).get("address") or "unknown")

@@ -42,6 +42,7 @@ from tdhil.service import afterwards, logins
 from tdhil.service.access import (
     SOCKET_LOOK_S,
     Access,
+    address_of,
     principal,
     require,
     require_options,
@@ -70,6 +71,8 @@ from tdhil.service.answers import (
 )
 from tdhil.service.asking import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.attending import LEASE_S
+from tdhil.service.audit import Head
+from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.edge import Guard, body_of, error_response, off, status_of, told_of
 from tdhil.service.feed import Feed, Feeds
 from tdhil.service.fleets import Fleets
@@ -114,6 +117,7 @@ class Web:
         self.access.changed = lambda what, name: supervisor.note("terminal", what, None, None, name=name)
         self.fleets = Fleets(self.store, logs, supervisor.turning)
         self.feeds = Feeds()
+        self._complain = Seldom(supervisor.say)
         self._stops = anyio.CapacityLimiter(16)        # a stop has threads of its own
         self._leases = anyio.CapacityLimiter(8)        # and so has a watched run's lease
         self._works = anyio.CapacityLimiter(1)         # arithmetic that somebody waits for, one piece at a time
@@ -139,7 +143,8 @@ class Web:
         self._pages.globals["version"] = __version__
         self.app = Starlette(routes=self._routes(), lifespan=self._lifespan,
                              middleware=[Middleware(AuthenticationMiddleware, backend=self.access)],
-                             exception_handlers=dict.fromkeys((TdhilError, HTTPException, Exception), self._failed))
+                             exception_handlers=dict.fromkeys((TdhilError, HTTPException, OSError, Exception),
+                                                              self._failed))
         self.asgi: ASGIApp = Guard(self.app, hosts, viewers)
 
     def _routes(self) -> list[BaseRoute]:
@@ -181,7 +186,11 @@ class Web:
             await anyio.to_thread.run_sync(self.supervisor.close)
 
     async def _failed(self, request: Request, error: Exception) -> Response:
-        if not isinstance(error, TdhilError | HTTPException):
+        if isinstance(error, OSError) and error.errno in NO_DESCRIPTOR:
+            error = LogError(f"the service has no descriptor left ({error.strerror})", where=request.url.path[:100],
+                             next_step="Ask again. Raise its limit of open files (LimitNOFILE, ulimit -n)")
+            self._complain("A request failed: {}", error)
+        elif not isinstance(error, TdhilError | HTTPException):
             import traceback
 
             traceback.print_exception(error, file=sys.stderr)
@@ -292,13 +301,14 @@ class Web:
             require_options(who, options_of(body))
 
         await off(check)
-        asked = await off(lambda: self.supervisor.start_run(rig, body, who.name, key))
+        asked = await off(lambda: self.supervisor.start_run(rig, body, who.name, key, address_of(request)))
         if asked.new:
             self._asked.inc()
         return 201 if asked.new else 200, await off(lambda: self.run_view(asked.request.id))
 
     async def _stop_rig(self, request: Request, body: Any) -> StoppedView:
-        rig_id, who = request.path_params["rig"], principal(request).name
+        rig_id, asking = request.path_params["rig"], principal(request)
+        who = asking.name
         self._stopped.inc()
 
         def stop() -> StoppedView:
@@ -306,6 +316,10 @@ class Web:
             if (run := self.supervisor.run_of(rig_id)) is not None:
                 self.supervisor.stop(run, who)
                 return StoppedView(rig_id, [run])
+            if "operator" not in asking.roles and self.supervisor.nobody_moves(rig):
+                raise NotAllowed("no tdhil moves this rig: a stop would open its bus and act on a drive that something"
+                                 " else may run", where=f"rig {rig_id}",
+                                 next_step="Ask an operator. If the shaft turns, use the hard-wired stop")
             code, said = self.supervisor.stop_drive(rig, who)
             return StoppedView(rig_id, [], code, said)
 
@@ -448,9 +462,13 @@ class Web:
         if not limit.isdecimal() or not 1 <= int(limit) <= 5000:
             raise UsageError("must be 1 to 5000", where="limit")
 
+        given = request.query_params.get("head")
+        kept = None if given is None else Head.of(given)
+
         def look() -> AuditView:
-            entries = list(self.supervisor.audit.entries())
-            return AuditView(entries[-int(limit):][::-1], self.supervisor.audit.verify())
+            audit = self.supervisor.audit
+            entries, broken, head = list(audit.entries()), audit.verify(kept), audit.head()
+            return AuditView(entries[-int(limit):][::-1], broken, None if head is None else str(head), audit.made())
 
         return await off(look)
 
@@ -458,7 +476,8 @@ class Web:
 
     async def _health(self, request: Request, body: Any) -> HealthView:
         rigs = await off(self.supervisor.rigs.all)
-        return HealthView("ok", __version__, self.supervisor.live(), len(rigs))
+        live = self.supervisor.live() if principal(request).roles else []
+        return HealthView("ok", __version__, live, len(rigs))
 
     async def _metrics(self, request: Request, body: Any) -> Response:
         self._live.set(len(self.supervisor.live()))

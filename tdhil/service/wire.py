@@ -156,8 +156,16 @@ def lives(folder: Path) -> bool:
     return False
 
 
-def signal_stop(pid: int, folder: Path) -> bool:
-    """The second road: SIGTERM, by a descriptor of the process, so that it reaches no other of that number."""
+def stands_still(pid: int) -> bool:
+    """Was the process stopped, by SIGSTOP or a debugger? False where that can't be known."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1] in ("T", "t")
+    except OSError:
+        return False
+
+
+def send_signal(pid: int, folder: Path, number: int) -> bool:
+    """Send it to the run's process, by a descriptor, so that it reaches no other process of that number."""
     if sys.platform != "linux":
         return False
     try:
@@ -167,7 +175,7 @@ def signal_stop(pid: int, folder: Path) -> bool:
     try:
         if not lives(folder):              # after the descriptor was made: it is this run's process, or none
             return False
-        signal.pidfd_send_signal(descriptor, signal.SIGTERM)
+        signal.pidfd_send_signal(descriptor, number)
         return True
     except OSError:
         return False

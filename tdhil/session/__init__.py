@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
         holders as holders,
     )
+    from tdhil.session.kept import connection_of_kept as connection_of_kept, kept_connection as kept_connection
     from tdhil.session.log_place import (
         check_different_files as check_different_files, check_log_path as check_log_path, is_live as is_live,
         make_room as make_room,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from tdhil.session.run_session import (
         Attendant as Attendant, Consent as Consent, RunRequest as RunRequest, RunSession as RunSession,
     )
-    from tdhil.session.stop_signals import stop_on_signals as stop_on_signals
+    from tdhil.session.stop_signals import Ending as Ending, stop_on_signals as stop_on_signals
     from tdhil.session.task import (
         bench_of as bench_of, excitation_request as excitation_request, facts as facts,
         machine_limits as machine_limits, stated_lags as stated_lags, suited as suited,

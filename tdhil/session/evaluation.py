@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tdhil.soft_torque import DrillString, EvaluationCase, Interval
 
 SAME_STRING = 1e-6
+_CONFIDENCE = 0.95        # of the interval that is shown of a ratio of torques
 _TUNE_AGAIN = "tdhil tune result.json --string string.yaml --json > tune.json"
 
 
@@ -125,13 +126,15 @@ def conclude_evaluation(
     rows: FloatArray, recording: Recording, run: Mapping[str, Any], log: str
 ) -> EvaluationConclusion:
     """From what the log holds alone: the same live and replayed. LogError where that is not enough."""
+    from tdhil.estimation import torque_contradiction, torque_ratios
     from tdhil.report import evaluation_document
     from tdhil.soft_torque import Outcome, Program, case_of, evaluate
 
     try:
         asked = run["evaluation"]
         case, program = case_of(asked["case"]), Program(**asked["program"])
-        found = evaluate(rows, case, program)
+        signals = torque_contradiction(torque_ratios(recording, _CONFIDENCE), recording.torque_scale_rel_sd)
+        found = evaluate(rows, case, program, "" if signals is None else f"{signals.reason}. Next: {signals.advice}")
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"holds no evaluation that can be read ({error})", where=log,
                        next_step="The run has to be done again") from None

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from tdhil.errors import UsageError
+from tdhil.errors import LogBroken, UsageError
 
 _LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
 
@@ -27,6 +29,8 @@ class LogPlace:
         self.older: Path | None = None         # where an older log was moved to
         self.live = False                      # somebody else is writing ``wanted``
         self.motion = False                    # set by whoever lets the shaft move
+        self.moved = ""                        # what became of the file meanwhile, for people; empty: nothing
+        self._descriptor: int | None = None    # of the file, as long as it may have to be looked for
 
     def open(self, wanted: Path) -> IO[bytes]:
         """The file, held against other runs for as long as it is open. OSError, or UsageError for a foreign file."""
@@ -41,7 +45,52 @@ class LogPlace:
                 self.older = make_room(wanted)
             file = self.path.open("xb", buffering=0)
             _lock(file.fileno())
+            self._descriptor = os.open(self.path, os.O_RDONLY)     # of its own, so that the lock ends with the file
             return file
+
+    def follow(self) -> None:
+        """Find the file again where its folder was renamed or removed in mid-run; ``path`` and ``moved`` then say so.
+
+        Linux tells where an open file is. One that was removed is written once more, to its own place or, without
+        that, to the working or the temporary folder. Raises LogBroken where it can't be found or saved.
+        """
+        if self._descriptor is None or self._is_there(self.path):
+            return
+        missing, found = self.path, self._real_path()
+        if found is not None:
+            self.path, self.moved = found, f"{missing} was moved in mid-run: the log is {found}"
+            return
+        for folder in (missing.parent, Path.cwd(), Path(tempfile.gettempdir())):
+            target = _dated(folder / missing.name, time.time())
+            with suppress(OSError):
+                with Path(f"/proc/self/fd/{self._descriptor}").open("rb") as source, target.open("xb") as copy:
+                    shutil.copyfileobj(source, copy)
+                self._forget()
+                self.path, self.moved = target, f"{missing} was removed in mid-run: what it held was saved as {target}"
+                return
+        self._forget()
+        raise LogBroken(
+            "the log's file was moved or removed in mid-run, and where it is can't be found out", where=str(missing),
+            next_step="Look for it where its folder was moved to",
+        )
+
+    def _is_there(self, path: Path) -> bool:
+        try:
+            return self._descriptor is None or os.path.samestat(path.stat(), os.fstat(self._descriptor))
+        except OSError:
+            return False
+
+    def _real_path(self) -> Path | None:
+        try:
+            found = Path(f"/proc/self/fd/{self._descriptor}").readlink()
+        except OSError:
+            return None
+        return found if self._is_there(found) else None
+
+    def _forget(self) -> None:
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+        self._descriptor = None
 
     def name(self, *, stub: bool) -> Path:
         """What the file will be called in the end. ``stub``: nothing moved in this run."""
@@ -51,6 +100,7 @@ class LogPlace:
 
     def settle(self, *, stub: bool) -> None:
         """Once the file is closed: a stub makes room for the older log again."""
+        self._forget()
         final = self.name(stub=stub)
         if final != self.path and self.older is not None:
             with suppress(OSError), _held(self.wanted.parent):      # nothing is lost under the names as they are

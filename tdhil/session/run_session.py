@@ -118,7 +118,9 @@ class RunSession:
 
     @property
     def path(self) -> Path:
-        """What the log will be called in the end."""
+        """What the log will be called in the end, also where its folder was renamed meanwhile."""
+        with suppress(LogError):           # `close` says so
+            self._place.follow()
         return self._place.name(stub=self._stub)
 
     @property
@@ -188,6 +190,7 @@ class RunSession:
         """Finish the log. Raises LogError; the file has its name then, too."""
         try:
             self.log.close()
+            self._place.follow()
         finally:
             self._settle()
 
@@ -198,6 +201,8 @@ class RunSession:
         self._settle()
 
     def _settle(self) -> None:
+        if self._place.moved:
+            self._attendant.warn(f"tdhil: {self._place.moved}")
         self._place.settle(stub=self._stub)
         self._tell_older()
 

@@ -24,6 +24,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 from rich.text import Text
 
+from tdhil.csv_text import cell_of
 from tdhil.report import STYLE, install_command, repeatable_figures
 from tdhil.studies.study import Cell, Progress, ResultTable, Statement, Study, StudyOutcome
 
@@ -163,7 +164,7 @@ def _cell(value: Cell) -> str:
     """Every digit of a number, so that it reads back as the same; nothing for None."""
     if value is None:
         return ""
-    return repr(float(value)) if isinstance(value, float) else str(value)
+    return repr(float(value)) if isinstance(value, float) else cell_of(value) if isinstance(value, str) else str(value)
 
 
 def _settings(name: str, settings: BaseModel, folder: Path) -> Path:

@@ -3,21 +3,26 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from drivers.errors import CommunicationLost, DriveFault, LimitHit
 from tdhil.cli.main import main
-from tdhil.errors import ExitCode, Interrupted, LogBroken
+from tdhil.errors import ExitCode, Interrupted, LogBroken, exit_code
+from tdhil.recording.log_reader import read_run
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.recording import Stage
-from tdhil.recording.run_log import RunLog
+from tdhil.recording.run_log import RunLog, find_ended
 from tdhil.run.stop import StopReport
 from tdhil.run.task import RunOutcome
+from tdhil.service.states import State, end_of
 from tdhil.session.conclusion import Conclusion
-from tdhil.session.stop_signals import stop_on_signals
+from tdhil.session.stop_signals import Ending, stop_on_signals
 
 REST = StopReport(True, 12.25, True)
 TURNING = StopReport(False, None, False, ("no feedback from the drive any more",))
@@ -145,6 +150,103 @@ def test_each_signal_is_a_wish_to_stop_and_the_first_one_stays(name):
         os.kill(os.getpid(), signal.SIGTERM)
         assert (request.signum, request.count) == (number, 2)
     assert signal.getsignal(number) is former
+
+
+KILLING = [number for number in sorted(signal.valid_signals()) if number not in {
+    # What can't be caught, what a broken program raises, what nobody is killed by, and what Python ignores already.
+    signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGCHLD,
+    signal.SIGCONT, signal.SIGURG, signal.SIGWINCH, signal.SIGPIPE, signal.SIGXFSZ, signal.SIGTTIN, signal.SIGTTOU,
+}]
+
+
+@pytest.mark.parametrize("number", KILLING)
+def test_every_signal_that_would_kill_the_host_is_a_request_to_stop(number):
+    with stop_on_signals() as request:
+        os.kill(os.getpid(), number)
+        assert request.signum == number
+    error = Interrupted(number)
+    asks_to_end = (signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP)
+    assert int(error.exit_code) == (143 if number in asks_to_end else 128 + number)
+    assert exit_code(error) == error.exit_code
+    assert end_of(int(error.exit_code), stop_confirmed=True) is State.STOPPED
+
+
+def test_a_signal_that_the_program_around_uses_itself_is_left_to_it():
+    seen = []
+    former = signal.signal(signal.SIGALRM, lambda number, frame: seen.append(number))
+    try:
+        with stop_on_signals() as request:
+            os.kill(os.getpid(), signal.SIGALRM)
+            assert (request.signum, seen) == (None, [signal.SIGALRM])
+    finally:
+        signal.signal(signal.SIGALRM, former)
+
+
+def test_a_run_that_such_a_signal_ended_says_so_in_its_log(ends):
+    code, _, err = ends(Interrupted(signal.SIGUSR1), REST)
+    assert code == 128 + signal.SIGUSR1
+    assert "interrupted by SIGUSR1" in err
+    found = find_ended({"ended": {"exit_code": 128 + signal.SIGUSR1}}, ())
+    assert found is not None and found.exit_code == 128 + signal.SIGUSR1
+    assert find_ended({"ended": {"exit_code": 77}}, ()).exit_code == 1
+
+
+def test_at_the_end_the_first_signal_interrupts_and_a_calm_end_none():
+    former = signal.getsignal(signal.SIGINT)
+    with Ending(own_process=False) as ending:
+        with pytest.raises(Interrupted):
+            os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert (ending.code(0), ending.code(5)) == (130, 5)
+    with Ending(own_process=False) as ending:
+        with stop_on_signals(ending.request) as request:       # a run's own handlers go before
+            os.kill(os.getpid(), signal.SIGUSR1)
+            os.kill(os.getpid(), signal.SIGINT)
+            assert request.signum == signal.SIGUSR1
+        os.kill(os.getpid(), signal.SIGINT)        # what had ended the run
+        assert ending.code(138) == 138
+    with Ending(own_process=False) as ending:
+        ending.calm()
+        for number in (signal.SIGUSR1, signal.SIGINT, signal.SIGTERM):
+            os.kill(os.getpid(), number)
+        assert ending.code(0) == 128 + signal.SIGUSR1
+    with Ending(own_process=False) as ending:
+        assert ending.code(0) == 0
+    assert signal.getsignal(signal.SIGINT) is former
+
+
+def test_in_a_process_of_its_own_signals_are_ignored_from_the_end_on():
+    kept = {number: signal.getsignal(number) for number in KILLING}
+    try:
+        with Ending(own_process=True):
+            pass
+        assert signal.getsignal(signal.SIGINT) is signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+        assert signal.getsignal(signal.SIGTSTP) is kept[signal.SIGTSTP]
+    finally:
+        for number, handler in kept.items():
+            signal.signal(number, handler)
+
+
+def test_a_burst_of_signals_up_to_the_very_end_changes_nothing(tmp_path):
+    """Through the stop, while the log closes, and in the interpreter's own end."""
+    log = tmp_path / "run.mcap"
+    child = subprocess.Popen(
+        [sys.executable, "-m", "tdhil", "identify", "--simulate", "--seed", "1", "--log", str(log)],
+        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "stage speed" in line:
+            break
+    child.send_signal(signal.SIGINT)
+    while child.poll() is None:
+        child.send_signal(signal.SIGINT)
+        child.send_signal(signal.SIGUSR1)
+        time.sleep(0.001)
+    err = child.stderr.read()
+    assert child.returncode == 130, err
+    assert "the shaft is at rest" in err
+    assert read_run(log).complete
 
 
 def test_a_program_in_the_background_is_not_stopped_by_its_terminal_while_a_shaft_turns():

@@ -1,5 +1,6 @@
 """Rows, the journal, and the table in each of its kinds."""
 
+import csv
 import json
 import random
 import struct
@@ -125,3 +126,19 @@ def test_what_changed_against_the_log_s_own_result(stored, changed):
     row = row_of("a.mcap", json.loads(json.dumps(document)), settings=Settings(), stored=stored)
     assert row.changed is changed
     assert row.inertia_low_kg_m2 == 103.0
+
+
+FORMULAS = ("=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t=1", "\r=1", "\n=1", "'=1", "''=1", "\uff1d1")
+
+
+@pytest.mark.parametrize("name", [*FORMULAS, "'quoted", "R7", "a=b", "5-6"])
+def test_no_text_of_a_table_is_a_formula_and_it_is_read_back_as_it_was(tmp_path, name):
+    """A rig's name comes from a log, and so from anybody."""
+    row = FleetRow(log=name, verdict="valid", rig=name, note=name, operator=name, skew_s=-0.5)
+    write_table([row], tmp_path / "fleet.csv")
+    with (tmp_path / "fleet.csv").open(newline="", encoding="utf-8") as file:
+        (cells,) = csv.DictReader(file)
+    texts = {cells[column] for column in ("log", "rig", "note", "operator")}
+    assert texts == {f"'{name}" if name in FORMULAS else name}
+    assert cells["skew_s"] == "-0.5"                       # a number stays one
+    assert read_table(tmp_path / "fleet.csv") == [row]

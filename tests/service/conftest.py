@@ -19,7 +19,8 @@ from starlette.testclient import TestClient
 from tdhil.service.access import Access
 from tdhil.service.answers import API
 from tdhil.service.asking import Rigs
-from tdhil.service.store import Audit, Index, Store
+from tdhil.service.audit import Audit
+from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.web import Web
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import io
 import threading
@@ -21,10 +22,11 @@ from tdhil.service import access as access_module
 from tdhil.service import accounts as accounts_module
 from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
-from tdhil.service.access import SESSION_S, STOPS_S, Access, Tries, address_of
+from tdhil.service.access import SESSION_S, STOPS_S, Access, Pace, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
 from tdhil.service.answers import API
-from tdhil.service.states import TooManyTries
+from tdhil.service.states import TooManyRuns, TooManyTries
+from tdhil.session import hold
 from tests.service.conftest import Service, wait_for
 
 URL = "https://127.0.0.1:8420"
@@ -705,3 +707,93 @@ def test_users_and_tokens_on_the_terminal(tmp_path, capsys, monkeypatch):
     assert typed("", "users", "remove", "nobody") == ExitCode.USAGE
     assert typed("", "users", "remove", "anna") == 0
     assert not AccountsFile(tmp_path / "data").read()
+
+
+# -- a drive without a run, what is public, and how many runs may show a code
+
+
+def test_everybody_stops_a_run_and_a_drive_that_tdhil_moves_and_an_operator_any_drive(guarded, monkeypatch):
+    """Decision 0022: a stop of a drive that no tdhil moves opens its bus."""
+    stopped: list[str] = []
+    monkeypatch.setattr(guarded.service.supervisor, "stop_drive",
+                        lambda rig, who: stopped.append(who) or (0, "tdhil stop saw the shaft at rest"))
+    viewers = (guarded.sessions["viewer"], guarded.of_token("viewer"), guarded.ended("admin"))
+
+    def stop(headers, rig="real"):
+        return guarded("POST", f"/rigs/{rig}/stop", headers, json={})
+
+    for headers in viewers:
+        answer = stop(headers)
+        assert answer.status_code == 403
+        assert "no tdhil moves this rig" in answer.json()["error"]["what"]
+        assert "hard-wired stop" in answer.json()["error"]["next_step"]
+    assert stopped == []
+    assert stop(guarded.sessions["operator"]).json()["said"] == "tdhil stop saw the shaft at rest"
+    with hold(guarded.service.supervisor.rigs.get("real").address):
+        assert {stop(headers).status_code for headers in viewers} == {200}
+    monkeypatch.setattr(guarded.service.supervisor, "blocked", lambda rig: "a run")
+    assert {stop(headers).status_code for headers in viewers} == {200}
+    monkeypatch.undo()
+    for rig in ("a", "broken"):                        # simulated; and one of which nothing can be known
+        assert stop(viewers[0], rig).status_code == 200
+    run = guarded.run("ask", rig="real")
+    assert stop(viewers[0]).json()["runs"] == [run]
+    guarded.service.wait(run, "stopped")
+
+
+def test_runs_are_named_to_who_is_known_alone(guarded):
+    run = guarded.run("hold")
+    assert guarded("GET", "/healthz").json()["live"] == []
+    assert guarded("GET", "/healthz", guarded.ended("admin")).json()["live"] == []
+    assert guarded("GET", "/healthz", guarded.sessions["viewer"]).json()["live"] == [run]
+    assert run not in guarded.client.get("/healthz").text
+
+
+def test_codes_are_shown_ten_times_in_ten_minutes_and_forty_times_a_day():
+    time_s = 0.0
+    pace = Pace(lambda: time_s)
+    begun = 0
+    for _ in range(20):
+        with contextlib.suppress(TooManyRuns):
+            pace.begin("anna", "192.0.2.1", "r")
+            begun += 1
+    assert begun == 10
+    with pytest.raises(TooManyRuns) as refused:
+        pace.begin("anna", "192.0.2.2", "r")               # from elsewhere: it is the user's
+    assert refused.value.wait_s == 600.0
+    pace.begin("berta", "192.0.2.1", "r")
+    for minute in range(23 * 60):
+        time_s = 600.0 + 60.0 * minute
+        with contextlib.suppress(TooManyRuns):
+            pace.begin("anna", "192.0.2.1", "r")
+            begun += 1
+    assert begun == 40
+    time_s += 86_400.0
+    pace.begin("anna", "192.0.2.1", "r")
+
+
+def test_an_address_has_a_limit_of_its_own_and_what_was_refused_does_not_count():
+    pace, begun = Pace(lambda: 0.0), 0
+    for user in range(100):
+        with contextlib.suppress(TooManyRuns):
+            pace.begin(f"user-{user}", "192.0.2.1", "r")
+            begun += 1
+    assert begun == 30
+    for _ in range(10):
+        pace.begin("user-99", "192.0.2.2", "r")
+
+
+def test_runs_that_show_a_code_are_limited_and_simulated_ones_are_not(guarded, monkeypatch):
+    monkeypatch.setattr(Pace, "LIMITS", ((600.0, 2, 9), (86_400.0, 40, 120)))
+    for _ in range(2):
+        run = guarded.run("ask", rig="real")
+        guarded("POST", f"/runs/{run}/stop", guarded.sessions["operator"], json={})
+        guarded.service.wait(run, "stopped")
+        wait_for("its end", lambda: not guarded.service.supervisor.live())
+    for rig in ("real", "rehearsed"):
+        refused = guarded("POST", f"/rigs/{rig}/runs", guarded.sessions["operator"], json={"note": "ask"})
+        assert refused.status_code == 429
+        assert "too many runs that show a code" in refused.json()["error"]["what"]
+        assert 1 <= int(refused.headers["retry-after"]) <= 600
+    assert len(guarded.service.store.ids()) == 2
+    guarded.run("done")                                    # a simulated one

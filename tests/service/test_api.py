@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -650,3 +651,46 @@ def test_the_audit_says_who_did_what_and_that_it_holds(call, service):
     path = next((service.store.folder / "audit").glob("*.jsonl"))
     path.write_bytes(path.read_bytes().replace(b'"asked"', b'"Asked"', 1))
     assert call("GET", "/audit", 200)["broken"]["line"] >= 1
+
+
+def test_a_web_without_descriptors_answers_in_words_and_writes_one_line_a_second(client, service, monkeypatch, capsys):
+    def none_left(*_: Any) -> Any:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    service.said.clear()
+    monkeypatch.setattr(service.web, "rig_view", none_left)
+    answers = [client.get(f"{API}/rigs") for _ in range(20)]       # and nothing is raised, which the server would log
+    assert {one.status_code for one in answers} == {503}
+    assert "no descriptor left" in answers[0].json()["error"]["what"]
+    assert len([one for one in service.said if "no descriptor left" in one]) <= 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "status", "words"), [
+    (errno.ENOSPC, 507, "Free some of the disk"), (errno.EDQUOT, 507, "Free some of the disk"),
+    (errno.EROFS, 503, "See to that folder"),
+])
+@pytest.mark.parametrize("at", ["new_id", "begin", "save"])
+def test_a_run_that_cannot_be_written_down_is_refused_in_words(call, service, monkeypatch, number, status, words, at):
+    def full(*_: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(service.store, at, full)
+        refused = call.start(expect=status)["error"]
+    assert os.strerror(number) in refused["what"]
+    assert refused["next_step"] == f"Nothing was started. {words}"
+    assert service.store.ids() == []
+    assert call("GET", "/rigs/a", 200)["state"] == "free"
+
+
+def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(call, service, monkeypatch):
+    def full(*_: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("tdhil.service.supervisor.take_life", full)
+        assert "can't be started" in call.start(expect=409)["error"]["what"]
+    (run,) = service.store.ids()
+    assert service.store.status(run).state is State.FAILED
+    assert service.supervisor.live() == []

@@ -346,3 +346,19 @@ def test_a_full_disk_holds_nobody_up(board, monkeypatch):
         board.to(State.PREFLIGHT)
         board.know(pid=7)
     assert board.status == replace(board.status, pid=7)
+
+
+def test_a_second_stop_leaves_the_time_when_the_first_was_seen(board, monkeypatch):
+    times = iter(f"2026-01-01T00:00:{number:02d}.000Z" for number in range(60))
+    monkeypatch.setattr("tdhil.service.attending.now", lambda: next(times))
+    watcher = Watcher(board)
+    board.to(State.PREFLIGHT)
+    board.to(State.MOVING, "setup")
+    braking = SAMPLE._replace(state=PowerState.QUICK_STOP)
+    watcher.asked_to_stop("first")
+    watcher.cycle(COMMAND, braking)
+    first = board.status.stop
+    assert first.seen is not None
+    watcher.asked_to_stop("second")
+    watcher.cycle(COMMAND, braking)
+    assert board.status.stop == first

@@ -70,3 +70,29 @@ def test_the_shaft_comes_to_rest_the_run_is_told_of_and_its_log_kept(tmp_path):
     assert len(read_run(service.store.place(run) / "recovered.mcap").recording.time_s) > 10
     with pytest.raises(FileNotFoundError):
         (service.store.place(run) / "confirm.json").read_bytes()       # a drive with the marker asks nobody
+
+
+@pytest.mark.heavy
+@pytest.mark.real_time
+def test_a_rig_s_file_that_names_another_drive_by_then_does_not_get_that_one_stopped(tmp_path):
+    """The issue's own case: the other drive was stopped, and its rest was taken for that of the run's."""
+    rigs = tmp_path / "rigs"
+    rigs.mkdir()
+    with simulated_drive(tmp_path / "own.csv") as port, simulated_drive(tmp_path / "other.csv") as other:
+        text = f"rate_hz: 10\nmodbus: {{host: 127.0.0.1, port: {port}}}\n{LIMITS}service: {{motion: attended}}\n"
+        (rigs / "real.yaml").write_text(text)
+        service = Service(tmp_path / "data", rigs, fake=False)
+        service.supervisor.start()
+        run = service.supervisor.start_run("real", {}, "local").request.id
+        wait_for("motion", lambda: speed_rad_s(tmp_path / "own.csv") > 1.0)
+        (rigs / "real.yaml").write_text(text.replace(str(port), str(other)))
+        os.kill(service.store.status(run).pid, signal.SIGKILL)
+        service.wait(run, "stop_not_confirmed", "interrupted")
+        assert abs(speed_rad_s(tmp_path / "own.csv")) < 0.1
+        assert "quick stop" in (tmp_path / "own.csv").read_text()
+        assert "quick stop" not in (tmp_path / "other.csv").read_text()
+        service.supervisor.close()
+    status = service.store.status(run)
+    assert (status.state, status.stop.confirmed) == (State.STOP_NOT_CONFIRMED, False)
+    assert f"port {port}" in status.error.what
+    assert service.supervisor.blocked("real") == run

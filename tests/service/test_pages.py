@@ -229,8 +229,8 @@ def test_an_answer_that_was_overtaken_undoes_nothing(page, served):
 
 
 def test_a_drive_that_a_terminal_has_is_stopped_from_its_card(page, served, monkeypatch):
-    told = [(0, "tdhil stop saw the shaft at rest"), (8, "tdhil stop did NOT see the shaft at rest")]
-    monkeypatch.setattr("tdhil.service.supervisor._stop_drive", lambda path, simulated: told.pop(0))
+    told = [(True, "tdhil stop saw the shaft at rest"), (False, "tdhil stop did NOT see the shaft at rest")]
+    monkeypatch.setattr("tdhil.service.supervisor._stop_seen", lambda command: told.pop(0))
     with hold(served.service.supervisor.rigs.get("real").address):
         page.goto("/")
         stop = page.get_by_role("article", name="real", exact=True).get_by_role("button", name="Stop")

@@ -45,11 +45,13 @@ console()
 
 
 class Server:
-    def __init__(self, data: Path, *more: str, **client: Any) -> None:
+    def __init__(self, data: Path, *more: str, descriptors: int | None = None, **client: Any) -> None:
+        """``descriptors``: its limit of open files."""
+        limit = () if descriptors is None else ("prlimit", f"--nofile={descriptors}:{descriptors}")
         self.log = (data.parent / "serve.txt").open("a+")
         start = self.log.seek(0, os.SEEK_END)
         self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVE, folder_of_locks(data.parent / "locks"), "serve", "--data", str(data),
+            [*limit, sys.executable, "-c", SERVE, folder_of_locks(data.parent / "locks"), "serve", "--data", str(data),
              "--port", "0", *more], stderr=self.log)
         address = wait_for("the address", lambda: re.search(r"https?://\S+", self.said(start)))
         self.url = address.group(0)
@@ -67,8 +69,8 @@ class Server:
 
 
 @contextlib.contextmanager
-def served(data: Path, *more: str, **client: Any) -> Iterator[Server]:
-    server = Server(data, *more, **client)
+def served(data: Path, *more: str, descriptors: int | None = None, **client: Any) -> Iterator[Server]:
+    server = Server(data, *more, descriptors=descriptors, **client)
     try:
         yield server
     finally:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import hashlib
+import json
 import os
 import random
 import sqlite3
@@ -11,8 +14,11 @@ from pathlib import Path
 
 import pytest
 
+from tdhil.cli.main import main
+from tdhil.errors import UsageError
+from tdhil.service.audit import KEY_FILE, Audit, Head
 from tdhil.service.states import NotThere, State, Status, now, way_to
-from tdhil.service.store import Audit, Index, Request, Store, summary_of, write_json, write_whole
+from tdhil.service.store import Index, Request, Store, summary_of, write_json, write_whole
 from tdhil.service.wire import lives, take_life
 
 
@@ -214,3 +220,192 @@ def test_a_run_of_which_nothing_can_be_known_is_not_given_up_for_dead(tmp_path, 
 
     monkeypatch.setattr(os, "open", none_left)
     assert lives(tmp_path)
+
+
+# -- the audit's key: what is found by it, and what a head that is kept elsewhere finds
+
+
+def lines_of(audit: Audit) -> list[bytes]:
+    return only_file(audit).read_bytes().splitlines(keepends=True)
+
+
+def fabricated(last: bytes, number: int, before: str) -> bytes:
+    """A line such as somebody without the key would write, with a plain hash."""
+    plain = {**json.loads(last), "number": number, "before": before, "who": "anna"}
+    plain.pop("hash", None)
+    digest = hashlib.sha256(json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**plain, "hash": digest}, ensure_ascii=False).encode() + b"\n"
+
+
+def cut_off_with_a_new_head(audit: Audit) -> None:
+    *kept, _ = lines_of(audit)
+    only_file(audit).write_bytes(b"".join(kept))
+    last = json.loads(kept[-1])
+    write_json(audit._folder / "head.json", {"number": last["number"], "hash": last["hash"]})
+
+
+def cut_off_with_an_old_head(audit: Audit) -> None:
+    old = (audit._folder / "head.json").read_bytes()
+    audit.note("local", "stop asked")
+    only_file(audit).write_bytes(b"".join(lines_of(audit)[:-1]))
+    (audit._folder / "head.json").write_bytes(old)
+
+
+def one_more_line_without_a_head(audit: Audit) -> None:
+    last = lines_of(audit)[-1]
+    with only_file(audit).open("ab") as file:
+        file.write(fabricated(last, 13, json.loads(last)["hash"]))
+
+
+def one_more_line_with_a_head(audit: Audit) -> None:
+    one_more_line_without_a_head(audit)
+    write_json(audit._folder / "head.json", {"number": 13, "hash": json.loads(lines_of(audit)[-1])["hash"]})
+
+
+def all_of_it_deleted(audit: Audit) -> None:
+    for path in audit._folder.iterdir():
+        path.unlink()
+
+
+def the_key_deleted(audit: Audit) -> None:
+    (audit._folder.parent / KEY_FILE).unlink()
+
+
+def the_key_another(audit: Audit) -> None:
+    path = audit._folder.parent / KEY_FILE
+    write_json(path, {**json.loads(path.read_bytes()), "key": "ab" * 32})
+
+
+def an_old_head_alone(audit: Audit) -> None:
+    old = (audit._folder / "head.json").read_bytes()
+    for _ in range(2):
+        audit.note("local", "stop asked")
+    (audit._folder / "head.json").write_bytes(old)
+
+
+def a_head_without_its_seal(audit: Audit) -> None:
+    path = audit._folder / "head.json"
+    write_json(path, {**json.loads(path.read_bytes()), "mac": "0" * 64})
+
+
+@pytest.mark.parametrize("attack", [
+    cut_off_with_a_new_head, cut_off_with_an_old_head, one_more_line_without_a_head, one_more_line_with_a_head,
+    all_of_it_deleted, the_key_deleted, the_key_another, an_old_head_alone, a_head_without_its_seal,
+])
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_what_is_done_to_the_chain_without_its_key_is_found_for_good(audit, attack, goes_on):
+    """Also after the service has gone on: nothing that it writes makes a broken chain hold again."""
+    attack(audit)
+    again = Audit(audit._folder)
+    assert again.verify() is not None
+    if goes_on:
+        with contextlib.suppress(OSError):
+            for _ in range(3):
+                again.note("local", "asked")
+        if attack in (an_old_head_alone, a_head_without_its_seal):
+            assert again.verify() is None      # its lines were never touched, and it has a head again
+        else:
+            assert again.verify() is not None
+            assert Audit(audit._folder).verify() is not None
+
+
+def test_the_key_is_for_nobody_else_and_made_once(store, audit):
+    path = store.folder / KEY_FILE
+    assert path.stat().st_mode & 0o777 == 0o600
+    key = json.loads(path.read_bytes())["key"]
+    Audit(store.folder / "audit").note("local", "asked")
+    assert json.loads(path.read_bytes())["key"] == key
+    assert key not in "".join(one.read_text() for one in (store.folder / "audit").iterdir())
+
+
+def test_killed_between_head_and_anchor_it_still_holds(store, audit):
+    kept = (store.folder / KEY_FILE).read_bytes()
+    audit.note("local", "asked")
+    (store.folder / KEY_FILE).write_bytes(kept)
+    again = Audit(store.folder / "audit")
+    assert again.verify() is None
+    again.note("local", "asked")
+    assert again.verify() is None
+    assert [entry.number for entry in again.entries()] == list(range(1, 15))
+
+
+def test_a_kept_head_finds_another_chain_with_another_key(store, audit):
+    kept = audit.head()
+    assert (kept.number, Head.of(str(kept))) == (12, kept)
+    audit.note("local", "asked")
+    assert audit.verify(kept) is None
+    all_of_it_deleted(audit)
+    the_key_deleted(audit)
+    other = Audit(store.folder / "audit")
+    assert other.verify() is None                      # nothing here shows it …
+    for _ in range(14):
+        other.note("local", "asked")
+    assert other.verify() is None
+    assert "line 12 as it was exported" in other.verify(kept).why      # … but what was kept elsewhere
+    with pytest.raises(UsageError):
+        Head.of("12")
+
+
+def test_a_chain_from_before_there_was_a_key_is_taken_as_it_is_and_sealed_from_then_on(store):
+    folder, before, lines = store.folder / "audit", "0" * 64, []
+    for number in range(1, 4):
+        plain = {"number": number, "at": now(), "who": "local", "what": "asked", "run": None, "rig": None,
+                 "details": {}}
+        lines.append(fabricated(json.dumps(plain).encode(), number, before))
+        before = json.loads(lines[-1])["hash"]
+    (folder / f"{now()[:7]}.jsonl").write_bytes(b"".join(lines))
+    write_json(folder / "head.json", {"number": 3, "hash": before})
+    audit = Audit(folder)
+    assert "no key" in audit.verify().why
+    audit.begin()
+    assert audit.verify() is None
+    assert [(one.who, one.what, one.details) for one in audit.entries()][3:] == [
+        ("service", "audit key made", {"lines_before": 3})]
+    audit.begin()                                      # once
+    audit.note("local", "asked")
+    assert Audit(folder).verify() is None
+    for place in (0, 3, 4):
+        changed = lines_of(audit)
+        changed[place] = changed[place].replace(b'"asked"', b'"Asked"').replace(b'"service"', b'"Service"')
+        path = only_file(audit)
+        data = path.read_bytes()
+        path.write_bytes(b"".join(changed))
+        assert Audit(folder).verify().line == place + 1
+        path.write_bytes(data)
+
+
+def test_the_key_is_there_before_the_first_line(store):
+    audit = Audit(store.folder / "audit")
+    audit.begin()
+    assert (store.folder / KEY_FILE).exists()
+    assert list(audit.entries()) == []
+    assert audit.verify() is None
+    assert Audit(store.folder / "audit").made() == audit.made()
+
+
+def test_a_key_that_cannot_be_read_is_not_replaced(audit):
+    path = audit._folder.parent / KEY_FILE
+    path.write_text("{}")
+    again = Audit(audit._folder)
+    with pytest.raises(OSError, match="key can't be read"):
+        again.note("local", "asked")
+    assert path.read_text() == "{}"
+    assert "no key that can be read" in again.verify().why
+    assert again.head() is None
+
+
+def test_the_audit_on_the_terminal(audit, capsys, tmp_path):
+    def check(*more: str) -> int:
+        return main(["serve", "audit", "--data", str(tmp_path / "data"), *more])
+
+    assert check() == 0
+    head = capsys.readouterr().out.strip()
+    assert head == str(audit.head())
+    audit.note("local", "asked")
+    assert check("--head", head) == 0
+    assert "13 lines" in capsys.readouterr().err
+    assert check("--head", f"12:{'0' * 64}") != 0
+    assert "as it was exported" in capsys.readouterr().err
+    only_file(audit).write_bytes(b"")
+    assert check() != 0
+    assert "doesn't hold" in capsys.readouterr().err

@@ -157,7 +157,7 @@
       if (found.runs.length) location.assign(`/runs/${found.runs[0]}/live`);
       else away(`${rig.name}: ${found.said}${found.exit_code === 0 ? "" : ". Use the hard-wired stop"}`);
     } catch (error) {
-      away(`Stop of ${rig.name} ${UNDELIVERED}`);
+      away(`Stop of ${rig.name} ${UNDELIVERED}${error instanceof Refused ? `. ${error.message}` : ""}`);
     } finally {
       clearTimeout(late);
     }
@@ -506,7 +506,7 @@
       if (now === shown) return;
       shown = now;
       byId("chain").className = found.broken ? "alarm" : "dim";
-      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : "The chain of all lines holds.";
+      byId("chain").textContent = found.broken ? `The chain is BROKEN at ${found.broken.file}:${found.broken.line}: ${found.broken.why}` : `The chain of all lines holds. Its head, to be kept on another computer: ${found.head || "no line yet"}`;
       show(byId("entries"), ...found.entries.map((one) => el("tr", {}, el("th", { scope: "row" }, when(one.at)), el("td", {}, one.who), el("td", {}, one.what), el("td", {}, one.rig || ""),
         el("td", {}, one.run ? el("a", { href: `/runs/${one.run}` }, one.run) : ""), el("td", {}, Object.keys(one.details).length ? JSON.stringify(one.details) : ""))));
     });

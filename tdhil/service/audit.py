@@ -1,0 +1,262 @@
+"""The audit: who requested, confirmed, stopped and downloaded what, and when. A chain of lines, sealed with a key.
+
+::
+
+    audit/<year>-<month>.jsonl     a line each, with the hash of the line before and its own
+    audit/head.json                number and hash of the last line, sealed
+    audit.key                      the key, and the anchor: number and hash of the last line; mode 0600
+
+A line's hash is an HMAC-SHA256 with the key. Without the key, each of these is found: a line that was changed, taken
+out, put in or added; lines cut off at the end, also with a rewritten or an older head.json; the whole folder `audit`
+deleted or put back from an older copy.
+
+What can't be held: a user of this computer who can read `audit.key` (the service's own user, root) can write another
+chain that holds. And where `audit.key` is deleted together with the folder, a new chain begins. Only a head that was
+exported before shows either: `Audit.verify` takes it. So export it at times, to another computer.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import hmac
+import json
+import os
+import re
+import secrets
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from tdhil.errors import UsageError
+from tdhil.service.states import now
+from tdhil.service.store import read_json, write_json
+
+KEY_FILE: Final = "audit.key"
+FIRST: Final = "0" * 64
+_HEAD: Final = re.compile(r"([0-9]{1,12}):([0-9a-f]{64})")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line. ``details`` is plain data."""
+
+    number: int
+    at: str
+    who: str
+    what: str
+    run: str | None
+    rig: str | None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    before: str = FIRST
+    hash: str = ""
+
+
+@dataclass(frozen=True)
+class Broken:
+    """Where the chain doesn't hold: the file, its line (from 1), and why."""
+
+    file: str
+    line: int
+    why: str
+
+
+@dataclass(frozen=True)
+class Head:
+    """The last line of a chain: its number and its hash."""
+
+    number: int
+    hash: str
+
+    def __str__(self) -> str:
+        return f"{self.number}:{self.hash}"
+
+    @staticmethod
+    def of(text: str) -> Head:
+        """Read ``NUMBER:HASH``, as it is exported. Raises UsageError."""
+        found = _HEAD.fullmatch(text.strip())
+        if found is None:
+            raise UsageError("is no head of an audit", where=f"head {text[:80]!r}",
+                             next_step="It is NUMBER:HASH, as tdhil serve audit prints it")
+        return Head(int(found[1]), found[2])
+
+
+@dataclass(frozen=True)
+class _Seal:
+    """The key, and the anchor. ``plain``: so many lines are older than the key, and have a hash without it."""
+
+    key: bytes
+    made: str
+    plain: int
+    anchor: Head
+
+    def hash_of(self, entry: Entry) -> str:
+        """What the line's hash must be."""
+        plain = {name: value for name, value in asdict(entry).items() if name != "hash"}
+        text = json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()
+        return hashlib.sha256(text).hexdigest() if entry.number <= self.plain else self._mac(b"line", text)
+
+    def of_head(self, head: Head) -> str:
+        """What seals a head."""
+        return self._mac(b"head", str(head).encode())
+
+    def _mac(self, kind: bytes, text: bytes) -> str:
+        return hmac.new(self.key, kind + b" " + text, hashlib.sha256).hexdigest()
+
+
+class Audit:
+    """The chain of one service. Only one process writes it: the web."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._key_path = folder.parent / KEY_FILE
+        self._lock = threading.Lock()
+        self._seal: _Seal | None = None
+        self._last: Head | None = None
+
+    def begin(self) -> None:
+        """Make the key where there is none; lines from before it are taken as they are. Raises OSError."""
+        with self._lock:
+            self._sealed()
+
+    def note(
+        self, who: str, what: str, *, run: str | None = None, rig: str | None = None, **details: Any
+    ) -> None:
+        """Add a line, on the disk when this returns. Raises OSError."""
+        with self._lock:
+            self._add(self._sealed(), who, what, run, rig, details)
+
+    def head(self) -> Head | None:
+        """The last line, to be kept elsewhere; None where there is none, or the chain's end doesn't hold."""
+        with self._lock:
+            seal = self._seal or self._read()
+            found = None if seal is None else self._end(seal)
+        return found if found is not None and found.number > 0 else None
+
+    def made(self) -> str | None:
+        """When the key was made; None without one. A later time than the first line's was once another key."""
+        seal = self._seal or self._read()
+        return None if seal is None else seal.made
+
+    def entries(self) -> Iterator[Entry]:
+        """All that can be read, in order."""
+        for _, _, entry in self._lines():
+            if isinstance(entry, Entry):
+                yield entry
+
+    def verify(self, kept: Head | None = None) -> Broken | None:
+        """The first place where a line was changed, taken out or put in; None where the chain holds.
+
+        ``kept``: a head that was exported before, which must be one of the lines.
+        """
+        with self._lock:
+            return self._verify(self._seal or self._read(), kept)
+
+    def _verify(self, seal: _Seal | None, kept: Head | None) -> Broken | None:
+        number, before, earlier, at, found = 0, FIRST, FIRST, ("", 0), kept is None
+        for file, line, entry in self._lines():
+            if isinstance(entry, str):
+                return Broken(file, line, entry)
+            if seal is None:
+                return Broken(file, line, f"the chain has no key that can be read ({KEY_FILE})")
+            if entry.number != number + 1 or entry.before != before:
+                return Broken(file, line, "it doesn't follow the line before")
+            if not hmac.compare_digest(seal.hash_of(entry).encode(), entry.hash.encode()):
+                return Broken(file, line, "it was changed after it was written, or written without the key")
+            number, earlier, before, at = entry.number, before, entry.hash, (file, line)
+            found = found or Head(number, before) == kept
+        if not found and kept is not None:
+            return Broken(*at, f"the chain doesn't have line {kept.number} as it was exported")
+        if seal is None:
+            return None
+        # A killed process may leave a line whose head or anchor wasn't written; never a head without its line.
+        ends = (Head(number, before), Head(number - 1, earlier))
+        if seal.anchor not in ends:
+            return Broken(*at, f"the chain ends with line {number}, and {KEY_FILE} has seen line {seal.anchor.number}")
+        plain = read_json(self._folder / "head.json") or {}
+        head = Head(plain.get("number", 0), plain.get("hash", FIRST))
+        mac = plain.get("mac")
+        # The head of lines from before there was a key has no seal.
+        sealed = isinstance(mac, str) and hmac.compare_digest(mac.encode(), seal.of_head(head).encode())
+        if head not in ends or not (sealed or head.number <= seal.plain):
+            return Broken(*at, f"the chain ends with line {number}, and head.json is not its head")
+        return None
+
+    def _add(
+        self, seal: _Seal, who: str, what: str, run: str | None, rig: str | None, details: Mapping[str, Any]
+    ) -> None:
+        last = self._last or self._end(seal) or seal.anchor        # an end that doesn't hold is never made to
+        at = now()
+        entry = Entry(last.number + 1, at, who[:80], what, run, rig, details, last.hash)
+        entry = replace(entry, hash=seal.hash_of(entry))
+        with (self._folder / f"{at[:7]}.jsonl").open("ab") as file:
+            file.write(json.dumps(asdict(entry), ensure_ascii=False).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self._last = head = Head(entry.number, entry.hash)
+        self._seal = replace(seal, anchor=head)
+        write_json(self._folder / "head.json", {**asdict(head), "mac": seal.of_head(head)})
+        self._write(self._seal)
+
+    def _sealed(self) -> _Seal:
+        """The seal; made where there is none. Raises OSError where it can't be read, or written."""
+        if self._seal is None:
+            self._seal = self._read()
+        if self._seal is None:
+            if self._key_path.exists():
+                raise OSError(errno.EINVAL, "the audit's key can't be read", str(self._key_path))
+            last = Head(0, FIRST)
+            for entry in self.entries():
+                last = Head(entry.number, entry.hash)
+            seal = _Seal(secrets.token_bytes(32), now(), last.number, last)
+            self._write(seal)
+            self._seal = seal
+            if last.number:
+                self._add(seal, "service", "audit key made", None, None, {"lines_before": last.number})
+        return self._seal
+
+    def _read(self) -> _Seal | None:
+        plain = read_json(self._key_path)
+        try:
+            assert plain is not None
+            seal = _Seal(bytes.fromhex(plain["key"]), str(plain["made"]), int(plain["plain"]),
+                         Head(int(plain["number"]), str(plain["hash"])))
+        except (AssertionError, KeyError, TypeError, ValueError):
+            return None
+        return seal if len(seal.key) == 32 else None
+
+    def _write(self, seal: _Seal) -> None:
+        plain = {"key": seal.key.hex(), "made": seal.made, "plain": seal.plain, **asdict(seal.anchor)}
+        write_json(self._key_path, plain, mode=0o600)
+
+    def _end(self, seal: _Seal) -> Head | None:
+        """The last line, if it is the anchor, or the one that follows it; None where the end doesn't hold."""
+        last: Entry | None = None
+        for entry in self.entries():
+            last = entry
+        if last is None:
+            return seal.anchor if seal.anchor.number == 0 else None
+        found = Head(last.number, last.hash)
+        follows = last.number == seal.anchor.number + 1 and last.before == seal.anchor.hash
+        good = found == seal.anchor or (
+            follows and hmac.compare_digest(seal.hash_of(last).encode(), last.hash.encode()))
+        return found if good else None
+
+    def _lines(self) -> Iterator[tuple[str, int, Entry | str]]:
+        for path in sorted(self._folder.glob("????-??.jsonl")):
+            with path.open("rb") as file:
+                for line, text in enumerate(file, start=1):
+                    yield path.name, line, _entry(text)
+
+
+def _entry(text: bytes) -> Entry | str:
+    try:
+        plain = json.loads(text)
+        if text != json.dumps(plain, ensure_ascii=False).encode() + b"\n":
+            return "it was changed after it was written"
+        found = Entry(**plain)
+        return found if isinstance(found.number, int) and isinstance(found.hash, str) else "it can't be read"
+    except (ValueError, TypeError, RecursionError):
+        return "it can't be read"

@@ -1,0 +1,35 @@
+"""The connection of a run as plain data: with it, a later stop reaches the drive of that run and no other.
+
+A rig's file, a profile's file and the environment may change while a run goes on. What is kept here has the bus, each
+setting of its line, the node, and the profile's text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from profiles import parse_profile, profile_text
+from tdhil.config import Origin, RunOptions, Setting, resolve
+from tdhil.session.connection import Connection, bus_kind
+
+_SOURCE: Final = "the run's own connection"
+_PLAIN: Final = (str, int, float, bool, type(None), list, dict)
+
+
+def kept_connection(options: RunOptions, connection: Connection) -> dict[str, Any]:
+    """Return it for JSON. Raises DataFileError where the profile can't be read any more."""
+    line = {name: one.value for name, one in connection.line.settings.items() if isinstance(one.value, _PLAIN)}
+    return {
+        "drive": connection.drive, "line": line, "node": options.node, "profile": connection.profile.name,
+        "profile_text": profile_text(options.profile), "address": connection.kind.address(options, connection),
+    }
+
+
+def connection_of_kept(plain: Mapping[str, Any]) -> tuple[RunOptions, Connection]:
+    """Return options and connection as the run had them. Raises DataFileError, KeyError, TypeError or ValueError."""
+    kind = bus_kind(str(plain["drive"]))
+    profile = parse_profile(str(plain["profile_text"]), str(plain["profile"]))
+    settings = {name: Setting(value, _SOURCE, Origin.RIG_FILE) for name, value in dict(plain["line"]).items()}
+    options = resolve({"drive": kind.name, "node": plain["node"]}, None)
+    return options, Connection(kind, profile, type(kind.nowhere)(settings))

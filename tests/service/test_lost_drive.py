@@ -1,0 +1,209 @@
+"""A run's process is lost or stands still: which drive is then stopped, and what is said of it; without a drive."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tdhil.service.states import Conflict, State, Status
+from tdhil.service.store import CONNECTION_FILE, write_json
+from tdhil.service.wire import stands_still
+from tdhil.session import kept_connection
+from tests.service.conftest import Service, wait_for
+
+# -- which drive is stopped
+
+
+class Stops:
+    """In the place of the stop's process: which commands there were, and what the next one saw."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.commands: list[list[str]] = []
+        self.code, self.said = 0, "{}"
+        real = subprocess.run
+
+        def run(command: list[str], **more: object) -> object:
+            if "tdhil.service.drive_stop" not in command and "stop" not in command:
+                return real(command, **more)
+            self.commands.append([one for one in command if one not in (sys.executable, "-m")])
+            return SimpleNamespace(returncode=self.code, stdout=self.said.encode(), stderr=b"")
+
+        monkeypatch.setattr("tdhil.service.supervisor.subprocess.run", run)
+
+
+@pytest.fixture
+def stops(monkeypatch: pytest.MonkeyPatch) -> Stops:
+    return Stops(monkeypatch)
+
+
+def lost_run(service: Service, *, kept: bool = True, change: Callable[[Path], object] = lambda path: None) -> str:
+    """A run on the rig `real` whose process is killed after the rig's file was changed."""
+    service.supervisor.start()
+    rig = service.supervisor.rigs.get("real")
+    run = service.supervisor.start_run("real", {"note": "ask"}, "local").request.id
+    service.wait(run, "awaiting_confirmation")
+    if kept:
+        write_json(service.store.place(run) / CONNECTION_FILE, kept_connection(*rig.way()))
+    change(rig.path)
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    service.wait(run, "interrupted", "stop_not_confirmed")
+    wait_for("its end", lambda: not service.supervisor.live())
+    return run
+
+
+def other_port(path: Path) -> None:
+    path.write_text(path.read_text().replace("host: 127.0.0.1", "host: 127.0.0.2"))
+
+
+def test_the_stop_after_a_lost_run_goes_where_the_run_went(service, stops):
+    run = lost_run(service)
+    assert stops.commands == [["tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE)]]
+    status = service.store.status(run)
+    assert (status.state, status.stop.confirmed) == (State.INTERRUPTED, True)
+    assert status.stop.at_rest is not None
+    assert service.supervisor.blocked("real") is None
+
+
+@pytest.mark.parametrize("change", [other_port, lambda path: path.write_text(path.read_text() + "# a word\n"),
+                                    lambda path: path.unlink()])
+def test_a_rig_s_file_that_was_changed_meanwhile_leaves_the_stop_unconfirmed(service, stops, change):
+    """Another drive may be the rig's by now: that the run's own was seen at rest says nothing of that one."""
+    path = service.supervisor.rigs.get("real").path
+    before = path.read_text()
+    run = lost_run(service, change=change)
+    assert stops.commands == [["tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE)]]
+    status = service.store.status(run)
+    assert (status.state, status.stop.confirmed, status.stop.at_rest) == (State.STOP_NOT_CONFIRMED, False, None)
+    for words in ("tdhil stop saw the shaft at rest, on the connection that the run had (modbus tcp 127.0.0.1",
+                  "real.yaml was changed or removed after the run was requested"):
+        assert words in status.error.what
+    assert "hard-wired stop" in status.error.next_step
+    path.write_text(before)
+    assert service.supervisor.blocked("real") == run
+    with pytest.raises(Conflict, match="nobody has signed it off"):
+        service.supervisor.start_run("real", {"note": "ask"}, "local")
+    service.supervisor.sign_off(run, "anna", "both shafts at rest")
+    assert service.supervisor.blocked("real") is None
+
+
+def test_without_a_kept_connection_the_rig_s_file_counts_as_long_as_it_is_the_same(service, stops):
+    path = service.supervisor.rigs.get("real").path
+    run = lost_run(service, kept=False)
+    assert stops.commands == [["tdhil", "stop", "--rig", str(path), "--json"]]
+    assert service.store.status(run).state is State.INTERRUPTED
+
+
+def test_without_a_kept_connection_and_with_another_file_no_drive_is_stopped(service, stops):
+    run = lost_run(service, kept=False, change=other_port)
+    assert stops.commands == []
+    status = service.store.status(run)
+    assert status.state is State.STOP_NOT_CONFIRMED
+    assert "no stop was sent" in status.error.what
+
+
+def test_a_drive_that_was_not_seen_at_rest_blocks_its_rig_and_stop_goes_to_it(service, stops):
+    """Its rig's Stop goes to the run's own drive, whatever the file says by then."""
+    stops.code, stops.said = 8, "no JSON"
+    run = lost_run(service)
+    status = service.store.status(run)
+    assert status.state is State.STOP_NOT_CONFIRMED
+    assert "did NOT see the shaft at rest" in status.error.what
+    rig = service.supervisor.rigs.get("real")
+    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT see the shaft at rest")
+    stops.code = 0
+    assert service.supervisor.stop_drive(rig, "anna") == (0, "tdhil stop saw the shaft at rest")
+    other_port(rig.path)
+    code, said = service.supervisor.stop_drive(service.supervisor.rigs.get("real"), "anna")
+    assert code == 8
+    assert "on the connection that the run had" in said
+    assert {tuple(one) for one in stops.commands} == {
+        ("tdhil.service.drive_stop", str(service.store.place(run) / CONNECTION_FILE))}
+    service.supervisor.sign_off(run, "anna", "at rest")
+    service.supervisor.stop_drive(rig, "anna")
+    assert stops.commands[-1] == ["tdhil", "stop", "--rig", str(rig.path), "--json"]
+    stops.code = 8
+    assert service.supervisor.stop_drive(rig, "anna") == (8, "tdhil stop did NOT see the shaft at rest")
+    assert service.supervisor.stop_drive(service.supervisor.rigs.get("a"), "berta")[0] == 0
+    wait_for("the audit", lambda: ("berta", "stop asked", None, "a") in {
+        (one.who, one.what, one.run, one.rig) for one in service.audit.entries()})
+
+
+def test_another_drive_at_the_run_s_address_is_not_the_run_s(service, stops, monkeypatch):
+    stops.code, stops.said = 8, json.dumps({"at_rest": True, "same_drive": False, "identity": "1, 2, 3, 99"})
+    status = service.store.status
+
+    def known(run: str) -> Status:
+        return replace(status(run), identity_numbers=(1, 2, 3, 4))
+
+    monkeypatch.setattr(service.store, "status", known)
+    run = lost_run(service)
+    assert stops.commands[0][2:] == ["1,2,3,4"]
+    assert service.store.status(run).state is State.STOP_NOT_CONFIRMED
+    assert "another drive is there than the run had (identity 1, 2, 3, 99)" in service.store.status(run).error.what
+
+
+# -- a process that stands still
+
+
+def test_a_stop_to_a_process_that_stands_still_kills_it_and_says_that_nothing_was_seen(call, service, stops):
+    run = call.start("real", what="ask")["id"]
+    service.wait(run, "awaiting_confirmation")
+    write_json(service.store.place(run) / CONNECTION_FILE,
+               kept_connection(*service.supervisor.rigs.get("real").way()))
+    pid = service.store.status(run).pid
+    os.kill(pid, signal.SIGSTOP)
+    told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
+    for words in ("doesn't react", "SIGSTOP", "watchdog (500 ms) stops the shaft", "sends tdhil stop"):
+        assert words in told["what"]
+    assert "hard-wired stop" in told["next_step"]
+    service.wait(run, "interrupted")
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert [one[0] for one in stops.commands] == ["tdhil.service.drive_stop"]
+    status = service.store.status(run)
+    assert (status.stop.by, status.stop.confirmed, status.stop.seen) == ("local", True, None)
+    assert status.stop.asked <= status.stop.at_rest
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGCONT)                   # it has nothing left to go on with
+    wait_for("the audit", lambda: [one.details for one in service.audit.entries() if one.what == "stop asked"] == [
+        {"process": "stood still", "killed": True}])
+
+
+def test_a_rig_whose_run_stands_still_answers_the_same(call, service):
+    run = call.start("a", what="hold")["id"]
+    service.wait(run, "moving")
+    os.kill(service.store.status(run).pid, signal.SIGSTOP)
+    assert "doesn't react" in call("POST", "/rigs/a/stop", 504, json={})["error"]["what"]
+    service.wait(run, "interrupted")
+
+
+def test_a_process_that_stands_still_and_cannot_be_killed_is_told_as_such(call, service, monkeypatch):
+    run = call.start("a", what="hold")["id"]
+    service.wait(run, "moving")
+    pid = service.store.status(run).pid
+    os.kill(pid, signal.SIGSTOP)
+    with monkeypatch.context() as patched:
+        patched.setattr("tdhil.service.supervisor.send_signal", lambda *arguments: False)
+        told = call("POST", f"/runs/{run}/stop", 504, json={})["error"]
+    assert "could not end the process, and sends nothing" in told["what"]
+    os.kill(pid, signal.SIGCONT)
+    call("POST", f"/runs/{run}/stop", 200, json={})
+    service.wait(run, "stopped")
+
+
+def test_standing_still_is_known_of_a_living_process_alone():
+    with subprocess.Popen(["sleep", "60"]) as child:
+        assert not stands_still(child.pid)
+        os.kill(child.pid, signal.SIGSTOP)
+        wait_for("its stop", lambda: stands_still(child.pid))
+        child.kill()
+    assert not stands_still(child.pid)

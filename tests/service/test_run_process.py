@@ -1,0 +1,191 @@
+"""The process of a run itself, in this process: what it does before anything moves. No part is played by `fake_run`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from tdhil.errors import ExitCode
+from tdhil.recording import read_run
+from tdhil.report import has_extra
+from tdhil.service.asking import read_rig
+from tdhil.service.run_process import NICE, RunProcess, main
+from tdhil.service.states import State, Watch, now
+from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
+from tdhil.service.wire import STOP_FILE
+from tests.service.conftest import Service, wait_for
+from tests.service.test_lost_run import LIMITS
+
+SIMULATED = "run: {simulate: true}\n"
+
+
+class Asked:
+    """A run that was requested, and whose process has not begun."""
+
+    def __init__(self, folder: Path, text: str, *, simulated: bool = True, motion: str = "attended",
+                 **options: object) -> None:
+        self.rig = folder / "rig.yaml"
+        self.rig.write_text(text)
+        self.store = Store(folder / "data")
+        self.store.prepare()
+        found = read_rig(self.rig)
+        self.run = self.store.new_id()
+        self.folder = self.store.place(self.run)
+        self.store.begin(Request(self.run, "rig", str(self.rig), found.sha256, options, "local", now(), simulated,
+                                 motion))
+
+    def serve(self) -> int:
+        return main([str(self.folder)])
+
+    @property
+    def states(self) -> list[State]:
+        return [one.state for one in self.store.status(self.run).history]
+
+
+@pytest.fixture(autouse=True)
+def nicer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own_locks: None) -> list[int]:
+    """By how much it made itself nicer. It goes into its folder, too: neither is for the tests after it."""
+    found: list[int] = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("os.nice", found.append)
+    return found
+
+
+@pytest.mark.parametrize(("left", "by"), [({"by": "anna", "at": now()}, "anna"), ({}, "somebody")])
+def test_a_stop_from_before_the_process_listened_is_the_first_thing_it_sees(tmp_path, left, by):
+    asked = Asked(tmp_path, SIMULATED, seed=7)
+    write_json(asked.folder / STOP_FILE, left)
+    assert asked.serve() == ExitCode.TERMINATED
+    assert asked.states == [State.REQUESTED, State.STOPPED]
+    status = asked.store.status(asked.run)
+    assert (status.stop.by, status.stop.seen) == (by, None)
+    assert status.stop.asked is not None
+    assert "Nothing has moved" in status.error.next_step
+    assert not list(asked.folder.glob("*.mcap"))
+
+
+@pytest.mark.parametrize("change", ["another", "removed"])
+def test_a_rig_s_file_that_was_changed_before_the_process_began_ends_it(tmp_path, change):
+    asked = Asked(tmp_path, SIMULATED, seed=7)
+    if change == "another":
+        asked.rig.write_text(f"name: another\n{SIMULATED}")
+    else:
+        asked.rig.unlink()
+    assert asked.serve() != ExitCode.OK
+    assert State.PREFLIGHT not in asked.states
+    if change == "another":
+        assert asked.states[-1] is State.REFUSED
+        assert "was changed after the run was asked for" in asked.store.status(asked.run).error.what
+    assert not list(asked.folder.glob("*.mcap"))
+
+
+def test_where_its_drive_is_is_kept_before_the_bus_is_opened(tmp_path, nobody_s_port):
+    """Nobody answers there, so that the run fails at its first word to the drive."""
+    asked = Asked(tmp_path, f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{LIMITS}", simulated=False)
+    assert asked.serve() == ExitCode.REFUSED
+    assert f"127.0.0.1:{nobody_s_port}" in asked.store.status(asked.run).error.message
+    plan, status = read_json(asked.folder / "plan.json"), asked.store.status(asked.run)
+    assert status.expected_half_width == plan["expected_half_width"]
+    assert status.expected_s["acquire"] == plan["duration_s"] + 5.0
+    plain = read_json(asked.folder / CONNECTION_FILE)
+    assert plain["address"] == f"modbus tcp 127.0.0.1 port {nobody_s_port} unit 1"
+    assert plain["profile_text"].startswith("#") or "bus: modbus" in plain["profile_text"]
+
+
+def test_a_run_that_cannot_keep_where_its_drive_is_opens_no_bus(tmp_path, nobody_s_port, monkeypatch):
+    def full(path: Path, plain: object) -> None:
+        if path.name == CONNECTION_FILE:
+            raise OSError(28, "No space left on device")
+
+    asked = Asked(tmp_path, f"modbus: {{host: 127.0.0.1, port: {nobody_s_port}}}\n{LIMITS}", simulated=False)
+    monkeypatch.setattr("tdhil.service.run_process.write_json", full)
+    assert asked.serve() == ExitCode.INTERNAL
+    assert "No space" in asked.store.status(asked.run).error.message
+    assert not (asked.folder / "run.mcap").exists()
+
+
+def test_what_comes_over_its_socket_has_an_answer_each(tmp_path):
+    process = RunProcess(Asked(tmp_path, SIMULATED).folder)
+    for asked, words in (({"do": "lease", "key": "x"}, "nobody watches this run"),
+                         ({"do": "confirm", "code": "1"}, "nothing to confirm")):
+        with pytest.raises(Exception, match=words):
+            process.answer(asked)
+    assert process.answer({"do": "code"}) == {"code": None}
+    assert process.answer({"do": "status"})["status"]["state"] == "requested"
+    assert process.answer({})["status"]["stop"]["asked"] is None
+    assert not process.stop.signum
+    found = process.answer({"do": "stop", "by": "an\x1bna" + "x" * 200})["status"]
+    assert len(found["stop"]["by"]) == 80
+    assert found["stop"]["asked"] is not None
+    assert process.stop.signum == 15
+    assert "\x1b" not in process.stop.why
+    process.board.close()
+
+
+def test_a_simulated_run_from_its_request_to_its_result(tmp_path, nicer):
+    asked = Asked(tmp_path, SIMULATED, seed=7, rate_hz=50.0)
+    process = RunProcess(asked.folder)
+    assert process.serve() == ExitCode.OK
+    assert process.watcher.log is not None                 # what a page says of itself gets into it
+    assert asked.states[:3] == [State.REQUESTED, State.PREFLIGHT, State.MOVING]
+    assert asked.states[-3:] == [State.STOPPING, State.IDENTIFYING, State.DONE]
+    status = asked.store.status(asked.run)
+    assert (status.exit_code, status.verdict, status.simulated) == (0, "valid", True)
+    result = json.loads((asked.folder / "result.json").read_bytes())
+    assert read_run(asked.folder / "run.mcap").complete
+    assert (asked.folder / "report.html").exists() is has_extra()
+    assert nicer == [NICE]
+    assert not (asked.folder / "plan.json").exists()       # nobody confirms it
+    assert json.loads((asked.folder / "row.json").read_bytes())["rig"] == "rig"
+    assert result["verdict"] == "valid"
+    assert (asked.folder / "run.mcap").exists()
+    assert not (asked.folder / CONNECTION_FILE).exists()
+
+
+@pytest.mark.heavy
+def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
+    """As the web leaves it for a process that does not listen yet."""
+    service = Service(tmp_path / "data", rigs, fake=False)
+    begin = service.supervisor._begin
+
+    def left(run: str) -> None:
+        write_json(service.store.place(run) / STOP_FILE, {"by": "anna"})
+        begin(run)
+
+    service.supervisor._begin = left
+    service.supervisor.start()
+    run = service.supervisor.start_run("a", {"seed": 7}, "local").request.id
+    service.wait(run, "stopped")
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert State.MOVING not in [one.state for one in service.store.status(run).history]
+    service.supervisor.close()
+
+
+def test_a_run_that_is_watched_no_more_is_stopped_by_nobody(tmp_path):
+    process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
+    assert process.watched
+    process.attendant._unwatched(Watch("anna", now(), now(), "hidden", now()))
+    assert process.stop.why == "nobody watched the run for 5 s (its page is hidden)"
+    assert (process.stop.signum, process.board.status.stop.by) == (15, "nobody watched")
+    process.board.close()
+
+
+def test_a_lease_and_a_code_are_handed_on_as_they_came(tmp_path):
+    process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
+    calls: list[object] = []
+    watch = Watch("anna", now())
+    process.attendant.lease = SimpleNamespace(renew=lambda *given, **more: calls.append((given, more)) or watch)
+    asked = {"do": "lease", "key": "k", "by": "anna", "new_key": None, "gone": "hidden"}
+    assert process.answer(asked)["watch"]["by"] == "anna"
+    assert calls.pop() == (("k", "anna"), {"new_key": "", "gone": "hidden"})
+    process.attendant.confirming = SimpleNamespace(
+        take=lambda *given: calls.append(given), confirmed_by=None, void=None, code="123456", left_s=9.0, binding="b")
+    assert process.answer({"do": "confirm", "code": 1, "binding": "b", "by": "anna", "lease": None})["status"]
+    assert calls.pop() == ("1", "b", "anna", "")
+    assert process.answer({"do": "code"}) == {"code": "123456", "left_s": 9.0, "binding": "b"}
+    process.attendant.confirming.confirmed_by = "anna"
+    assert process.answer({"do": "code"}) == {"code": None}
+    process.board.close()

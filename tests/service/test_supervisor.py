@@ -1,0 +1,396 @@
+"""What the supervisor does beside each run: begin, find again, brake, and never take a lost run for one at rest."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from drivers import CommunicationLost, DataFileError
+from tdhil.errors import LogError
+from tdhil.service import supervisor as supervisor_module
+from tdhil.service.states import Conflict, NoRoom, State, Status, now, way_to
+from tdhil.service.store import Request
+from tdhil.service.supervisor import KEYS
+from tdhil.service.wire import STOP_FILE, Refused
+from tests.service.conftest import FAKE, Service, wait_for
+
+
+def begun(service: Service, what: str = "hold", rig: str = "a", *states: str) -> str:
+    """A run that has come as far."""
+    run = service.supervisor.start_run(rig, {"note": what}, "anna").request.id
+    service.wait(run, *(states or ("moving",)))
+    return run
+
+
+def ended(service: Service, rig: str = "a", state: State = State.STOP_NOT_CONFIRMED) -> str:
+    """A run of before that ended so."""
+    run = service.store.new_id()
+    status = service.store.begin(Request(run, rig, "rig.yaml", "0" * 64, {}, "anna", now(), True, "never"))
+    service.store.save(way_to(status.to(State.PREFLIGHT, now()).to(State.MOVING, now()), state, now(), exit_code=8))
+    return run
+
+
+def lines(service: Service) -> list[tuple[str, str, str | None, str | None]]:
+    return [(one.who, one.what, one.run, one.rig) for one in service.audit.entries()]
+
+
+def test_what_blocks_a_rig_and_what_lives_is_found_at_the_start(service, tmp_path, rigs):
+    bad, good = ended(service), ended(service, "b", State.STOPPED)
+    signed = ended(service, "real")
+    service.store.sign_off(signed, "anna", "at rest")
+    (service.store.runs / "20260101-000000-abcdef").mkdir()                # a folder without a request
+    service.supervisor.start()
+    run = begun(service, "hold", "b")
+    service.supervisor.close()
+    after = Service(tmp_path / "data", rigs)
+    after.supervisor.start()
+    assert after.supervisor.live() == [run]
+    assert [after.supervisor.blocked(rig) for rig in ("a", "b", "real")] == [bad, None, None]
+    assert after.supervisor.run_of("b") == run
+    assert after.supervisor.run_of("a") is None
+    assert good not in after.supervisor.live()
+    assert run in after.supervisor.ahead_of_the_index()
+    wait_for("the index", lambda: {one.id for one in after.index.find()} >= {bad, good, signed})
+    after.supervisor.stop(run, "anna")
+    after.wait(run, "stopped")
+    wait_for("its end", lambda: not after.supervisor.live())
+    wait_for("the audit", lambda: ("service", "ended: stopped", run, "b") in lines(after))
+    wait_for("the index", lambda: after.supervisor.ahead_of_the_index() == [])
+    assert ("anna", "stop asked", run, "b") in lines(after)
+    after.supervisor.close()
+
+
+def test_close_ends_its_threads_and_no_run(service):
+    service.supervisor.start()
+    run = begun(service)
+    thread = service.supervisor._thread
+    service.supervisor.note("anna", "asked", None, None)
+    service.supervisor.close()
+    assert not thread.is_alive()
+    assert not any(one.is_alive() for one in service.supervisor._notes)
+    assert service.store.status(run).state is State.MOVING
+
+
+def test_a_service_that_brakes_begins_nothing_more(service):
+    service.supervisor.start()
+    loose, run = begun(service, "loose"), begun(service, "hold", "b")
+    assert service.supervisor.brake("the end")
+    assert service.supervisor.not_at_rest == [loose]
+    assert service.said[0] == (f"Braking: run {loose}, {run}. It waits for rest, 60 s at most."
+                               " If a shaft turns on, use the hard-wired stop.")
+    assert {service.store.status(one).stop.by for one in (loose, run)} == {"the end"}
+    with pytest.raises(Conflict, match="service is ending"):
+        begun(service, "hold", "b")
+    service.said.clear()
+    assert service.supervisor.brake("again")
+    assert service.said == []                                              # nothing moves: nothing is said
+    assert service.supervisor.not_at_rest == [loose]
+
+
+def test_a_service_that_waited_long_enough_says_what_still_lives(service):
+    service.supervisor.start()
+    run = begun(service, "frozen")
+    assert not service.supervisor.brake("the end", within_s=0.0)
+    assert service.supervisor.not_at_rest == [run]
+    assert service.said[-1] == f"run {run}: moving"
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    service.wait(run, "interrupted")
+
+
+def test_a_key_gives_its_run_for_the_same_request_of_the_same_user_and_rig(service):
+    service.supervisor.start()
+    first = service.supervisor.start_run("a", {"note": "done"}, "anna", "key")
+    assert (first.new, first.request.asked_by, first.request.idempotency_key) == (True, "anna", "key")
+    again = service.supervisor.start_run("a", {"note": "done"}, "anna", "key")
+    assert (again.new, again.request) == (False, first.request)
+    with pytest.raises(Conflict, match="another request"):
+        service.supervisor.start_run("a", {"note": "hold"}, "anna", "key")
+    service.wait(first.request.id, "done")
+    wait_for("its end", lambda: not service.supervisor.live())
+    other = service.supervisor.start_run("a", {"note": "done"}, "berta", "key")
+    assert other.new
+    service.wait(other.request.id, "done")
+    assert KEYS >= 100
+    wait_for("the audit", lambda: sum(one.what == "asked" for one in service.audit.entries()) == 2)
+
+
+def test_a_run_of_a_rig_that_may_not_move_or_of_options_that_cannot_be_is_none(service):
+    for rig, options, wrong in (("never", {}, "never moved"), ("broken", {}, "broken.yaml"),
+                                ("a", {"excitation": "nosuch"}, "excitation"), ("nosuch", {}, "no such rig")):
+        with pytest.raises(Exception, match=wrong):
+            service.supervisor.start_run(rig, options, "anna")
+    assert service.store.ids() == []
+
+
+def test_what_was_requested_is_written_down(service):
+    service.supervisor.start()
+    run = begun(service, "done", "a", "done")
+    request, rig = service.store.request(run), service.supervisor.rigs.get("a")
+    assert (request.id, request.rig, request.rig_file, request.rig_sha256, request.simulated, request.motion) == (
+        run, "a", str(rig.path.resolve()), rig.sha256, True, "never")
+    assert (service.store.place(run) / "process.log").exists()
+
+
+def test_a_stop_reaches_a_process_that_does_not_listen_yet_by_its_file(service, monkeypatch):
+    run = begun(service)
+    real, asked = supervisor_module.ask, []
+
+    def deaf_once(folder: Path, wish: Any, **more: Any) -> Any:
+        asked.append((wish, more))
+        if len(asked) == 1:
+            raise CommunicationLost("not yet")
+        return real(folder, wish, **more)
+
+    monkeypatch.setattr(supervisor_module, "ask", deaf_once)
+    service.supervisor.stop(run, "anna")
+    assert asked == [({"do": "stop", "by": "anna"}, {"timeout_s": 1.0})] * 2
+    assert "anna" in (service.store.place(run) / STOP_FILE).read_text()
+    service.wait(run, "stopped")
+
+
+@pytest.mark.parametrize("dies", [False, True])
+def test_a_stop_that_reaches_nobody_says_so(service, monkeypatch, dies):
+    run = begun(service, "hold")
+    sent: list[int] = []
+
+    def nothing(*_: Any, **__: Any) -> Any:
+        raise CommunicationLost("nobody answers")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(supervisor_module, "ask", nothing)
+        patched.setattr(supervisor_module, "send_signal", lambda pid, folder, number: sent.append(number) or False)
+        if dies:
+            patched.setattr(supervisor_module, "lives", lambda folder: False)
+            assert service.supervisor.stop(run, "anna").state is State.MOVING
+        else:
+            with pytest.raises(CommunicationLost, match="nobody answers") as lost:
+                service.supervisor.stop(run, "anna")
+            assert "hard-wired stop" in lost.value.next_step
+        assert sent == [signal.SIGTERM]
+    service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+
+
+def test_a_full_disk_keeps_no_stop_from_the_second_road(service, monkeypatch):
+    run = begun(service, "deaf")
+
+    def full(*_: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(supervisor_module, "write_json", full)
+        service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+
+
+def test_a_code_for_nothing_is_refused_and_noted(service):
+    service.supervisor.start()
+    run = begun(service)
+    with pytest.raises(Conflict, match="nothing to confirm"):
+        service.supervisor.confirm(run, "123456", None, "anna")
+    real = begun(service, "ask", "real", "awaiting_confirmation")
+    with pytest.raises(Conflict, match="isn't the code"):
+        service.supervisor.confirm(real, "000000", None, "anna")
+    with pytest.raises(Conflict, match="nobody watches"):
+        service.supervisor.renew(real, "key", "anna", new_key=None, gone=None)
+    assert service.supervisor.confirm(real, "123456", None, "berta").id == real
+    service.wait(real, "done")
+    with pytest.raises(Conflict, match="nothing to confirm"):
+        service.supervisor.confirm(real, "123456", None, "anna")
+    wait_for("the audit", lambda: sum(one.what == "confirmation refused" for one in service.audit.entries()) == 3)
+    assert ("berta", "confirmed", real, "real") in lines(service)
+    service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+
+
+def test_a_signature_is_for_a_stop_that_was_not_confirmed_alone(service):
+    bad, good = ended(service), ended(service, "b", State.STOPPED)
+    service.supervisor.start()
+    with pytest.raises(Conflict, match="nothing to sign off: the run is stopped"):
+        service.supervisor.sign_off(good, "anna", "at rest")
+    assert service.store.signed_off(good) is None
+    with pytest.raises(Conflict, match="was not confirmed"):
+        begun(service)
+    service.supervisor.sign_off(bad, "anna", "at rest")
+    assert service.store.signed_off(bad)["note"] == "at rest"
+    begun(service, "done", "a", "done")
+    wait_for("the audit", lambda: ("anna", "signed off", bad, "a") in lines(service))
+
+
+def test_an_edit_waits_for_nobody_who_has_the_rig(service, monkeypatch, rigs):
+    service.supervisor.start()
+    rig = service.supervisor.rigs.get("real")
+    text = rig.path.read_text()
+    run = begun(service, "ask", "real", "awaiting_confirmation")
+    with pytest.raises(Conflict, match="has this rig"):
+        service.supervisor.edit_rig("real", text, rig.sha256, "anna")
+    service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+    wait_for("its end", lambda: not service.supervisor.live())
+    with pytest.raises(Conflict, match="changed meanwhile"):
+        service.supervisor.edit_rig("real", text, "0" * 64, "anna")
+    with pytest.raises(DataFileError):
+        service.supervisor.edit_rig("real", "torque: 1", rig.sha256, "anna")
+
+    def full(*_: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(supervisor_module, "write_whole", full)
+        with pytest.raises(LogError, match="No space"):
+            service.supervisor.edit_rig("real", text.replace("400.0", "300.0"), rig.sha256, "anna")
+    assert rig.path.read_text() == text
+    mode = rig.path.stat().st_mode
+    found = service.supervisor.edit_rig("real", text.replace("400.0", "300.0"), rig.sha256, "anna")
+    assert found.rig.limits.torque_nm == 300.0
+    assert rig.path.stat().st_mode == mode
+    assert (service.store.folder / "rigs" / "real" / f"{rig.sha256}.yaml").read_text() == text
+    wait_for("the audit", lambda: ("anna", "rig file edited", None, "real") in lines(service))
+
+
+def test_a_process_that_is_lost_is_looked_after_once_and_the_others_all_the_same(service, monkeypatch):
+    service.supervisor.start()
+    run, other = begun(service), begun(service, "hold", "b")
+    real, died = service.supervisor._died, []
+
+    def slow(one: str, status: Status) -> Status:
+        died.append(one)
+        going.wait(60.0)
+        return real(one, status)
+
+    going = threading.Event()
+    monkeypatch.setattr(service.supervisor, "_died", slow)
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    wait_for("the loss", lambda: died)
+    service.supervisor.stop(other, "anna")
+    service.wait(other, "stopped")                     # meanwhile
+    wait_for("its end", lambda: service.supervisor.live() == [run])
+    going.set()
+    service.wait(run, "interrupted")
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert died == [run]
+    status = service.store.status(run)
+    assert (status.exit_code, status.confirmation, status.error.kind) == (5, None, "CommunicationLost")
+    assert any(f"run {run}: its process is gone; stopping the drive" in one for one in service.said)
+    assert not (service.store.place(run) / ".reserve").exists()
+    assert all(child.poll() is not None for child in service.supervisor._children.values())
+
+
+def test_what_fails_at_one_run_keeps_nobody_from_the_others(service, monkeypatch):
+    service.supervisor.start()
+    run, other = begun(service), begun(service, "hold", "b")
+    real = service.supervisor._look_at
+
+    def looks(one: str) -> None:
+        if one == run:
+            raise RuntimeError("this one")
+        real(one)
+
+    monkeypatch.setattr(service.supervisor, "_look_at", looks)
+    service.supervisor.stop(other, "anna")
+    service.wait(other, "stopped")
+    wait_for("its end", lambda: service.supervisor.live() == [run])
+    assert f"run {run}: RuntimeError: this one" in service.said
+    monkeypatch.undo()
+    service.supervisor.stop(run, "anna")
+
+
+def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
+    service.supervisor.start()
+    found: list[tuple[str, str]] = []
+    monkeypatch.setattr(service.supervisor, "work", lambda what, run, asked: found.append((what, run)) or {
+        "document": {"verdict": "valid", "inertia_kg_m2": None}})
+    run = begun(service)
+    os.kill(service.store.status(run).pid, signal.SIGKILL)
+    service.wait(run, "interrupted")
+    wait_for("the result", lambda: service.store.result(run))
+    assert found == [("recover", run)]
+    wait_for("the index", lambda: [one.verdict for one in service.index.find()] == ["valid"])
+
+
+def test_arithmetic_that_fails_says_why(service, monkeypatch):
+    with pytest.raises(Refused, match="nosuch") as refused:
+        service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
+    assert refused.value.told.exit_code != 0
+    broken = SimpleNamespace(stdout=b"no JSON", stderr=b"first\nkilled\n")
+    monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
+    with pytest.raises(Refused) as refused:
+        service.supervisor.work("plan", None, {})
+    assert (refused.value.told.message, refused.value.told.what) == ("the work failed", "killed")
+    broken.stderr = b""
+    with pytest.raises(Refused):
+        service.supervisor.work("plan", None, {})
+
+
+def test_an_audit_or_an_index_that_cannot_be_written_is_said_and_holds_nothing_up(service, monkeypatch):
+    def full(*_: Any, **__: Any) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        for name in ("note", "begin"):
+            patched.setattr(service.audit, name, full)
+        for name in ("put", "rebuild"):
+            patched.setattr(service.index, name, full)
+        service.supervisor.start()
+        run = begun(service, "done", "a", "done")
+        for words in ("the audit can't be written", "the index has to wait", "the index can't be made"):
+            wait_for(words, lambda words=words: any(words in one for one in service.said))
+        assert sum("the index has to wait" in one for one in service.said) == 1
+    wait_for("the index", lambda: [one.id for one in service.index.find()] == [run])
+
+
+@pytest.mark.parametrize(("simulated", "state", "turns"), [
+    (False, State.MOVING, True), (False, State.AWAITING, False), (True, State.MOVING, False)])
+def test_a_real_shaft_of_a_run_that_moves_may_turn(service, monkeypatch, simulated, state, turns):
+    run = service.store.new_id()
+    status = service.store.begin(Request(run, "a", "rig.yaml", "0" * 64, {}, "anna", now(), simulated, "never"))
+    status = status.to(State.PREFLIGHT, now())
+    service.store.save(status.to(state, now()))
+    service.supervisor._live[run] = None
+    assert service.supervisor.turning() is turns
+    service.supervisor._live.clear()
+    monkeypatch.setattr(supervisor_module, "holders", lambda: ["somebody"])
+    assert service.supervisor.turning()
+
+
+def test_the_codes_of_runs_that_wait_are_shown_at_the_terminal_of_the_service(service):
+    service.supervisor.start()
+    run = begun(service, "ask", "real", "awaiting_confirmation")
+    wait_for("the code", lambda: any("123 456" in one for one in service.said))
+    service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+    wait_for("its end", lambda: not service.supervisor.live())
+    assert run not in service.supervisor._console._shown
+
+
+def test_a_run_s_process_is_one_of_its_own(service):
+    """What ends the web's session ends no run; and its lock is handed on, so that it never looks dead."""
+    service.supervisor.start()
+    run = begun(service)
+    pid = service.store.status(run).pid
+    assert os.getsid(pid) == pid
+    assert service.supervisor._children[run].args == [sys.executable, str(FAKE), str(service.store.place(run))]
+    service.supervisor.stop(run, "anna")
+    service.wait(run, "stopped")
+
+
+@pytest.mark.parametrize("at", ["new_id", "begin"])
+@pytest.mark.parametrize(("number", "kind"), [(errno.ENOSPC, NoRoom), (errno.EDQUOT, NoRoom), (errno.EROFS, LogError)])
+def test_a_run_that_cannot_be_written_down_is_none(service, monkeypatch, at, number, kind):
+    def full(*_: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(service.store, at, full)
+    with pytest.raises(kind, match=os.strerror(number)) as refused:
+        service.supervisor.start_run("a", {}, "anna")
+    assert refused.value.next_step.startswith("Nothing was started.")
+    assert service.store.ids() == []
+    assert service.supervisor.live() == []
