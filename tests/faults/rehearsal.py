@@ -47,8 +47,12 @@ class Rehearsed:
         assert abs(self.shaft.speed_rad_s).max(initial=0.0) < 0.001
         assert "nothing has moved" in self.done.err or "shaft is at rest" in self.done.err
 
-    def assert_stopped(self, since_s, notice_s, *, held=True):
-        """Within the time to notice it, the ramp and the settling; never let go while it turned, but by the drive."""
+    def assert_stopped(self, since_s, notice_s, *, held=True, backwards_rad_s=0.3):
+        """Within the time to notice it, the ramp and the settling; never let go while it turned, but by the drive.
+
+        ``backwards_rad_s``: how fast it may turn backwards; a sign probe the wrong way round is the worst of it where
+        the drive's own sensor and power stage are good.
+        """
         shaft = self.shaft
         after = shaft.time_s >= since_s
         fastest = np.abs(shaft.speed_rad_s[after]).max()
@@ -58,7 +62,7 @@ class Rehearsed:
             free = np.array([state not in HELD for state in shaft.state])
             assert not np.any(np.abs(shaft.speed_rad_s[free]) > 0.05), "a turning shaft was disabled"
         assert shaft.time_s[-1] - shaft.at_rest_from() >= 1.0
-        assert shaft.speed_rad_s.min() > -0.3                # a sign probe the wrong way round is the worst of it
+        assert shaft.speed_rad_s.min() > -backwards_rad_s
         return round(self.standstill_s(since_s), 2)
 
     def assert_log_whole(self):

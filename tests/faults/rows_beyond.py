@@ -326,4 +326,44 @@ BETWEEN: dict[int, Row] = {
              "nothing but the host can stop it, so the stop is tried in every cycle"),
 }
 
-BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN
+SCRIPTED, OVER_MODBUS = f"{HERE}test_rows_scripted.py::test_row", f"{HERE}test_modbus_scripted.py::test_row"
+OBSERVER, DOUBT = "tests/run/test_observer.py::", "tests/run/test_stop_doubt.py::"
+
+LYING: dict[int, Row] = {
+    115: Row("the drive's speed sensor is lost or frozen; its speed control follows it",
+             "found by torque and inertia; QS; never disabled as at standstill; torque off if the shaft accelerates",
+             "8", (SCRIPTED, OVER_MODBUS,
+                   f"{OBSERVER}test_a_lost_encoder_is_found_before_the_shaft_is_fast",
+                   f"{OBSERVER}test_a_sensor_that_is_dead_in_the_stop_is_seen_in_two_ways",
+                   f"{OBSERVER}test_a_speed_that_was_lost_is_not_believed_again",
+                   f"{DOUBT}test_a_speed_that_is_lost_disables_nothing")),
+    116: Row("the reported speed is lost or frozen, the sensor is good",
+             "QS; standstill by the position, where it goes on; else not confirmed and not disabled", "6, 8",
+             (SCRIPTED, OVER_MODBUS, f"{OBSERVER}test_a_speed_that_jumps_is_found_at_once",
+              f"{OBSERVER}test_a_speed_that_freezes_is_found_once_the_shaft_turns_otherwise",
+              f"{OBSERVER}test_a_position_that_lives_stands_in_for_a_lost_speed",
+              f"{DOUBT}test_with_a_position_that_lives_standstill_is_confirmed")),
+    117: Row("the scale of the reported speed changes in motion", "QS", "6, 8",
+             (SCRIPTED, f"{OBSERVER}test_a_speed_that_jumps_is_found_at_once")),
+    118: Row("the reported torque contradicts the commanded torque, or the motion", "QS, no J", "6",
+             (SCRIPTED, OVER_MODBUS, f"{OBSERVER}test_a_torque_that_lies_is_found_in_torque_mode",
+              f"{OBSERVER}test_a_torque_that_lies_is_found_under_speed_control",
+              f"{OBSERVER}test_torque_alone_is_doubted_where_it_contradicts_its_command")),
+    119: Row("the reported position contradicts the reported speed", "QS", "6, 8",
+             (SCRIPTED, f"{OBSERVER}test_a_position_that_does_not_go_as_far_as_the_speed_says",
+              f"{OBSERVER}test_the_position_finds_a_frozen_speed_however_little_torque_it_takes")),
+    120: Row("all feedback is zero, or has all bits set (gateway without its drive, dead TPDO)",
+             "no valid state: QS again and again; nothing is disabled", "8",
+             (SCRIPTED, OVER_MODBUS,
+              f"{DOUBT}test_a_drive_that_shows_no_state_gets_its_quick_stop_again_and_again",
+              "tests/run/test_standstill.py::test_a_report_that_shows_none")),
+    121: Row("the shaft accelerates against its quick stop (polarity, stuck torque, wrong sensor)",
+             "seen in two ways: torque off, 8; above a drill string only beyond the speed limit", "8",
+             (SCRIPTED, f"{OBSERVER}test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways",
+              f"{OBSERVER}test_above_a_drill_string_the_torque_is_left_on_below_the_speed_limit",
+              f"{DOUBT}test_a_runaway_loses_its_torque_and_nothing_is_confirmed",
+              f"{DOUBT}test_above_a_string_the_torque_stays_on_below_the_limit",
+              f"{DOUBT}test_above_a_string_it_is_removed_beyond_the_limit")),
+}
+
+BEYOND = LATE | SECOND_MASTER | MODBUS | UNITS | STAGES | COMMAND_LINE | LOG | SOFT_TORQUE | BETWEEN | LYING

@@ -56,6 +56,11 @@ CASES = (
     Case(44, "word-order", 4, ("register 42", "12345678h"), "refused"),
     Case(45, "reads-back-otherwise", 4, ("register 38", "wanted 0.4"), "refused"),
     Case(50, "watchdog-not-armed", 4, ("register 40", "wanted 0.5 s, found 0 s"), "refused"),
+    Case(115, "sensor-lost" + IN_MOTION, 8, ("contradict each other", "encoder"), "coasts"),
+    Case(116, "speed-frozen@acquire+2s", 8, ("contradict each other", "encoder"), notice_s=7.0),
+    Case(118, "torque-scale=0.5", 6, ("contradicts the commanded torque",), notice_s=60.0),
+    Case(120, "feedback-zero" + IN_MOTION, 8, ("no valid state",)),
+    Case(120, "feedback-ones" + IN_MOTION, 8, ("no valid state",)),
 )
 
 

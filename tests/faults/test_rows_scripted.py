@@ -12,11 +12,15 @@ NOTICED_AT_ONCE_S = 0.1        # five cycles
 HEARTBEAT_S = 0.7              # 0.5 s without one, which may have been due 0.1 s before
 FEEDBACK_S = 0.4               # a quarter of a second without feedback
 WATCHDOG_S = 0.6               # the drive's own, and a cycle
+CONTRADICT = ("contradict each other", "The shaft was stopped")
 
 
 @dataclass(frozen=True)
 class Case:
-    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go)."""
+    """``ends``: refused (nothing moves), held (the drive holds the shaft until it rests), coasts (the drive let go).
+
+    ``backwards_rad_s``: so fast a wrong sensor or power stage may turn the shaft backwards before that is noticed.
+    """
 
     row: int
     fault: str
@@ -26,6 +30,7 @@ class Case:
     notice_s: float = NOTICED_AT_ONCE_S
     more: tuple[object, ...] = ()
     confirmed: bool = True
+    backwards_rad_s: float = 0.3
 
     @property
     def id(self):
@@ -59,13 +64,30 @@ CASES = (
     Case(33, "sto" + IN_MOTION, 6, ("statusword", "STO"), "coasts"),
     Case(33, "sto@setup", 6, ("within 3 s of enabling", "STO"), "refused"),
     Case(33, "internal-limit@torque+3s", 7, ("internal limit", "bit 11", "panel"), notice_s=4.5),
-    Case(34, "load-lost@torque+3s", 7, ("internal limit",), notice_s=2.0),
-    Case(34, "load-lost@acquire+2s", 7, ("internal limit",), notice_s=3.0),
+    Case(34, "load-lost@torque+3s=20%", 7, ("changes faster than this shaft", "Was the load lost?"), notice_s=2.0),
+    Case(34, "load-lost@acquire+2s", 7, ("changes faster than this shaft", "Was the load lost?"), notice_s=3.0),
     Case(35, "torque-scale@speed+15s=5", 7, ("beyond the limit of 400 N·m",)),
     Case(36, "encoder-inverted", 4, ("sign probe", "turned backwards", "encoder wiring"), notice_s=7.0),
     Case(45, "write-not-kept", 4, ("6080h", "speed limit: wanted"), "refused"),
     Case(45, "reads-back-otherwise", 4, ("6072h", "torque limit: wanted 400"), "refused"),
     Case(50, "watchdog-not-armed", 4, ("1016h:1", "watchdog: wanted", "leave the shaft turning"), "refused"),
+    Case(115, "sensor-lost" + IN_MOTION, 8, (*CONTRADICT, "encoder"), "coasts", confirmed=False),
+    Case(115, "sensor-lost@torque+3s", 8, (*CONTRADICT, "encoder"), notice_s=1.5, confirmed=False),
+    Case(115, "sensor-frozen@acquire+2s", 8, (*CONTRADICT, "encoder"), "coasts", confirmed=False,
+         backwards_rad_s=3.0),
+    Case(116, "speed-lost" + IN_MOTION, 6, (*CONTRADICT, "encoder"), notice_s=0.3),
+    Case(116, "speed-frozen@acquire+2s", 8, ("position", "contradict each other"), notice_s=2.0, confirmed=False),
+    Case(117, "speed-scale@acquire+2s=0.5", 8, (*CONTRADICT, "reported speed"), notice_s=0.3, confirmed=False),
+    Case(118, "torque-scale=0.5", 6, ("contradicts the commanded torque", "per_lsb of 6071h and 6077h"), notice_s=60.0),
+    Case(118, "torque-sign@acquire+2s", 6, ("contradict", "reported"), notice_s=4.0),
+    Case(119, "position-frozen" + IN_MOTION, 6, ("reported position and reported speed contradict", "6064h"),
+         notice_s=2.0),
+    Case(120, "feedback-zero" + IN_MOTION, 8, ("0000h", "no valid state"), confirmed=False),
+    Case(120, "feedback-ones" + IN_MOTION, 8, ("FFFFh", "no valid state"), confirmed=False),
+    Case(121, "quick-stop-inverted", 8, ("EMCY 7305h",), "coasts", more=("--fault", "emcy" + IN_MOTION),
+         confirmed=False),
+    Case(121, "motor-polarity" + IN_MOTION, 8, CONTRADICT, "coasts", confirmed=False, backwards_rad_s=6.0),
+    Case(121, "torque-stuck@acquire+2s=100", 8, ("contradicts the commanded torque",), "coasts", confirmed=False),
 )
 
 
@@ -77,7 +99,9 @@ def test_row(case, rehearse, seen):
     if case.ends == "refused":
         run.assert_nothing_moved()
     else:
-        standstill_s = run.assert_stopped(run.fault_s, case.notice_s, held=case.ends == "held")
+        standstill_s = run.assert_stopped(
+            run.fault_s, case.notice_s, held=case.ends == "held", backwards_rad_s=case.backwards_rad_s
+        )
         run.shaft.assert_enabled(True)
     assert ("NOT confirmed" in run.done.document["stop"]) is not case.confirmed
     if not case.confirmed:
