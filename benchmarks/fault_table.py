@@ -22,7 +22,8 @@ HEAD = """# The faults, and what a run does about each
 
 The first fifty were asked for; those beyond were found by trying. Made by `python benchmarks/fault_table.py` from the
 tests that it names; a rehearsal of any scripted row is `tdhil identify --simulate --fault NAME@STAGE+2s` (`--fault
-list` shows the names).
+list` shows the names). `NAME@stop` begins when the drive is first commanded to come to rest. Lying reports, sensors and
+power stages have a table of their own: `sim_bus/reports.py`.
 
 **QS** the one stop sequence: quick stop, standstill seen, trapped torque down, only then disable · **WD** the drive's
 own watchdog stops the shaft · **R** refused before the shaft has moved · **M** the run goes on, and what was degraded

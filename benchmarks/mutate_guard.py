@@ -7,9 +7,10 @@
     python benchmarks/mutate_guard.py clock --limit 20 --skip 40
 
 Guard and stop, the protocol's stages, the drivers' time, limits, watchdogs and bare stops, the log's writer, and the
-end of `tdhil identify`. Works on copies in memory: a child process per mutant is forked off this one, loads the changed
-module in the place of the real one, and runs the module's tests up to the first failure. Nothing in the checkout is
-written. A subject whose tests fail as it is comes first: nothing can be said of it.
+end of `tdhil identify`; of the service what begins, stops and loses a run, who may do what, its audit and its door.
+Works on copies in memory: a child process per mutant is forked off this one, loads the changed module in the place of
+the real one, and runs the module's tests up to the first failure. Nothing in the checkout is written. A subject whose
+tests fail as it is comes first: nothing can be said of it.
 """
 
 from __future__ import annotations
@@ -38,12 +39,13 @@ OURS = ("drivers", "profiles", "sim_bus", "tdhil")
 class Subject:
     """A module below the root, the tests (below ``tests/``) that guard it, and what of it is meant (none: all).
 
-    ``within``: names that stand at the module's top: functions, classes, constants.
+    ``within``: names that stand at the module's top: functions, classes, constants. ``heavy``: the heavy tests run too.
     """
 
     path: str
     tests: tuple[str, ...]
     within: frozenset[str] = frozenset()
+    heavy: bool = True
 
     @property
     def module(self) -> str:
@@ -58,6 +60,11 @@ def _driver(name: str, *tests: str, within: str = "") -> Subject:
     return Subject(f"drivers/{name}.py", tuple(f"drivers/{test}" for test in tests), frozenset(within.split()))
 
 
+def _service(name: str, *tests: str, within: str = "") -> Subject:
+    tests = tuple(f"service/{test}" for test in tests)
+    return Subject(f"tdhil/service/{name}.py", tests, frozenset(within.split()), heavy=False)
+
+
 _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_polls.py",
@@ -67,6 +74,7 @@ SUBJECTS = {
     "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py", "test_kept_within.py"),
     "stop": _run("stop", *_STOP),
     "string_release": _run("string_release", *_STOP),
+    "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_runner.py"),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py"),
@@ -102,13 +110,38 @@ SUBJECTS = {
         within="HEARTBEAT_S ANSWER_S SignOfLife _guarded",
     ),
     "canopen/watchdog": _driver(
-        "canopen/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py"
+        "canopen/watchdog", "test_preflight.py", "test_no_watchdog.py", "test_guarding.py", "test_watchdog_feed.py",
+        "test_angle_in_cycle.py", "test_changed_feedback.py", "test_other_master.py",
     ),
+    "canopen/state_machine": _driver(
+        "canopen/state_machine", "test_state_machine.py", "test_no_valid_state.py", "test_falling_out.py"
+    ),
+    "canopen/pdo_mapping": _driver("canopen/pdo_mapping", "test_pdo_mapping.py", "test_other_master.py"),
+    "canopen/position": _driver(
+        "canopen/position", "test_position.py", "test_angle_in_cycle.py", "test_profile_preflight.py"
+    ),
+    "canopen/slow_feedback": _driver("canopen/slow_feedback", "test_angle_in_cycle.py", "test_drive_contract.py"),
+    "canopen/sdo_feedback": _driver("canopen/sdo_feedback", "test_sdo_feedback.py", "test_no_valid_state.py"),
+    "canopen/other_master": _driver("canopen/other_master", "test_other_master.py", "test_falling_out.py"),
+    "canopen/read back": _driver(
+        "canopen/supervision", "test_other_master.py", "test_changed_feedback.py",
+        within="Group ReadBack _Watched _shown",
+    ),
+    "angle": _driver("angle", "test_angle_in_cycle.py"),
+    "bare stop": _driver("quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py"),
     "canopen/quick_stop": _driver(
         "canopen/quick_stop", "test_quick_stop.py",
         within="HALT BY_SDO_TRIES BY_RPDO_TRIES BURST BURST_PAUSE_S NEAR_ZERO_RAD_S NEAR_ZERO_LSB MODE_S MODE_PAUSE_S "
         "_RPDOS _CONTROLWORD _COAST _BRAKE_AND_HOLD Cia402Target",
     ),
+    "modbus/state_machine": _driver(
+        "modbus/state_machine", "test_modbus_state_machine.py", "test_no_valid_state.py", "test_modbus_drive.py"
+    ),
+    "modbus/drive": _driver(
+        "modbus/drive", "test_modbus_drive.py", "test_no_valid_state.py", "test_angle_in_cycle.py",
+        "test_modbus_preflight.py", "test_modbus_other_master.py", "test_sdo_feedback.py", "test_drive_contract.py",
+    ),
+    "modbus/position": _driver("modbus/position", "test_position.py", "test_angle_in_cycle.py"),
     "modbus/tcp": _driver("modbus/tcp", "test_modbus_links.py"),
     "modbus/preflight": _driver(
         "modbus/preflight", "test_modbus_preflight.py", "test_modbus_wrongs.py",
@@ -131,12 +164,23 @@ SUBJECTS = {
     "mcap_container": Subject(
         "tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")
     ),
+    "log_place": Subject("tdhil/session/log_place.py", ("session/test_log_place.py", "cli/test_identify_end.py")),
+    "service/supervisor": _service("supervisor", "test_lost_drive.py", "test_supervisor.py"),
+    "service/run_process": _service("run_process", "test_run_process.py", "test_attended.py"),
+    "service/access": _service("access", "test_access.py"),
+    "service/attending": _service("attending", "test_attending.py"),
+    "service/audit": _service("audit", "test_store.py"),
+    "service/door": _service("door", "test_door.py"),
+    "service/drive_stop": _service("drive_stop", "test_drive_stop.py"),
+    "session/holder": Subject("tdhil/session/holder.py", ("session/test_holder.py",)),
+    "session/kept": Subject("tdhil/session/kept.py", ("session/test_kept.py",)),
+    "session/run_session": Subject(
+        "tdhil/session/run_session.py", ("service/test_run_process.py", "cli/test_identify_end.py")
+    ),
     "identify": Subject(
-        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_failed"})
+        "tdhil/cli/identify.py", ("cli/test_identify_end.py",), frozenset({"_run", "_finish", "_failed"})
     ),
-    "stop_on_signals": Subject(
-        "tdhil/session/stop_signals.py", ("cli/test_identify_end.py",), frozenset({"_NAMES", "stop_on_signals"})
-    ),
+    "stop_on_signals": Subject("tdhil/session/stop_signals.py", ("cli/test_identify_end.py",)),
 }
 NAMED: tuple[tuple[str, str, str], ...] = (
     ("canopen/drive", "stall_share * self._watchdog_s", "10.0 * stall_share * self._watchdog_s"),
@@ -144,6 +188,8 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("canopen/limits", "return _rounded(one, limits.torque_nm * nm, per_lsb, math.floor)",
      "return _rounded(one, limits.torque_nm * nm, per_lsb, math.ceil)"),
     ("canopen/supervision", "self._every_s = min(HEARTBEAT_S, every_s)", "self._every_s = HEARTBEAT_S"),
+    ("canopen/watchdog", "return time_ms / 5000.0", "return time_ms / 2500.0"),
+    ("canopen/state_machine", "return State.UNKNOWN if state is State.NOT_READY else state", "return state"),
     ("modbus/tcp", "self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)", "pass"),
     ("modbus/watchdog", "good = LEAST_CYCLES * period_s <= value <= ", "good = value <= "),
     ("modbus/preflight", "            access.write(register, 0)\n", "            pass\n"),
@@ -159,6 +205,19 @@ NAMED: tuple[tuple[str, str, str], ...] = (
     ("preconditions", "if not preflight.quick_stop_holds:", "if preflight.quick_stop_holds is False:"),
     ("mcap_container", "if found.st_size < self._offset:", "if False:"),
     ("stop_on_signals", '"SIGQUIT", ', ""),
+    ("service/run_process", "if (early := read_json(self.folder / STOP_FILE)) is not None:",
+     "if (early := None) is not None:"),
+    ("service/run_process", "        refuse_changed(path, self.request.rig_sha256)      # after", "        # after"),
+    ("service/supervisor", "state = State.INTERRUPTED if seen else State.STOP_NOT_CONFIRMED",
+     "state = State.INTERRUPTED"),
+    ("service/supervisor", "stop = replace(status.stop, confirmed=seen, at_rest=now() if seen else None, **first)",
+     "stop = replace(status.stop, confirmed=True, at_rest=now(), **first)"),
+    ("service/supervisor", "            if same:\n                return seen",
+     "            if True:\n                return seen"),
+    ("service/audit", "if seal.anchor not in ends:", "if False:"),
+    ("service/audit", "if head not in ends or not (sealed or head.number <= seal.plain):", "if head not in ends:"),
+    ("service/door", "first = min(among, key=lambda one: one.rank)", "first = next(iter(among))"),
+    ("service/drive_stop", "if found[\"at_rest\"] and found[\"same_drive\"] else", "if found[\"at_rest\"] else"),
 )
 """(subject, what stands there, what it becomes): lines that could be changed unnoticed once, and what came anew."""
 
@@ -166,11 +225,23 @@ LONGEST_S, LONGEST = 90, 4
 """A mutant that loops for ever counts as found: after so long, and after so many times what the tests take as it is."""
 
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
+_POWER = "shows after a loss of power alone"
+_A_PROCESS = "a process of its own loads the file and not the mutant; tests that begin one fail without the line"
 EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
     "stop.py, _see_rest: return None (last)": _FALLS_THROUGH,
     "stop.py, _gets_slower: return False (last)": _FALLS_THROUGH,
     "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
+    **{f"{name}.py, module: {line}": _A_PROCESS for name in ("service/run_process", "service/drive_stop")
+       for line in ("if __name__ == '__main__':", "sys.exit(main(sys.argv[1:]))")},
+    "service/audit.py, _verify: return None (last)": _FALLS_THROUGH,
+    "service/audit.py, _add: file.flush()": _POWER,
+    "service/audit.py, _add: os.fsync(file.fileno())": _POWER,
+    "service/audit.py, _read: assert plain is not None": "says to mypy what the TypeError two lines on says as well",
+    "service/run_process.py, answer: return {'status': self.board.status.plain()}":
+        "the function's last line returns the same, and nothing between asks for this",
+    "service/run_process.py, _run: self.stop.check(next_step='Nothing has moved')":
+        "a stop is seen once more by the Runner, before it moves anything; here it only comes sooner",
     "string_release.py, _yielding: assert self._reference_nm is not None": "says to mypy what its caller has just set",
 }
 """Deletions that change nothing that can be seen, and why. (mypy refuses them all the same.)"""
@@ -283,7 +354,7 @@ def run_tests(subject: str, changed: Changed) -> int:
     forget(SUBJECTS[subject].module)
     sys.meta_path.insert(0, changed)
     quiet = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--hypothesis-seed=0", "-o", "addopts=",
-             "--all-but-long"]
+             *(["--all-but-long"] if SUBJECTS[subject].heavy else [])]
     files = [str(TESTS / name) for name in SUBJECTS[subject].tests]
     return int(pytest.main([*quiet, "--import-mode=importlib", *files]))
 

@@ -4,6 +4,7 @@
     python benchmarks/service_proofs.py stop [--full]      # a stop over HTTP beside all that could be in its way
     python benchmarks/service_proofs.py cycles [--full]    # the control loop with server and viewers, and without
     python benchmarks/service_proofs.py lost [--full]      # the run's process is killed
+    python benchmarks/service_proofs.py idle [--full]      # a stop over HTTP beside 5,000 idle connections
 
 - kill: SIGKILL of the web, and a new one, again and again (5 times; --full: 50) while stepped runs of one seed go. A
   new web knows the run, and what it is, within 3 s of its start; the log has the samples of a run that nobody
@@ -17,8 +18,14 @@
   at most 5 % of a core.
 - lost: SIGKILL of the run's process, while it turns a drive in another process whose watchdog has 5 s (2 times; --full:
   10). `tdhil stop` is on its way within 5 s, the drive brakes, and the run says what became of it.
+- idle: a process keeps 5,000 connections to the service's port of loopback, and opens each again that is closed. They
+  come from some 40 addresses (127.0.1.x) with few connections each and from 3 with very many. One half sends nothing,
+  the other half begins a header. Meanwhile some 20 stops a second are asked for, each by a new connection: from an
+  address without other connections, and from one with very many (8 s; --full: 60 s). From the call to the answer it
+  takes at most 200 ms in 99 of 100, and each answer says that the run was asked to stop. Once with the limit of open
+  files that holds here, once with 1,024.
 
-`cycles` and `stop` want a machine with nothing else to do, and say the load that they had.
+`cycles`, `idle` and `stop` want a machine with nothing else to do, and say the load that they had.
 """
 
 from __future__ import annotations
@@ -58,7 +65,8 @@ from tests.service.test_lost_run import LIMITS, simulated_drive, speed_rad_s  # 
 from tests.service.test_serve import Server, served  # noqa: E402
 
 RIG = "simulated-canopen"
-FOUND_S, STOP_S, LOST_S = 3.0, 0.1, 5.0
+FOUND_S, STOP_S, LOST_S, IDLE_STOP_S = 3.0, 0.1, 5.0, 0.2
+STOPS_A_SECOND = 20
 MORE_MISSED, WEB_SHARE = 1e-3, 0.05
 RATE_HZ, VIEWERS = 100.0, 20
 TMPFS_MB = 400                     # a log isn't begun where less than 200 MB are free
@@ -394,13 +402,121 @@ def lost(folder: Path, times: int, seed: int) -> bool:
     return good and max(took) <= LOST_S
 
 
+# -- idle -------------------------------------------------------------------------------------------------------------
+
+
+def addresses(count: int) -> list[str]:
+    """A source address for each connection: three quarters share three addresses, the rest has 40."""
+    many, few = [f"127.0.1.{1 + n}" for n in range(3)], [f"127.0.1.{101 + n}" for n in range(40)]
+    return [many[n % len(many)] if n % 4 else few[n // 4 % len(few)] for n in range(count)]
+
+
+def keep_idle(port: int, count: int) -> None:
+    """So many connections, in a process of its own, until it is ended; each second a line says what there is."""
+    import resource
+    import selectors
+    import socket
+
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    os.nice(10)                            # it is to take the service's descriptors, and not its processor
+    chosen, look = selectors.DefaultSelector(), time.monotonic() + 1.0
+    sources, opened = addresses(count), 0
+
+    def begin(number: int) -> None:
+        nonlocal opened
+        peer = socket.socket()
+        peer.setblocking(False)
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")      # leaves no port behind
+        peer.bind((sources[number], 0))
+        peer.connect_ex(("127.0.0.1", port))
+        opened += 1
+        chosen.register(peer, selectors.EVENT_WRITE, (number, False))
+
+    for number in range(count):
+        begin(number)
+    while True:
+        for key, _ in chosen.select(0.2):
+            number, there = key.data
+            peer = key.fileobj
+            assert isinstance(peer, socket.socket)
+            try:
+                if there:
+                    peer.recv(1)           # closed by the other end, or reset
+                    raise ConnectionError
+                if number % 2:
+                    peer.send(b"POST /api/v1/runs/x/stop HTTP/1.1\r\nHost: 127.0.0.1\r\n")
+                chosen.modify(peer, selectors.EVENT_READ, (number, True))
+            except OSError:
+                chosen.unregister(peer)
+                peer.close()
+                begin(number)
+        if time.monotonic() >= look:
+            look += 1.0
+            there_now = sum(key.data[1] for key in chosen.get_map().values())
+            print(f"{there_now} {opened}", flush=True)
+
+
+def timed_stop(url: str, run: str, source: str) -> tuple[float, Any]:
+    """A new connection, a whole request, and its answer: the time that it took, and the run's stop."""
+    import http.client
+    from urllib.parse import urlsplit
+
+    at = urlsplit(url)
+    begun_s = time.monotonic()
+    with contextlib.closing(http.client.HTTPConnection(at.hostname or "", at.port, 30.0, (source, 0))) as client:
+        client.request("POST", f"/api/v1/runs/{run}/stop", "{}", {"Content-Type": "application/json"})
+        answer = json.loads(client.getresponse().read())
+    return time.monotonic() - begun_s, answer.get("stop")
+
+
+def idle(folder: Path, seconds: float, descriptors: int | None, count: int = 5000) -> bool:
+    """``descriptors``: the limit of open files that the service has; None: as it is here."""
+    took_s: list[float] = []
+    good, most, opened = True, 0, 0
+    with served(folder / f"data-{descriptors}", descriptors=descriptors) as server:
+        run = server.client.start(RIG, real_time=True, rate_hz=10.0)["id"]
+        wait_for("motion", lambda: stage_of(server, run) == "speed" or ended_early(server, run))
+        port = server.url.rpartition(":")[2]
+        with subprocess.Popen([sys.executable, __file__, "keep", port, str(count)], stdout=subprocess.PIPE,
+                              text=True) as child:
+            assert child.stdout is not None
+            try:
+                child.stdout.readline()
+                end_s, number = time.monotonic() + seconds, 0
+                while time.monotonic() < end_s:
+                    for _ in range(STOPS_A_SECOND):
+                        source = "127.0.0.9" if number % 2 else "127.0.1.1"
+                        took, stop = timed_stop(server.url, run, source)
+                        took_s.append(took)
+                        good &= bool(stop and stop["asked"])
+                        number += 1
+                        time.sleep(1.0 / STOPS_A_SECOND)
+                    there, opened = (int(one) for one in child.stdout.readline().split())
+                    most = max(most, there)
+            finally:
+                child.kill()
+        wait_for("its end", lambda: state_of(server, run) in ENDED)
+        end, said = server.client.run(run), server.said()
+    good &= end["stop"]["confirmed"] is True and "Traceback" not in said
+    p99_s = quantile(sorted(took_s), 0.99)
+    print(f"{'no own' if descriptors is None else descriptors} limit of open files: {len(took_s)} stops beside {count}"
+          f" idle connections ({most} open at once, {opened} opened in all): p99 {1e3 * p99_s:.0f} ms, median"
+          f" {1e3 * float(np.median(took_s)):.0f} ms, longest {1e3 * max(took_s):.0f} ms; the run is {end['state']};"
+          f" {len(said)} bytes of log; {load()}", flush=True)
+    return good and p99_s <= IDLE_STOP_S and len(said) <= 200 * (seconds + 60.0)
+
+
 def main(arguments: list[str]) -> int:
     """0 where all holds."""
     if arguments[:1] == ["view"]:
         view(arguments[1], arguments[2], int(arguments[3]))
         return 0
+    if arguments[:1] == ["keep"]:
+        keep_idle(int(arguments[1]), int(arguments[2]))
+        return 0
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("kill", "stop", "cycles", "lost"))
+    parser.add_argument("what", choices=("kill", "stop", "cycles", "lost", "idle"))
     parser.add_argument("--full", action="store_true", help="as many as the promise is for")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--mounted", action="store_true", help=argparse.SUPPRESS)
@@ -413,6 +529,7 @@ def main(arguments: list[str]) -> int:
         "stop": lambda folder: stop(folder, 50 if options.full else 4, options.mounted),
         "cycles": lambda folder: cycles(folder, *((6, 60.0) if options.full else (2, 20.0))),
         "lost": lambda folder: lost(folder, 10 if options.full else 2, options.seed),
+        "idle": lambda folder: all(idle(folder, 60.0 if options.full else 8.0, one) for one in (None, 1024)),
     }
     with tempfile.TemporaryDirectory() as folder:
         try:
