@@ -5,6 +5,8 @@ import numpy as np
 from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
 
 LINES = (0.1, 0.2, 0.3, 0.4)
+UNRECORDED_S = 2.0
+"""Between two segments: the closed form has no torque that would change the mean speed, so it must not be recorded."""
 
 
 def closed_form(
@@ -43,7 +45,7 @@ def closed_form(
             Segment(start + begin, start + begin + periods * period, period, 1, offset, tuple(lines),
                     tuple(amplitudes), tuple(np.angle(speed_lines)))
         )
-        begin += periods * period
+        begin += periods * period + UNRECORDED_S
     time = np.concatenate(times)
     count = len(time)
     return Recording(

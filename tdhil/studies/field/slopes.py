@@ -229,7 +229,10 @@ _AROUND_S = 1.0        # kept before and after a record's segments
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
-    """One Recording of all: times shifted, each torque less its own offset; levels and ramps are left out."""
+    """One Recording of all: times shifted, each torque less its own offset.
+
+    Levels, ramps, commanded and demanded torque and the angle are left out: a slope needs none of them.
+    """
     times, speeds, torques, fresh, limited = [], [], [], [], []
     segments: list[Segment] = []
     begin_s = 0.0
@@ -261,6 +264,9 @@ def joined(recordings: Sequence[Recording]) -> Recording:
         ramps=(),
         stages=(),
         torque_offset_nm=0.0,
+        commanded_torque_nm=None,
+        demanded_torque_nm=None,
+        position_rad=None,
     )
 
 
