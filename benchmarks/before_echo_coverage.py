@@ -25,7 +25,7 @@ from scipy.stats import beta
 
 from tdhil.estimation import Identification, identify
 from tdhil.recording import LagPrior
-from tdhil.run.excitation import periodic_kind
+from tdhil.runner.excitation import periodic_kind
 from tests.estimation.loaded_bench import Loaded, records
 
 NOISY = Loaded(bit_noise_nm=500.0)

@@ -35,9 +35,9 @@ from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.params import RigParams
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.run_log import RunLog
-from tdhil.run.control_loop import ControlLoop
-from tdhil.run.guard import Guard
-from tdhil.run.settings import MachineLimits, StopRequest
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.guard import Guard
+from tdhil.runner.settings import MachineLimits, StopRequest
 
 RATE_HZ = 250.0
 LIMITS = DriveLimits(speed_rad_s=10.0, torque_nm=400.0, quick_stop_rad_s2=2.0, watchdog_s=0.5)

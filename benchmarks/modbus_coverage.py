@@ -31,9 +31,9 @@ from tdhil.estimation.result import Options
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.recording import Recording, Stage
 from tdhil.recording.run_log import RunLog
-from tdhil.run.runner import Runner
-from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.run.task import Task
+from tdhil.runner.five_stages import Runner
+from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.task import Task
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(

@@ -53,7 +53,7 @@ class Subject:
 
 
 def _run(name: str, *tests: str, within: str = "") -> Subject:
-    return Subject(f"tdhil/run/{name}.py", tuple(f"run/{test}" for test in tests), frozenset(within.split()))
+    return Subject(f"tdhil/runner/{name}.py", tuple(f"runner/{test}" for test in tests), frozenset(within.split()))
 
 
 def _driver(name: str, *tests: str, within: str = "") -> Subject:
@@ -69,18 +69,18 @@ _STOP = (
     "test_stop.py", "test_stop_feedback.py", "test_stop_interrupted.py", "test_stop_patience.py",
     "test_stop_torque_off.py", "test_stop_in_between.py", "test_stop_string.py", "test_stop_polls.py",
 )
-_RUNS = ("test_control_loop.py", "test_runner.py", "test_run_goes_wrong.py")
+_RUNS = ("test_control_loop.py", "test_five_stages.py", "test_run_goes_wrong.py")
 SUBJECTS = {
     "guard": _run("guard", "test_guard.py", "test_guard_prediction.py", "test_guard_follows.py", "test_kept_within.py"),
     "stop": _run("stop", *_STOP),
     "string_release": _run("string_release", *_STOP),
-    "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_runner.py"),
+    "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_five_stages.py"),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py"),
     "setup": _run("stages/setup", *_RUNS, "test_run_refused.py"),
     "speed": _run("stages/speed", *_RUNS),
-    "torque": _run("stages/torque", *_RUNS, "test_brake_test.py"),
+    "torque": _run("stages/torque", *_RUNS, "test_braking_probe.py"),
     "hold": _run(
         "stages/hold", "test_kept_within.py", *_RUNS, "test_control.py",
         within="WINDOW_SHARE SETTLED_S MEAN_S TIMEOUT_S run_hold",
@@ -164,15 +164,15 @@ SUBJECTS = {
     "mcap_container": Subject(
         "tdhil/recording/mcap_container.py", ("recording/test_writer.py", "recording/test_round_trip.py")
     ),
-    "log_place": Subject("tdhil/session/log_place.py", ("session/test_log_place.py", "cli/test_identify_end.py")),
+    "log_files": Subject("tdhil/session/log_files.py", ("session/test_log_files.py", "cli/test_identify_end.py")),
     "service/supervisor": _service("supervisor", "test_lost_drive.py", "test_supervisor.py"),
     "service/run_process": _service("run_process", "test_run_process.py", "test_attended.py"),
     "service/access": _service("access", "test_access.py"),
-    "service/attending": _service("attending", "test_attending.py"),
+    "service/attendance": _service("attendance", "test_attendance.py"),
     "service/audit": _service("audit", "test_store.py"),
     "service/door": _service("door", "test_door.py"),
     "service/drive_stop": _service("drive_stop", "test_drive_stop.py"),
-    "session/holder": Subject("tdhil/session/holder.py", ("session/test_holder.py",)),
+    "session/drive_lock": Subject("tdhil/session/drive_lock.py", ("session/test_drive_lock.py",)),
     "session/kept": Subject("tdhil/session/kept.py", ("session/test_kept.py",)),
     "session/run_session": Subject(
         "tdhil/session/run_session.py", ("service/test_run_process.py", "cli/test_identify_end.py")
@@ -371,11 +371,11 @@ def preload() -> None:
     import tdhil.errors
     import tdhil.estimation
     import tdhil.recording.run_log
-    import tdhil.run.design
-    import tdhil.run.excitation
+    import tdhil.runner.design
+    import tdhil.runner.excitation
 
     assert all((hypothesis, numpy, pytest, scipy.optimize, drivers.drive, tdhil.errors, tdhil.estimation,
-                tdhil.run.design, tdhil.run.excitation, tdhil.recording.run_log))
+                tdhil.runner.design, tdhil.runner.excitation, tdhil.recording.run_log))
 
 
 def forget(module: str) -> None:

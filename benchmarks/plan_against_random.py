@@ -18,10 +18,19 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.recording import LagPrior
-from tdhil.run import ControlAssumptions, Guard, Knowledge
-from tdhil.run.design import Noise, choose, expected_half_width
-from tdhil.run.design.choice import highest_line_hz, relative_sd
-from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, PlanRefused, RigGuess, Shape, make_plan, unit_peak
+from tdhil.runner import ControlAssumptions, Guard, Knowledge
+from tdhil.runner.design import Noise, choose, expected_half_width
+from tdhil.runner.design.choice import highest_line_hz, relative_sd
+from tdhil.runner.excitation import (
+    ExcitationWish,
+    MotionLimits,
+    Plan,
+    PlanRefused,
+    RigGuess,
+    Shape,
+    make_plan,
+    unit_peak,
+)
 from tdhil.studies.coverage.plants import FLEET, CoveragePlant
 
 CONFIDENCE = 0.95

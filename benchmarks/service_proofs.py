@@ -57,9 +57,9 @@ sys.path[:0] = [str(ROOT)]
 from drivers import CommunicationLost  # noqa: E402
 from drivers.clock import quantile  # noqa: E402
 from tdhil.recording import Recording, read_run  # noqa: E402
-from tdhil.service.states import ENDED  # noqa: E402
+from tdhil.service.run_channel import ask, lives  # noqa: E402
+from tdhil.service.run_state import ENDED  # noqa: E402
 from tdhil.service.store import Store  # noqa: E402
-from tdhil.service.wire import ask, lives  # noqa: E402
 from tests.service.conftest import wait_for  # noqa: E402
 from tests.service.test_lost_run import LIMITS, simulated_drive, speed_rad_s  # noqa: E402
 from tests.service.test_serve import Server, served  # noqa: E402

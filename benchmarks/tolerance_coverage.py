@@ -28,12 +28,12 @@ from drivers.clock import SteppedClock
 from drivers.drive import Command, Counters, DriveLimits, Identity, Mode, PowerState, Preflight, Sample
 from sim_bus.inverter import RPM, Inverter
 from sim_bus.params import RigParams
-from tdhil.run.runner import Runner
-from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.run.task import Task
+from tdhil.runner.five_stages import Runner
+from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.task import Task
 from tdhil.session.conclusion import conclude
-from tests.run.fake_drive import FakeDisplay
-from tests.run.line_drive import BuilderLog
+from tests.runner.fake_drive import FakeDisplay
+from tests.runner.line_drive import BuilderLog
 
 TRUE_KG_M2 = 104.0
 LIMITS = MachineLimits(0.5, 10.0, 400.0, 3600.0, probe_torque_nm=200.0)

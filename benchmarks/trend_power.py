@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 
-from tdhil.fleet.changes import Measured, difference, history
+from tdhil.fleet.change_detection import Measured, difference, history
 
 KINDS = {"none": 0.0, "step 1 %": 0.01, "step 2 %": 0.02, "step 5 %": 0.05, "drift 2 %": 0.02, "drift 5 %": 0.05}
 

@@ -14,23 +14,21 @@ Everything here raises `tdhil.TdhilError` and its kind, each with what happened,
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from tdhil.errors import UsageError
-from tdhil.run import StopRequest
+from tdhil.runner import StopRequest
 from tdhil.session import ByKeyword, RunRecord, read
 
 if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
     from tdhil.errors import ExitCode
     from tdhil.estimation import Identification, InertiaEstimate, Verdict
-    from tdhil.session import Attendant, Connection, PeerPlan, RunRequest
+    from tdhil.session import Connection, OperatorInterface, PeerPlan, RunRequest
 
 __all__ = [
     "CoastDown", "DriveHandle", "Motion", "Multisine", "Pulses", "Result", "RunRecord", "Sine", "Step", "StopRequest",
@@ -247,31 +245,31 @@ def run(
     operator: str | None = None,
     note: str | None = None,
     stop: StopRequest | None = None,
-    **consent: Any,
+    **overrides: Any,
 ) -> RunRecord:
     """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
 
     ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
-    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``consent``: fields of
-    `tdhil.session.Consent`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread; in
+    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``overrides``: fields
+    of `tdhil.session.Overrides`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread; in
     another one give a ``stop``, and ``ask()`` it: signals are not looked at there.
 
     Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
     where it was not seen at rest: use the hard-wired stop then.
     """
-    from tdhil.run import not_confirmed
-    from tdhil.session import Consent, RunRequest, RunSession
+    from tdhil.runner import not_confirmed
+    from tdhil.session import Overrides, RunRequest, RunSession
 
-    unknown = set(consent) - {one.name for one in fields(Consent)}
+    unknown = set(overrides) - {one.name for one in fields(Overrides)}
     if unknown:
-        raise UsageError(f"no such consent: {', '.join(sorted(unknown))}", where="tdhil.run")
+        raise UsageError(f"no such override: {', '.join(sorted(unknown))}", where="tdhil.run")
     asked: dict[str, Any] = {"log": str(log), "mode": mode, "tolerance": tolerance, "max_time_s": max_time_s}
     motion = motion or Multisine()
     asked |= {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()}
     options, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
-    request = RunRequest.of(options, connection, peer, drive.rig, consent=Consent(**consent), operator=operator,
+    request = RunRequest.of(options, connection, peer, drive.rig, overrides=Overrides(**overrides), operator=operator,
                             note=note)
-    session = RunSession(request, _attendant(request, confirm))
+    session = RunSession(request, _operator_interface(request, confirm))
     try:
         outcome = session.move(stop)
     except BaseException:
@@ -291,15 +289,6 @@ def run(
     return RunRecord(recording, configuration, str(session.path))
 
 
-class _CallableRoom(ModuleType):
-    """``tdhil.run`` is this function and a room: once the room is loaded, Python makes the attribute the room."""
-
-    __call__ = staticmethod(run)
-
-
-sys.modules["tdhil.run"].__class__ = _CallableRoom
-
-
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
     """What would be opened: the command line's checks, in its order. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
@@ -312,11 +301,11 @@ def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Con
     return options, connection, with_faults(plan_peer(options, connection), drive.faults, connection.drive)
 
 
-def _attendant(request: RunRequest, confirm: Callable[[str], bool] | None) -> Attendant:
+def _operator_interface(request: RunRequest, confirm: Callable[[str], bool] | None) -> OperatorInterface:
     from tdhil.report import stderr_console
-    from tdhil.session import AskingAttendant, TerminalAttendant
+    from tdhil.session import CallbackOperator, TerminalOperator
 
     gear_ratio = 1.0 if request.rig is None else request.rig.gear.ratio
     if confirm is None:
-        return TerminalAttendant(stderr_console(), gear_ratio=gear_ratio)
-    return AskingAttendant(stderr_console(), confirm, gear_ratio=gear_ratio)
+        return TerminalOperator(stderr_console(), gear_ratio=gear_ratio)
+    return CallbackOperator(stderr_console(), confirm, gear_ratio=gear_ratio)

@@ -27,7 +27,7 @@ from drivers.canopen import preflight as checks
 from drivers.canopen import watchdog as arming
 from drivers.canopen.bus import PEER_DEAD_S, CanLink
 from drivers.canopen.limits import check_parameters, note_temperature, set_limits
-from drivers.canopen.other_master import Strangers
+from drivers.canopen.other_master import ForeignTraffic
 from drivers.canopen.pdo import (
     Feedback,
     Reported,
@@ -129,16 +129,16 @@ class Cia402Drive:
         self._objects = Objects(self._link, node)
         self._journal = journal
         self._watch = Watch(node, clock)
-        self._strangers = Strangers(self._link, self._watch, clock, node=node, number=host_node)
+        self._foreign_traffic = ForeignTraffic(self._link, self._watch, clock, node=node, number=host_node)
         self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
         if self._life.asks:
-            self._strangers.own_questions()
+            self._foreign_traffic.own_questions()
         self._read_back = ReadBack(
-            self._watch, lambda request: self._link.send(0x600 + node, request), self._strangers.tell, node
+            self._watch, lambda request: self._link.send(0x600 + node, request), self._foreign_traffic.tell, node
         )
         self._objects.on_answer(self._read_back.take)
         self._read_back.on_changed = self._on_changed
-        self._strangers.on_write = self._on_write
+        self._foreign_traffic.on_write = self._on_write
         self._shape = shape_of(profile)
         self._standing = Standing(self._objects, self._link, node, self.period_s, self._shape.target_speed)
         self._fed = True
@@ -157,9 +157,9 @@ class Cia402Drive:
         self._wide = self._shape.wide
         self._feedback = self._new_feedback()
         self._link.handlers[NMT] = self._on_nmt
-        self._strangers.own(SYNC, "SYNC", lambda data: self._feedback.on_foreign_sync())
+        self._foreign_traffic.own(SYNC, "SYNC", lambda data: self._feedback.on_foreign_sync())
         for number in range(1, 5):
-            self._strangers.own(0x100 * (1 + number) + node, rpdo_kind(number, 0x100 * (1 + number) + node))
+            self._foreign_traffic.own(0x100 * (1 + number) + node, rpdo_kind(number, 0x100 * (1 + number) + node))
         self._has_target = self._shape.target_torque
         self._slow = SlowFeedback(Slow(wide=self._wide), 1)
         self._watchdog_s = self._allowed_silence_s = 0.0
@@ -282,13 +282,13 @@ class Cia402Drive:
             None if self._angle is None else self._angle.entry,
         )
         for number, cob_id in others.items():
-            self._strangers.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
+            self._foreign_traffic.own(cob_id & 0x7FF, rpdo_kind(number, cob_id & 0x7FF))
         self._standing.rpdos = {1: self._rpdo1_id, **({2: self._rpdo2_id} if self._shape.second else {}), **others}
         self._slow = self._new_slow(carried)
         frames = arming.feedback_frames(objects)
         self._unwrapped = None if self._angle is None else self._angle.unwrapped(limits.speed_rad_s)
         self._life.pace(limits.watchdog_s / 5.0)
-        self._life.host_node = self._strangers.settle_number(table)
+        self._life.host_node = self._foreign_traffic.settle_number(table)
         heard = arming.set_timing(table, objects, self._profile, self.period_s, HEARTBEAT_S, self.clock.stepped)
         self._watchdog_s = limits.watchdog_s
         feed_s = arming.arm_watchdog(
@@ -397,7 +397,7 @@ class Cia402Drive:
         """From the next cycle on move towards operation enabled in ``mode``."""
         if mode not in self._codes:
             raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
-        self._strangers.refuse_shared()
+        self._foreign_traffic.refuse_shared()
         self._wish, self._in_operation, self._ever_asked = Wish.ENABLED, False, True
 
     def quick_stop(self) -> None:
@@ -491,7 +491,7 @@ class Cia402Drive:
     def _stand(self) -> None:
         """The quick stop is undone by somebody, or not taken: by SDO, then, and without any RPDO in the drive."""
         done = self._standing.take_over(self._watchdog_s, self._life.feed)
-        self._strangers.tell(
+        self._foreign_traffic.tell(
             f"the quick stop did not stand: {done} RPDOs were switched off in the drive, and it was asked for by SDO"
         )
         self._ticks.put_off()
@@ -628,7 +628,7 @@ class Cia402Drive:
         if len(data) < 2 or data[1] not in (0, self._node):
             return
         name = NMT_COMMANDS.get(data[0], f"command {data[0]:02X}h")
-        self._strangers.tell(f"somebody else sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
+        self._foreign_traffic.tell(f"somebody else sent NMT {name} to {'all nodes' if data[1] == 0 else 'the drive'}")
         state = {0x02: "stopped", ENTER_PRE_OPERATIONAL: "pre-operational"}.get(data[0])
         if state is not None and self._watch.expect_operational:       # after a reset its boot-up message says so
             self._watch.interference(
@@ -698,11 +698,11 @@ class Cia402Drive:
 
     def remarks(self) -> tuple[str, ...]:
         """What others did on the bus since this was asked last; see `drivers.drive.Telling`."""
-        return self._strangers.remarks()
+        return self._foreign_traffic.remarks()
 
     def summary(self) -> tuple[str, ...]:
         """What others wrote to the drive in all of the run."""
-        return self._strangers.summary()
+        return self._foreign_traffic.summary()
 
     def keep_alive(self) -> None:
         """A sign of life between two cycles, without a SYNC: in stepped time a peer takes a silent host for a dead one.

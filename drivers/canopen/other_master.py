@@ -35,7 +35,7 @@ _MOST_REMARKS = 20
 _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 
 
-class Strangers:
+class ForeignTraffic:
     """Listens from the beginning. ``number`` is the host's node number; ``on_write`` is told of written objects."""
 
     def __init__(self, link: CanLink, watch: Watch, clock: Clock, *, node: int, number: int) -> None:

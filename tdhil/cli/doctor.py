@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import DataFileError, TdhilError
-from tdhil.cli.bus_commands import bus_commands
-from tdhil.cli.finding import Finding, bad, note, of_error, ok
+from tdhil.cli.doctor_finding import Finding, bad, note, of_error, ok
 from tdhil.cli.results import print_json
+from tdhil.cli.scan_common import bus_commands
 from tdhil.session.real_time import HOW, allowed
 
 if TYPE_CHECKING:
-    from tdhil.cli.bus_commands import ValueSeen
+    from tdhil.cli.scan_common import ValueSeen
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tdhil.run import MachineLimits, Planned
+    from tdhil.runner import MachineLimits, Planned
     from tdhil.session import Connection
     from tdhil.soft_torque import EvaluationCase
 
@@ -161,7 +161,7 @@ def _figures_table(figures: tuple[Figure, ...]) -> Table:
 
 
 def _conclusions(planned: Planned) -> list[str]:
-    from tdhil.run import NOT_PREDICTED, NOTHING_TO_EXPECT
+    from tdhil.runner import NOT_PREDICTED, NOTHING_TO_EXPECT
 
     stopping = planned.stopping
     if not math.isfinite(planned.half_width):

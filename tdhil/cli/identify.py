@@ -18,7 +18,7 @@ from tdhil.session import PeerPlan, bus_kinds
 
 if TYPE_CHECKING:
     from tdhil.config import Rig, RunOptions
-    from tdhil.run import RunOutcome
+    from tdhil.runner import RunOutcome
     from tdhil.session import Connection, Ending, RunRequest, RunSession
     from tdhil.soft_torque import EvaluationCase
 
@@ -135,7 +135,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     """
     from tdhil.cli.dry_run import dry_run, dry_run_course, say_unreachable
     from tdhil.report import stderr_console
-    from tdhil.session import Consent, RunRequest, check_names, connection_of, plan_peer, suited, with_faults
+    from tdhil.session import Overrides, RunRequest, check_names, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -161,7 +161,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
         return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
-    consent = Consent(
+    overrides = Overrides(
         no_watchdog=namespace.accept_no_watchdog,
         shared_watchdog=namespace.accept_shared_watchdog,
         wider_limits=tuple(namespace.accept_wider_limit or ()),
@@ -169,7 +169,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
         reset_fault=namespace.reset_fault,
     )
     request = RunRequest.of(
-        options, connection, peer, rig, consent=consent, operator=namespace.operator, note=namespace.note,
+        options, connection, peer, rig, overrides=overrides, operator=namespace.operator, note=namespace.note,
         real_time_priority=namespace.real_time_priority, evaluation=evaluation,
     )
     if evaluation is None and (said := say_unreachable(options, rig, connection, simulated)) is not None:
@@ -200,14 +200,14 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
 
 def _run(request: RunRequest, console: Console, report: Path | None) -> int:
     import tdhil.cli.main as entry
-    from tdhil.session import Ending, RunSession, TerminalAttendant
+    from tdhil.session import Ending, RunSession, TerminalOperator
 
     options = request.options
-    attendant = TerminalAttendant(
+    operator_interface = TerminalOperator(
         console, yes=options.yes, gear_ratio=1.0 if request.rig is None else request.rig.gear.ratio
     )
     with Ending(own_process=entry.process.own) as ending:
-        session = RunSession(request, attendant, report=report is not None)
+        session = RunSession(request, operator_interface, report=report is not None)
         return ending.code(_finish(session, ending, options, console, report))
 
 
@@ -251,7 +251,7 @@ def _failed(outcome: RunOutcome, path: str, as_json: bool, console: Console) -> 
     """The first cause, how the stop went, and where the log is."""
     import traceback
 
-    from tdhil.run import not_confirmed
+    from tdhil.runner import not_confirmed
 
     cause, stop = outcome.cause, outcome.stop
     code = exit_code(cause) if cause is not None else ExitCode.OK

@@ -16,7 +16,7 @@ from importlib import import_module
 from types import SimpleNamespace
 from typing import NoReturn
 
-from tdhil.cli.streams import sheltered
+from tdhil.cli.standard_streams import sheltered
 from tdhil.errors import ExitCode, TdhilError, UsageError, exit_code
 from tdhil.version import __version__
 
@@ -168,7 +168,7 @@ def _hear_no_more() -> None:
 
 def leave(code: int) -> NoReturn:
     """The end of the process, at once also where arithmetic that was left alone goes on in a thread."""
-    background = sys.modules.get("tdhil.run.background")
+    background = sys.modules.get("tdhil.runner.background")
     if background is not None and background.goes_on():
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):     # full, closed, or none

@@ -52,7 +52,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def report(found: Salvage, path: Path, target: Path | None) -> dict[str, Any]:
     """Plain data. Times are control time in s; ``under_way``: the stage that the log breaks off in, or None."""
-    from tdhil.run import STAGES
+    from tdhil.runner import STAGES
 
     run = found.run
     time_s = run.recording.time_s

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.streams import OutputLost
+from tdhil.cli.standard_streams import OutputLost
 
 if TYPE_CHECKING:
     from tdhil.recording import FloatArray, Recording

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles import Profile, load_profile, visible
-from tdhil.cli.bus_commands import FoundDrive, bus_commands
 from tdhil.cli.profile_text import required_text
 from tdhil.cli.results import print_json
+from tdhil.cli.scan_common import FoundDrive, bus_commands
 from tdhil.config import BUSES, Limits, Rig, load_rig, resolve
 from tdhil.errors import UsageError
 from tdhil.session import bus_kind, doubtful

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sim_bus import RigParams
     from tdhil.config import Rig, RunOptions
     from tdhil.recording import Recording, Stage
-    from tdhil.run import Idle, RunOutcome, Task
-    from tdhil.run.excitation import Plan, SwingPlan
+    from tdhil.runner import Idle, RunOutcome, Task
+    from tdhil.runner.excitation import Plan, SwingPlan
     from tdhil.studies import Chapter, FieldRun, RunProgress, Study, StudyOutcome
 
 
@@ -41,8 +41,8 @@ class SimulatedFieldBench:
         """The Recording; raises what ended the run before its end."""
         from tdhil.config import resolve
         from tdhil.recording import RunLog, RunWriter
-        from tdhil.run import Runner
-        from tdhil.session import PeerPlan, open_drive, simulated_connection, stop_on_signals
+        from tdhil.runner import Runner
+        from tdhil.session import PeerPlan, opened_drive, simulated_connection, stop_on_signals
 
         rig = bench_rig(wish)
         options = resolve(_asked(wish), rig)
@@ -51,7 +51,7 @@ class SimulatedFieldBench:
             writer = RunWriter(Path(folder) / "run.mcap", epoch_ns=peer.epoch_ns, block=True)
             log = RunLog(writer, {"tdhil": __version__, "embedded_simulator": True, "seed": wish.seed})
             try:
-                with stop_on_signals() as stop_request, open_drive(
+                with stop_on_signals() as stop_request, opened_drive(
                     peer, options, simulated_connection(options), None, log.frame, None
                 ) as drive:
                     make_task = partial(_task, options, rig)
@@ -108,7 +108,7 @@ def _asked(wish: FieldRun) -> dict[str, object]:
 
 
 def _task(options: RunOptions, rig: Rig, identity: Identity) -> Task:
-    from tdhil.run import Task
+    from tdhil.runner import Task
     from tdhil.session import bench_of, excitation_request, facts, machine_limits
 
     bench = bench_of(identity, rig)
@@ -121,7 +121,7 @@ def _no_prompt(task: Task, preflight: Preflight, idle: Idle) -> None:
 
 
 def _raise_if_ended(outcome: RunOutcome) -> None:
-    from tdhil.run import not_confirmed
+    from tdhil.runner import not_confirmed
 
     if outcome.cause is not None:
         raise outcome.cause

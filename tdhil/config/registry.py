@@ -33,7 +33,7 @@ class Entry:
 class BusEntry(Entry):
     """``at``: what a run asks of the bus, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
 
-    ``commands``: what scan, doctor and rig new do on it, a `tdhil.cli.bus_commands.BusCommands`. Both stand in modules
+    ``commands``: what scan, doctor and rig new do on it, a `tdhil.cli.scan_common.BusCommands`. Both stand in modules
     that load no library of the bus by themselves: ``--help`` shows the options of every bus.
     """
 
@@ -41,15 +41,16 @@ class BusEntry(Entry):
 
 
 EXCITATIONS: dict[str, Entry] = {
-    "multisine": Entry("tdhil.run.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
-    "sine": Entry("tdhil.run.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
-    "step": Entry("tdhil.run.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True, True),
-    "prbs": Entry("tdhil.run.excitation.signals:PRBS", "pseudo-random torque, for a drill string on bottom", True,
+    "multisine": Entry("tdhil.runner.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
+    "sine": Entry("tdhil.runner.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
+    "step": Entry("tdhil.runner.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True,
+                  True),
+    "prbs": Entry("tdhil.runner.excitation.signals:PRBS", "pseudo-random torque, for a drill string on bottom", True,
                   before_echo=True),
-    "pulses": Entry("tdhil.run.excitation.pulses:PULSES", "torque pulses between steady speeds"),
-    "coast-down": Entry("tdhil.run.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
+    "pulses": Entry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
+    "coast-down": Entry("tdhil.runner.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
 }
-"""What stage 5 can do; each a `tdhil.run.excitation.ExcitationKind`."""
+"""What stage 5 can do; each a `tdhil.runner.excitation.ExcitationKind`."""
 
 DEFAULT_EXCITATION = "multisine"
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
-    from tdhil.fleet.changes import (
+    from tdhil.fleet.change_detection import (
         Difference as Difference, History as History, Measured as Measured, difference as difference,
         history as history,
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdhil.errors import UsageError
-from tdhil.fleet.changes import LEAST, Difference, History, Measured, difference, history
+from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
 from tdhil.fleet.rows import FleetRow, Settings, counted, row_of
 from tdhil.fleet.task import content_hash, read_any
 

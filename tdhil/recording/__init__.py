@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     )
     from tdhil.recording.log_writer import RunWriter as RunWriter
     from tdhil.recording.mcap_container import MAGIC as MAGIC, schema_of as schema_of
-    from tdhil.recording.packed import pack_recording as pack_recording, unpack_recording as unpack_recording
+    from tdhil.recording.npz_cache import pack_recording as pack_recording, unpack_recording as unpack_recording
     from tdhil.recording.recording import (
         BoolArray as BoolArray, Excitation as Excitation, FloatArray as FloatArray, ImpedanceInput as ImpedanceInput,
         LagPrior as LagPrior, Level as Level, Pipe as Pipe, Ramp as Ramp, Recording as Recording, Segment as Segment,

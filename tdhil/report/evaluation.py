@@ -12,8 +12,8 @@ import numpy as np
 from rich.text import Text as Words
 
 from tdhil.recording import FloatArray, Recording
+from tdhil.report.blocks import Answer, Column, Pairs, Picture, Report, Section, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, shown_date
 from tdhil.report.document import SIMULATED, provenance
 from tdhil.report.html import sha256_of, write_blocks
 from tdhil.report.plots import DARK, OURS, QUIET, envelope

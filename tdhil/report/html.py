@@ -13,7 +13,7 @@ from typing import Any
 
 from tdhil.errors import UsageError
 from tdhil.recording import Recording
-from tdhil.report.content import WIDTH_IN, Picture, Report, report_of
+from tdhil.report.blocks import WIDTH_IN, Picture, Report, report_of
 from tdhil.report.page import inline_svg, require_extra
 
 PDF = ".pdf"

@@ -12,7 +12,7 @@ from functools import lru_cache
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from tdhil.report.content import WIDTH_IN, Answer, Column, Pairs, Picture, Report, Section, Table, Text
+from tdhil.report.blocks import WIDTH_IN, Answer, Column, Pairs, Picture, Report, Section, Table, Text
 from tdhil.report.page import lay_out, repeatable_figures
 
 if TYPE_CHECKING:

@@ -13,9 +13,9 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
+from tdhil.report.blocks import Answer, Column, Pairs, Picture, Report, Section, Table, Text
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
-from tdhil.report.content import Answer, Column, Pairs, Picture, Report, Section, Table, Text
 from tdhil.report.document import SIMULATED
 from tdhil.report.html import write_blocks
 from tdhil.soft_torque import (

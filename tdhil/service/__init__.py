@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from tdhil.service.audit import Audit as Audit, Head as Head
     from tdhil.service.client import Client as Client, ServiceError as ServiceError
     from tdhil.service.console import attend as attend
-    from tdhil.service.serving import (
+    from tdhil.service.run_state import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
+    from tdhil.service.server import (
         HOST as HOST, PORT as PORT, Tls as Tls, check_idle as check_idle, require_folder as require_folder,
         serve as serve,
     )
-    from tdhil.service.states import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere
 else:
     __getattr__, __dir__ = lazy_face(__name__)

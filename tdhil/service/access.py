@@ -28,8 +28,8 @@ from starlette.responses import Response
 
 from tdhil.errors import TdhilError
 from tdhil.service.accounts import ROLES, Accounts, AccountsFile, Role, matches, role_at_least
-from tdhil.service.answers import CSRF_HEADER
-from tdhil.service.states import NotAllowed, NotLoggedIn, TooManyRuns, TooManyTries
+from tdhil.service.run_state import NotAllowed, NotLoggedIn, TooManyRuns, TooManyTries
+from tdhil.service.schemas import CSRF_HEADER
 from tdhil.service.store import read_json, write_json
 
 SESSION_S: Final = 12 * 3600.0

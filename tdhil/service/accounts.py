@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from tdhil.errors import LogError, UsageError
-from tdhil.service.states import NotThere, now
+from tdhil.service.run_state import NotThere, now
 from tdhil.service.store import write_json
 
 Role = Literal["viewer", "operator", "engineer", "admin"]

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdhil.errors import UsageError
-from tdhil.service.states import now
+from tdhil.service.run_state import now
 from tdhil.service.store import read_json, write_json
 
 KEY_FILE: Final = "audit.key"

@@ -16,9 +16,9 @@ from typing import Final
 from drivers import CommunicationLost
 from profiles import visible
 from tdhil.errors import UsageError
-from tdhil.service.states import State, Status
+from tdhil.service.run_channel import SOCKET, Refused, ask, lives
+from tdhil.service.run_state import State, Status
 from tdhil.service.store import Store
-from tdhil.service.wire import SOCKET, Refused, ask, lives
 
 EVERY_S: Final = 0.25
 NEWEST: Final = 50

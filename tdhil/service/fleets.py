@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from tdhil.errors import UsageError
-from tdhil.service.states import Conflict, NotThere, Told, now
+from tdhil.service.run_state import Conflict, NotThere, Told, now
 from tdhil.service.store import Store, read_json, write_json
 
 if TYPE_CHECKING:

@@ -19,23 +19,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 from drivers import Preflight, PreflightRefused
 from profiles import visible
-from tdhil.service.asking import binding_of, plan_of, read_rig, refuse_changed, run_request
-from tdhil.service.attending import (
+from tdhil.service.attendance import (
     EXPECTED_S,
     LEASE_S,
     WATCHED,
     Board,
     Confirming,
-    ServiceAttendant,
+    ServiceOperator,
     Watcher,
     tell,
 )
-from tdhil.service.states import State, Status, Told, Watch, end_of, now, way_to
+from tdhil.service.run_channel import STOP_FILE, Listener
+from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to
+from tdhil.service.start_request import binding_of, plan_of, read_rig, refuse_changed, run_request
 from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
-from tdhil.service.wire import STOP_FILE, Listener
 
 if TYPE_CHECKING:
-    from tdhil.run import RunOutcome
+    from tdhil.runner import RunOutcome
 
 NICE: Final = 5
 """Of a simulated run in stepped time, which takes all the processor that it gets."""
@@ -53,13 +53,14 @@ class RunProcess:
         self.board = Board(self.store, replace(self.store.status(self.request.id), pid=os.getpid(),
                                                expected_s=EXPECTED_S))
         self._plan: dict[str, Any] = {}
-        from tdhil.run import StopRequest
+        from tdhil.runner import StopRequest
 
         self.stop = StopRequest()
         self.watcher = Watcher(self.board, self.stop)
         self.watched = self.request.motion == "watched"
-        self.attendant = ServiceAttendant(self.board, self.watcher, self.folder, self._bind, watched=self.watched,
-                                          unwatched=self._unwatched)
+        self.operator_interface = ServiceOperator(
+            self.board, self.watcher, self.folder, self._bind, watched=self.watched, unwatched=self._unwatched
+        )
 
     def serve(self) -> int:
         """Run it; the exit code, as of `tdhil identify`."""
@@ -84,20 +85,20 @@ class RunProcess:
             self._stop(f"{visible(who)} asked for a stop", who)
             return {"status": self.board.status.plain()}
         if what == "lease":
-            if (lease := self.attendant.lease) is None:
+            if (lease := self.operator_interface.lease) is None:
                 raise PreflightRefused("nobody watches this run", where="lease")
             watch = lease.renew(str(asked.get("key", "")), who, new_key=str(asked.get("new_key") or ""),
                                 gone=str(asked.get("gone") or ""))
             return {"watch": asdict(watch)}
         if what == "confirm":
-            confirming = self.attendant.confirming
+            confirming = self.operator_interface.confirming
             if confirming is None:
                 raise PreflightRefused("there is nothing to confirm", where="run",
                                        next_step="A simulated rig asks nobody; a real one asks after its preflight")
             confirming.take(str(asked.get("code", "")), asked.get("binding"), who, str(asked.get("lease") or ""))
             return {"status": self.board.status.plain()}
         if what == "code":
-            confirming = self.attendant.confirming
+            confirming = self.operator_interface.confirming
             waiting = confirming is not None and confirming.confirmed_by is None and confirming.void is None
             if confirming is None or not waiting:
                 return {"code": None}
@@ -151,12 +152,12 @@ class RunProcess:
             write_json(self.folder / CONNECTION_FILE, kept_connection(asked.options, asked.connection))
         report = has_extra()
         self.stop.check(next_step="Nothing has moved")
-        session = RunSession(asked, self.attendant, report=report)
+        session = RunSession(asked, self.operator_interface, report=report)
         self.watcher.log = session.log
         try:
             outcome = session.move(self.stop)
-            if self.attendant.lease is not None:
-                self.attendant.lease.end()
+            if self.operator_interface.lease is not None:
+                self.operator_interface.lease.end()
             if outcome.cause is not None or (outcome.stop is not None and not outcome.stop.confirmed):
                 session.abandon()
                 return self._ended(outcome)
@@ -195,7 +196,7 @@ class RunProcess:
 
     def _ended(self, outcome: RunOutcome) -> int:
         from tdhil.errors import ExitCode, exit_code
-        from tdhil.run import not_confirmed
+        from tdhil.runner import not_confirmed
 
         error: BaseException | None = outcome.cause
         code = exit_code(error) if error is not None else ExitCode.OK

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tdhil.errors import LogUnopened
-from tdhil.service.states import NotThere, State, Status, now
+from tdhil.service.run_state import NotThere, State, Status, now
 
 ID: Final = re.compile(r"[0-9]{8}-[0-9]{6}-[0-9a-f]{6}")
 """Of a run: date, time (UTC), and what keeps two of one second apart."""

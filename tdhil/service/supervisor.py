@@ -26,10 +26,10 @@ from typing import Any, Final
 from drivers import CommunicationLost
 from tdhil.errors import ExitCode, LogError, UsageError
 from tdhil.service.access import Pace
-from tdhil.service.asking import RigFile, Rigs, edited, is_as_it_was, options_of, require_motion
 from tdhil.service.audit import Audit
 from tdhil.service.console import Console
-from tdhil.service.states import (
+from tdhil.service.run_channel import STOP_FILE, Refused, ask, lives, send_signal, stands_still, take_life
+from tdhil.service.run_state import (
     MAY_TURN,
     Conflict,
     NoRoom,
@@ -43,8 +43,8 @@ from tdhil.service.states import (
     now,
     way_to,
 )
+from tdhil.service.start_request import RigFile, Rigs, edited, is_as_it_was, options_of, require_motion
 from tdhil.service.store import CONNECTION_FILE, Index, Request, Store, read_json, write_json, write_whole
-from tdhil.service.wire import STOP_FILE, Refused, ask, lives, send_signal, stands_still, take_life
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
@@ -498,7 +498,7 @@ class Supervisor:
 
     def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
         """A piece of arithmetic in a process of its own, nicer than all that moves. Raises Refused."""
-        command = [sys.executable, "-m", "tdhil.service.work", what]
+        command = [sys.executable, "-m", "tdhil.service.worker", what]
         question = {"folder": None if run is None else str(self.store.place(run)), **asked}
         done = subprocess.run(command, input=json.dumps(question).encode(), capture_output=True, check=False,
                               start_new_session=True)

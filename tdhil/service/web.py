@@ -38,7 +38,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from tdhil.errors import LogError, TdhilError, UsageError
-from tdhil.service import afterwards, logins
+from tdhil.service import auth_routes, run_views
 from tdhil.service.access import (
     SOCKET_LOOK_S,
     Access,
@@ -48,7 +48,23 @@ from tdhil.service.access import (
     require_options,
 )
 from tdhil.service.accounts import Role
-from tdhil.service.answers import (
+from tdhil.service.attendance import LEASE_S
+from tdhil.service.audit import Head
+from tdhil.service.door import NO_DESCRIPTOR, Seldom
+from tdhil.service.fleets import Fleets
+from tdhil.service.foxglove import PROTOCOLS, Relay, Running
+from tdhil.service.live_feed import Feed, Feeds
+from tdhil.service.middleware import Guard, body_of, error_response, off, status_of, told_of
+from tdhil.service.run_channel import lives
+from tdhil.service.run_state import (
+    NotAllowed,
+    NotLoggedIn,
+    NotThere,
+    State,
+    Status,
+    now,
+)
+from tdhil.service.schemas import (
     API,
     CSRF_HEADER,
     ROUTES,
@@ -69,30 +85,14 @@ from tdhil.service.answers import (
     document,
     plain,
 )
-from tdhil.service.asking import EDITABLE, RigFile, options_of, require_motion, require_unwatched
-from tdhil.service.attending import LEASE_S
-from tdhil.service.audit import Head
-from tdhil.service.door import NO_DESCRIPTOR, Seldom
-from tdhil.service.edge import Guard, body_of, error_response, off, status_of, told_of
-from tdhil.service.feed import Feed, Feeds
-from tdhil.service.fleets import Fleets
-from tdhil.service.foxglove import PROTOCOLS, Relay, Running
-from tdhil.service.states import (
-    NotAllowed,
-    NotLoggedIn,
-    NotThere,
-    State,
-    Status,
-    now,
-)
+from tdhil.service.start_request import EDITABLE, RigFile, options_of, require_motion, require_unwatched
 from tdhil.service.store import Summary, read_json, write_json
 from tdhil.service.supervisor import Supervisor
-from tdhil.service.wire import lives
 from tdhil.version import __version__
 
 T = TypeVar("T")
 HERE: Final = Path(str(files("tdhil.service")))
-_ANSWERS: Final = {**afterwards.ANSWERS, **logins.ANSWERS}
+_ANSWERS: Final = {**run_views.ANSWERS, **auth_routes.ANSWERS}
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _REPORT_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox allow-downloads"
 _OF_HERE: Final = re.compile(r"/(?![/\\])[\x21-\x5b\x5d-\x7e]*")
@@ -369,7 +369,7 @@ class Web:
 
     async def _ask_replay(self, request: Request, body: Any) -> tuple[int, ReplayView]:
         run, who = request.path_params["run"], principal(request).name
-        asked = afterwards.settings_of(body)
+        asked = run_views.settings_of(body)
         view = await off(lambda: self._new_replay(run, asked, who))
         rig = (await off(lambda: self.store.request(run))).rig
         self.supervisor.note(who, f"replay {view.name} asked", run, rig, options=asked)

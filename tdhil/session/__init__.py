@@ -7,40 +7,43 @@ from profiles import lazy_face
 if TYPE_CHECKING:
     from tdhil.session.conclusion import conclude as conclude
     from tdhil.session.confirm import (
-        AskingAttendant as AskingAttendant, TerminalAttendant as TerminalAttendant, motion_summary as motion_summary,
+        CallbackOperator as CallbackOperator, TerminalOperator as TerminalOperator, motion_summary as motion_summary,
     )
     from tdhil.session.connection import (
         Connection as Connection, PeerPlan as PeerPlan, bus_kind as bus_kind, bus_kinds as bus_kinds,
         connection_of as connection_of, simulated_connection as simulated_connection,
     )
-    from tdhil.session.consent import (
-        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
-        is_accepted as is_accepted,
+    from tdhil.session.drive_lock import (
+        DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
+        holders as holders,
+    )
+    from tdhil.session.dry_run import (
+        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_course as plan_course,
+        plan_document as plan_document, plan_dry as plan_dry,
     )
     from tdhil.session.evaluation import (
         conclude_evaluation as conclude_evaluation, evaluation_case as evaluation_case, is_evaluation as is_evaluation,
         load_tuning as load_tuning,
     )
-    from tdhil.session.holder import (
-        DriveHeld as DriveHeld, Holder as Holder, address_of as address_of, hold as hold, holder_of as holder_of,
-        holders as holders,
-    )
     from tdhil.session.kept import connection_of_kept as connection_of_kept, kept_connection as kept_connection
-    from tdhil.session.log_place import (
+    from tdhil.session.log_files import (
         check_different_files as check_different_files, check_log_path as check_log_path, is_live as is_live,
         make_room as make_room,
     )
-    from tdhil.session.opening import open_drive as open_drive, plan_peer as plan_peer, with_faults as with_faults
-    from tdhil.session.plan_ahead import (
-        BEFORE_ACQUIRE_S as BEFORE_ACQUIRE_S, Figure as Figure, plan_course as plan_course,
-        plan_document as plan_document, plan_dry as plan_dry,
+    from tdhil.session.open_drive import (
+        opened_drive as opened_drive, plan_peer as plan_peer, with_faults as with_faults,
     )
-    from tdhil.session.recorded import (
+    from tdhil.session.overrides import (
+        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
+        is_accepted as is_accepted,
+    )
+    from tdhil.session.run_record import (
         RunRecord as RunRecord, ByKeyword as ByKeyword, is_log as is_log, read as read,
         require_file as require_file,
     )
     from tdhil.session.run_session import (
-        Attendant as Attendant, Consent as Consent, RunRequest as RunRequest, RunSession as RunSession,
+        OperatorInterface as OperatorInterface, Overrides as Overrides, RunRequest as RunRequest,
+        RunSession as RunSession,
     )
     from tdhil.session.stop_signals import Ending as Ending, stop_on_signals as stop_on_signals
     from tdhil.session.task import (

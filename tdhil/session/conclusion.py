@@ -23,7 +23,7 @@ def working_confidence_of(run: Mapping[str, Any], confidence: float) -> float:
     last = stopping["decisions"][-1]
     if stopping.get("confidence") == confidence:
         return float(last["working_confidence"])
-    from tdhil.run import interval_confidence
+    from tdhil.runner import interval_confidence
 
     return interval_confidence(confidence, float(stopping["pilot_dof"]), int(last["seen"]))
 
@@ -58,7 +58,7 @@ def conclude(
     """
     from tdhil.estimation import Options, Verdict, identify
     from tdhil.report import result_document
-    from tdhil.run import precondition_warnings, speed_warnings, stage_warnings
+    from tdhil.runner import precondition_warnings, speed_warnings, stage_warnings
 
     asked = run.get("identify", {})
     known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}

@@ -17,7 +17,7 @@ from drivers import ACCEPTED_BY, ANY_CLIENT, NOTHING_STOPS_IT, Preflight, Prefli
 from profiles import visible
 from profiles.quantities import RPM
 from tdhil.report import LiveDisplay, minutes
-from tdhil.run import Display, ExcitationRequest, Idle, MachineLimits, Task
+from tdhil.runner import Display, ExcitationRequest, Idle, MachineLimits, Task
 
 T = TypeVar("T")
 
@@ -194,7 +194,7 @@ def _meanwhile(idle: Idle, ask: Callable[[], T]) -> T:
             return answer.result()
 
 
-class TerminalAttendant:
+class TerminalOperator:
     """Whoever sits at the terminal: sees the run there, types the confirmation, watches the shaft."""
 
     def __init__(self, console: Console, *, yes: bool = False, gear_ratio: float = 1.0) -> None:
@@ -235,7 +235,7 @@ class TerminalAttendant:
         self._console.print(text, style="yellow", markup=False, soft_wrap=True)
 
 
-class AskingAttendant(TerminalAttendant):
+class CallbackOperator(TerminalOperator):
     """The same, but a function of the caller's confirms motion: it is given in words what will move."""
 
     def __init__(self, console: Console, ask: Callable[[str], bool], *, gear_ratio: float = 1.0) -> None:

@@ -1,7 +1,7 @@
 """One run, from what was asked for to a log that is closed: log, drive, Runner, identification.
 
 The command line and the Python API both go through here, so that guard, stop and confirmation are the same. What a
-person sees and is asked is an `Attendant`'s; nothing here prints.
+person sees and is asked is an `OperatorInterface`'s; nothing here prints.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 from tdhil.config import Rig, RunOptions
 from tdhil.errors import LogError, TdhilError
 from tdhil.recording import RunLog, RunWriter
-from tdhil.run import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
+from tdhil.runner import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
 from tdhil.session.connection import Connection, PeerPlan
-from tdhil.session.consent import accepted_lines, note, require_accepted
-from tdhil.session.log_place import LogPlace
-from tdhil.session.opening import open_drive
-from tdhil.session.plan_ahead import refuse_hopeless
+from tdhil.session.dry_run import refuse_hopeless
+from tdhil.session.log_files import LogPlace
+from tdhil.session.open_drive import opened_drive
+from tdhil.session.overrides import accepted_lines, note, require_accepted
 from tdhil.session.real_time import real_time_priority
 from tdhil.session.stop_signals import stop_on_signals
 from tdhil.session.task import bench_of, excitation_request, facts, machine_limits, suited
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Consent:
+class Overrides:
     """What the operator takes upon himself by name, for one run: no file of the bench says any of it."""
 
     no_watchdog: bool = False
@@ -53,7 +53,7 @@ class RunRequest:
     connection: Connection
     peer: PeerPlan
     rig: Rig | None
-    consent: Consent = field(default_factory=Consent)
+    overrides: Overrides = field(default_factory=Overrides)
     operator: str | None = None
     note: str | None = None
     real_time_priority: bool = False
@@ -62,7 +62,7 @@ class RunRequest:
 
     @classmethod
     def of(
-        cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, consent: Consent,
+        cls, options: RunOptions, connection: Connection, peer: PeerPlan, rig: Rig | None, *, overrides: Overrides,
         operator: str | None = None, note: str | None = None, real_time_priority: bool = False,
         evaluation: EvaluationCase | None = None,
     ) -> RunRequest:
@@ -70,10 +70,10 @@ class RunRequest:
         bench = suited(rig, peer.plant)
         if evaluation is None:
             refuse_hopeless(options, bench, connection.profile.can_torque)
-        return cls(options, connection, peer, bench, consent, operator, note, real_time_priority, evaluation)
+        return cls(options, connection, peer, bench, overrides, operator, note, real_time_priority, evaluation)
 
 
-class Attendant(Protocol):
+class OperatorInterface(Protocol):
     """Who is there while a run goes: watches it, lets the shaft move, sees it turn."""
 
     def watch(self) -> AbstractContextManager[Display]:
@@ -100,17 +100,17 @@ class Attendant(Protocol):
 class RunSession:
     """One run. `move` runs the drive, `conclude` identifies; `close` always, or `abandon` where all else failed."""
 
-    def __init__(self, request: RunRequest, attendant: Attendant, *, report: bool = False) -> None:
+    def __init__(self, request: RunRequest, operator_interface: OperatorInterface, *, report: bool = False) -> None:
         """Open the log; nothing else is touched. ``report``: one will be written, so its modules are loaded as well."""
         load_what_the_end_needs(report)
         options, peer = request.options, request.peer
-        self._request, self._attendant = request, attendant
+        self._request, self._operator_interface = request, operator_interface
         self._place = place = LogPlace(Path(options.log))
         writer = RunWriter(place.wanted, epoch_ns=peer.epoch_ns, block=peer.stepped, opener=place.open,
                            frames=request.connection.kind.frame_channel)
         writer.path = place.path
         if place.live:
-            attendant.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")
+            operator_interface.warn(f"another run is writing {place.wanted}: this one's log is {place.path}")
         self._older_told = False
         self._outcome: RunOutcome | None = None
         said = {"operator": request.operator, "note": request.note}
@@ -142,18 +142,18 @@ class RunSession:
             raise
 
     def _move(self, stop: StopRequest | None) -> RunOutcome:
-        request, log, attendant = self._request, self.log, self._attendant
+        request, log, operator_interface = self._request, self.log, self._operator_interface
         options, connection, peer, rig = request.options, request.connection, request.peer, request.rig
         trace = None if options.trace is None else Path(options.trace)
         data = rig.drive_data if rig is not None else None
-        with stop_on_signals(stop) as stop_request, open_drive(
+        with stop_on_signals(stop) as stop_request, opened_drive(
             peer, options, connection, data, log.frame, trace
-        ) as drive, attendant.watch() as display, real_time_priority(
+        ) as drive, operator_interface.watch() as display, real_time_priority(
             request.real_time_priority, stepped=peer.stepped
         ) as raised:
             if raised.said:
                 log.configure(real_time_priority=raised.plain())
-                attendant.say(raised.said)
+                operator_interface.say(raised.said)
             self._outcome = outcome = Runner(
                 drive,
                 self._task,
@@ -161,14 +161,14 @@ class RunSession:
                 stop_request,
                 display,
                 self._confirm,
-                reset_fault=request.consent.reset_fault,
-                say=attendant.say,
-                confirm_speed=attendant.confirm_speed,
+                reset_fault=request.overrides.reset_fault,
+                say=operator_interface.say,
+                confirm_speed=operator_interface.confirm_speed,
             ).run()
         for fault in peer.never_came:
             with suppress(LogError):
                 log.event(drive.clock.now_s(), "fault", f"--fault {fault} never came")
-            attendant.warn(f"tdhil: --fault {fault} never came: this run did not reach its moment")
+            operator_interface.warn(f"tdhil: --fault {fault} never came: this run did not reach its moment")
         return outcome
 
     def conclude(self) -> Conclusion | EvaluationConclusion:
@@ -202,7 +202,7 @@ class RunSession:
 
     def _settle(self) -> None:
         if self._place.moved:
-            self._attendant.warn(f"tdhil: {self._place.moved}")
+            self._operator_interface.warn(f"tdhil: {self._place.moved}")
         self._place.settle(stub=self._stub)
         self._tell_older()
 
@@ -211,31 +211,31 @@ class RunSession:
         older = self._place.older
         if not self._older_told and older is not None and older.exists():
             self._older_told = True
-            self._attendant.say(f"an older {self._place.wanted} was kept as {older}")
+            self._operator_interface.say(f"an older {self._place.wanted} was kept as {older}")
 
     def _confirm(self, task: Task, preflight: Preflight, idle: Idle) -> None:
         request = self._request
         taken = accepted_lines(request.connection.profile, request.options.accept_unverified)
-        self._attendant.confirm(task, preflight, idle, taken)
+        self._operator_interface.confirm(task, preflight, idle, taken)
         self._place.motion = True
         self._tell_older()
 
     def _task(self, identity: Identity) -> Task:
         request, log = self._request, self.log
-        profile, consent, accepted = request.connection.profile, request.consent, request.options.accept_unverified
+        profile, overrides, accepted = request.connection.profile, request.overrides, request.options.accept_unverified
         bench = bench_of(identity, request.rig)
         log.configure(bench=bench.model_dump(mode="json", by_alias=True), identity=asdict(identity))
         if not identity.simulated:
             require_accepted(profile, accepted)
             log.configure(unverified=list(accepted_lines(profile, accepted)))
         elif text := note(profile):
-            self._attendant.say(text)
+            self._operator_interface.say(text)
         limits = machine_limits(
             bench,
-            accept_no_watchdog=consent.no_watchdog,
-            accept_shared_watchdog=consent.shared_watchdog,
-            accept_wider=consent.wider_limits,
-            accept_speed_unit=consent.speed_unit,
+            accept_no_watchdog=overrides.no_watchdog,
+            accept_shared_watchdog=overrides.shared_watchdog,
+            accept_wider=overrides.wider_limits,
+            accept_speed_unit=overrides.speed_unit,
         )
         asked = excitation_request(request.options, bench)
         if request.evaluation is not None:

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, Self
 
 from tdhil.errors import Interrupted
-from tdhil.run import StopRequest
+from tdhil.runner import StopRequest
 
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")  # the last four don't exist everywhere
 _UNHEARD = ("SIGTTIN", "SIGTTOU")

@@ -9,7 +9,7 @@ from typing import Any
 from drivers import Identity
 from tdhil.config import Rig, RunOptions, require_limits, simulated_default_rig
 from tdhil.recording import LagPrior, Pipe
-from tdhil.run import ExcitationRequest, MachineLimits
+from tdhil.runner import ExcitationRequest, MachineLimits
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Limits of the embedded simulated rig where a plant.yaml hangs a drill string on it and no rig.yaml names any.

@@ -18,7 +18,7 @@ from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import PreflightRefused
 from tdhil.cli.main import main
 from tdhil.errors import Interrupted, UsageError
-from tdhil.session.confirm import AskingAttendant, TerminalAttendant
+from tdhil.session.confirm import CallbackOperator, TerminalOperator
 from tdhil.session.stop_signals import stop_on_signals
 
 SHORT = tdhil.Multisine(frequency_hz=0.5, periods=6)
@@ -51,12 +51,12 @@ def test_every_name_that_it_promises_is_there():
         _ = tdhil.nothing
 
 
-@pytest.mark.parametrize("first", ["tdhil", "tdhil.run", "tdhil.run.guard", "tdhil.api"])
+@pytest.mark.parametrize("first", ["tdhil", "tdhil.runner", "tdhil.runner.guard", "tdhil.api"])
 def test_run_is_called_whatever_was_loaded_before(first):
     code = f"import {first}, tdhil\ntry: tdhil.run(tdhil.simulate(seed=7).__enter__(), no_guard=True)\n"
     code += "except tdhil.TdhilError as err: print(err)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "no such consent: no_guard" in done.stdout
+    assert "no such override: no_guard" in done.stdout
 
 
 def test_a_run_is_read_back_as_it_was(record):
@@ -208,8 +208,8 @@ def test_a_request_of_ones_own_hears_of_signals_too_in_the_main_thread():
     assert other.signum == signal.SIGINT
 
 
-def test_a_consent_that_there_is_not_is_refused():
-    with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match="no such consent: no_guard"):
+def test_an_override_that_is_not_there_is_refused():
+    with tdhil.simulate(seed=7) as drive, pytest.raises(UsageError, match="no such override: no_guard"):
         tdhil.run(drive, SHORT, no_guard=True)
 
 
@@ -223,14 +223,14 @@ class Asked:
         self.cycles += 1
 
 
-def ask(attendant, real_preflight, asked):
+def ask(operator_interface, real_preflight, asked):
     from tdhil.config.rig import simulated_default_rig
-    from tdhil.run.settings import ExcitationRequest
-    from tdhil.run.task import Task
+    from tdhil.runner.settings import ExcitationRequest
+    from tdhil.runner.task import Task
     from tdhil.session.task import machine_limits
 
     task = Task(machine_limits(simulated_default_rig()), ExcitationRequest())
-    attendant.confirm(task, real_preflight, asked.idle, ())
+    operator_interface.confirm(task, real_preflight, asked.idle, ())
 
 
 @pytest.fixture
@@ -248,9 +248,9 @@ def test_only_true_moves_a_real_shaft(real_preflight, answer):
     from tdhil.report.live import stderr_console
 
     told = []
-    attendant = AskingAttendant(stderr_console(), lambda text: told.append(text) or answer)
+    operator_interface = CallbackOperator(stderr_console(), lambda text: told.append(text) or answer)
     with pytest.raises(PreflightRefused, match="not confirmed"):
-        ask(attendant, real_preflight, Asked())
+        ask(operator_interface, real_preflight, Asked())
     assert "hard-wired emergency stop" in told[0]
 
 
@@ -267,7 +267,7 @@ def test_a_confirmation_that_fails_moves_nothing_and_feeds_the_watchdog(real_pre
         raise RuntimeError("nobody home")
 
     with pytest.raises(RuntimeError, match="nobody home"):
-        ask(AskingAttendant(stderr_console(), fails), real_preflight, asked)
+        ask(CallbackOperator(stderr_console(), fails), real_preflight, asked)
     assert asked.cycles > 0
 
 
@@ -276,13 +276,13 @@ def test_without_a_terminal_nobody_confirms(real_preflight, monkeypatch):
 
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(PreflightRefused, match="nobody is there to confirm"):
-        ask(TerminalAttendant(stderr_console()), real_preflight, Asked())
+        ask(TerminalOperator(stderr_console()), real_preflight, Asked())
 
 
 def test_true_moves(real_preflight):
     from tdhil.report.live import stderr_console
 
-    ask(AskingAttendant(stderr_console(), lambda text: True), real_preflight, Asked())
+    ask(CallbackOperator(stderr_console(), lambda text: True), real_preflight, Asked())
 
 
 def test_frames_for_notebooks(record):

@@ -18,9 +18,9 @@ from tdhil.recording.log_reader import read_run
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.recording import Stage
 from tdhil.recording.run_log import RunLog, find_ended
-from tdhil.run.stop import StopReport
-from tdhil.run.task import RunOutcome
-from tdhil.service.states import State, end_of
+from tdhil.runner.stop import StopReport
+from tdhil.runner.task import RunOutcome
+from tdhil.service.run_state import State, end_of
 from tdhil.session.conclusion import Conclusion
 from tdhil.session.stop_signals import Ending, stop_on_signals
 

@@ -10,8 +10,8 @@ from drivers.drive import Identity, Mode, Preflight
 from drivers.errors import CommunicationLost, DriveFault
 from tdhil.config.rig import load_rig, simulated_default_rig
 from tdhil.errors import exit_code
-from tdhil.run import preconditions
-from tdhil.run.settings import ExcitationRequest, MachineLimits
+from tdhil.runner import preconditions
+from tdhil.runner.settings import ExcitationRequest, MachineLimits
 from tdhil.session.confirm import motion_summary
 from tdhil.session.task import machine_limits
 

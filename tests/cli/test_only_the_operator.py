@@ -62,7 +62,7 @@ def test_no_option_takes_the_confirmation_from_a_rig():
     assert resolve({}, None).yes is False
 
 
-def test_consent_in_a_file_is_for_the_profile_of_that_file(tmp_path):
+def test_an_override_in_a_file_is_for_the_profile_of_that_file(tmp_path):
     bench = load_rig(rig(tmp_path, "profile: danfoss/fc302\naccept_unverified: [likely]\n"))
     assert resolve({}, bench).accept_unverified == ("likely",)
     assert resolve({"profile": "danfoss/fc302"}, bench).accept_unverified == ("likely",)
@@ -79,7 +79,7 @@ def test_no_standard_input_is_nobody_at_the_prompt(monkeypatch):
     from rich.console import Console
 
     from drivers.drive import Identity
-    from tdhil.run.settings import ExcitationRequest, MachineLimits
+    from tdhil.runner.settings import ExcitationRequest, MachineLimits
 
     monkeypatch.setattr("sys.stdin", None)
     monkeypatch.setattr("tdhil.session.confirm.motion_summary", lambda *_: "")

@@ -31,9 +31,9 @@ from profiles.yaml_loader import parse_model
 from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
 from sim_bus.plant.friction.shaft import Shaft
-from tdhil.cli.bus_commands import BusCommands, FoundDrive
-from tdhil.cli.finding import Finding, ok
+from tdhil.cli.doctor_finding import Finding, ok
 from tdhil.cli.main import build_parser, main
+from tdhil.cli.scan_common import BusCommands, FoundDrive
 from tdhil.config.options import Setting
 from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, Entry, load, names, told_before_echo
 from tdhil.config.rig import Registered, Rig, load_rig
@@ -43,18 +43,18 @@ from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
 from tdhil.recording.log_format import MODBUS
 from tdhil.recording.log_reader import read_frames, read_run
-from tdhil.run.excitation import ExcitationKind, MotionLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
-from tdhil.run.excitation.pulses import SwingKind, SwingPlan
-from tdhil.run.excitation.signals import unit_peak
-from tdhil.run.planning import adaptive, plan_acquisition, refuse_hopeless
-from tdhil.run.preconditions import refuse_by_plan
-from tdhil.run.settings import ExcitationRequest, MachineLimits
+from tdhil.runner.excitation import ExcitationKind, MotionLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
+from tdhil.runner.excitation.pulses import SwingKind, SwingPlan
+from tdhil.runner.excitation.signals import unit_peak
+from tdhil.runner.planning import adaptive, plan_acquisition, refuse_hopeless
+from tdhil.runner.preconditions import refuse_by_plan
+from tdhil.runner.settings import ExcitationRequest, MachineLimits
 from tdhil.session.connection import BusKind, LineConfig, PeerPlan
 from tests.estimation.compliant_bench import TwoMass, run
 from tests.estimation.test_two_mass import KNOWN as KNOWN_LAGS
 from tests.estimation.test_two_mass import MILD
-from tests.run.line_drive import Line, LineDrive
-from tests.run.test_design import KNOWN
+from tests.runner.line_drive import Line, LineDrive
+from tests.runner.test_design import KNOWN
 
 ROOT = Path(__file__).parents[2]
 LIMITS, GUESS = MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(104.0, 8.0, 60.0)
@@ -240,7 +240,7 @@ class ToyLine(LineConfig):
 
 
 class ToyKind(BusKind):
-    """Its drive is the one of `tests.run.line_drive`, which no bus of ours knows."""
+    """Its drive is the one of `tests.runner.line_drive`, which no bus of ours knows."""
 
     name, title, named_by = "toy", "Toy", "--peg"
     flags = MappingProxyType({"peg": "--peg"})

@@ -2,7 +2,7 @@
 
 import math
 
-from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
+from tdhil.runner.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
 from tests.estimation.shaft_bench import Motion
 
 LIMITS = MotionLimits(0.5, 10.0, 400.0)

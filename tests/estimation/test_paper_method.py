@@ -5,7 +5,7 @@ import pytest
 
 from tdhil.estimation import Verdict, identify
 from tdhil.recording.recording import LagPrior
-from tdhil.run.excitation import ExcitationWish
+from tdhil.runner.excitation import ExcitationWish
 from tests.estimation.analytic import closed_form
 from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate

@@ -18,7 +18,7 @@ from tdhil.estimation.friction_levels import measure_levels
 from tdhil.estimation.samples import Samples, stretches, usable_samples
 from tdhil.estimation.spectrum import period_lines
 from tdhil.recording.recording import Recording
-from tdhil.run.excitation import ExcitationWish
+from tdhil.runner.excitation import ExcitationWish
 from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate
 from tests.estimation.stages_bench import Stages, run_stages, usual_runs

@@ -143,7 +143,7 @@ FIFTY = {
             "no number, or one with a warning"),
     49: Row("aborted protocol", "resumed at a stage boundary only, after a new preflight", "-",
             (f"{HOST}test_row_49_an_aborted_run_begins_anew",
-             "tests/run/test_no_resume.py::test_after_an_abort_in_any_stage_a_run_begins_anew")),
+             "tests/runner/test_no_resume.py::test_after_an_abort_in_any_stage_a_run_begins_anew")),
     50: _scripted("watchdog not armed, or cannot be", "R, unless the operator accepts it by name",
                   "4; accepted: as any run, but 8 where the line is lost in motion",
                   f"{HERE}test_modbus_scripted.py::test_row", f"{NO_WATCHDOG}test_no_other_switch_takes_it",

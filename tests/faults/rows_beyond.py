@@ -15,8 +15,8 @@ LATE: dict[int, Row] = {
              "tests/drivers/test_late_host.py::test_half_of_the_watchdogs_time_is_the_longest_stall"),
             "\"this computer was late: its control loop stood still for …\" comes before what was seen on the bus"),
     53: Row("Ctrl-C, or a trip of the guard, while the rest of the run is planned", "QS in the next cycle", "130, 7",
-            ("tests/run/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
-             "tests/run/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
+            ("tests/runner/test_deaf.py::test_the_stop_does_not_wait_for_arithmetic",
+             "tests/runner/test_deaf.py::test_a_process_ends_although_arithmetic_that_was_left_alone_goes_on"),
             "the plan is dropped, not waited for; it was before, and nothing was sent meanwhile"),
     54: Row("a busy computer, in stepped time (answers take seconds, or are lost)", "the run is the same", "as without",
             ("tests/drivers/test_drive_faults.py::test_in_stepped_time_nothing_is_late",
@@ -24,32 +24,32 @@ LATE: dict[int, Row] = {
              "tests/drivers/test_drive_faults.py::test_a_dead_peer_ends_a_wait_and_costs_little_from_then_on"),
             "the peer is asked whether anything is still to come; nothing but a dead one (4 s) ends a wait"),
     55: Row("this computer doesn't hold the profile's rate", "a lower one, chosen and said before motion", "0",
-            ("tests/run/test_choose_rate.py::"
+            ("tests/runner/test_choose_rate.py::"
              "test_the_highest_rate_whose_half_period_is_longer_than_the_delay",
-             "tests/run/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
+             "tests/runner/test_choose_rate.py::test_the_runner_tries_before_motion_and_goes_on_at_that_rate"),
             "the highest of which 999 cycles of 1000 are in time by half a period"),
 }
 
 SECOND = f"{HERE}test_second_master_rows.py::"
-STRANGERS = "tests/drivers/test_other_master.py::"
+OTHER_MASTER = "tests/drivers/test_other_master.py::"
 
 SECOND_MASTER: dict[int, Row] = {
     56: Row("another node bears the host's number: its heartbeat feeds the drive's watchdog",
             "a free number from the start; QS in motion, however slow it is", "0, 5",
             (f"{SECOND}test_noticed_and_stopped",
              f"{SECOND}test_a_number_that_is_taken_from_the_start_is_not_the_host_s",
-             f"{STRANGERS}test_a_number_that_another_node_bears_is_not_taken",
-             f"{STRANGERS}test_one_that_comes_before_motion_is_refused")),
+             f"{OTHER_MASTER}test_a_number_that_another_node_bears_is_not_taken",
+             f"{OTHER_MASTER}test_one_that_comes_before_motion_is_refused")),
     57: Row("a tool writes watchdog or reaction in motion", "read back at once, QS", "5",
             (f"{SECOND}test_noticed_and_stopped",)),
     58: Row("watchdog, quick stop or a limit changed at the drive's panel in motion", "read back, QS", "5",
             (f"{SECOND}test_noticed_and_stopped",
-             f"{STRANGERS}test_a_setting_that_somebody_changes_in_motion_ends_the_run")),
+             f"{OTHER_MASTER}test_a_setting_that_somebody_changes_in_motion_ends_the_run")),
     59: Row("a second master's setpoints in another RPDO", "that RPDO is off; QS, at rest", "5",
-            (f"{SECOND}test_noticed_and_stopped", f"{STRANGERS}test_other_rpdos_are_switched_off_and_given_back")),
+            (f"{SECOND}test_noticed_and_stopped", f"{OTHER_MASTER}test_other_rpdos_are_switched_off_and_given_back")),
     60: Row("a second master's setpoints by SDO, or by another fieldbus", "QS, at rest", "5",
             (f"{SECOND}test_noticed_and_stopped",
-             f"{STRANGERS}test_a_speed_in_the_drive_that_is_not_ours_ends_the_run")),
+             f"{OTHER_MASTER}test_a_speed_in_the_drive_that_is_not_ours_ends_the_run")),
     61: Row("a stray SDO that the cycle undoes", "told in log, result and at the end", "0, 9",
             (f"{SECOND}test_stray_writes_that_the_cycle_undoes_are_told",)),
     62: Row("a second master undoes the quick stop again and again", "the host falls silent and looks on; WD", "5",
@@ -60,7 +60,7 @@ SECOND_MASTER: dict[int, Row] = {
     64: Row("the drive's own limits are tighter than rig.yaml's", "they stay, or R; widened by name only", "0, 4",
             ("tests/drivers/test_preflight.py::test_a_tighter_limit_of_the_drive_s_own_stays",
              "tests/drivers/test_preflight.py::test_it_is_widened_by_name_and_no_other_with_it",
-             "tests/run/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
+             "tests/runner/test_run_refused.py::test_limits_of_the_drive_that_leave_no_room"),
             "kept, and the run keeps within them"),
     65: Row("a killed host leaves its limits in the drive", "named by doctor, given back by the next run", "-",
             ("tests/drivers/test_undo_journal.py::test_the_next_run_gives_back_what_a_killed_one_left",
@@ -138,35 +138,35 @@ UNITS: dict[int, Row] = {
 STAGES: dict[int, Row] = {
     79: Row("a drill string, and a drive whose quick stop lets go of it", "R", "4",
             ("tests/faults/test_stage_rows.py::test_a_string_and_a_quick_stop_that_lets_go",
-             "tests/run/test_stop_string.py::test_what_a_string_forbids",
+             "tests/runner/test_stop_string.py::test_what_a_string_forbids",
              "tests/drivers/test_preflight.py::test_whether_a_quick_stop_holds_the_shaft")),
     80: Row("somebody else drives the shaft on against the quick stop", "the drive is fed no more: WD", "as its cause",
-            ("tests/run/test_stop_polls.py::"
+            ("tests/runner/test_stop_polls.py::"
              "test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched",),
             "no slower for 3 s: no sign of life goes out any more, the drive's watchdog stops it, and that is seen"),
     81: Row("a scripted fault whose moment the run does not reach", "said at the end", "as without",
             ("tests/faults/test_stage_rows.py::test_a_fault_that_never_comes_is_said",)),
     82: Row("a mode that is lost in motion", "QS", "6",
             ("tests/faults/test_stage_rows.py::test_a_mode_that_is_lost_in_motion",
-             "tests/run/test_guard_follows.py::test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame")),
+             "tests/runner/test_guard_follows.py::test_a_mode_that_is_lost_trips_once_it_can_be_no_late_frame")),
     83: Row("a shaft that does not follow in speed mode", "following error: QS", "7",
             ("tests/faults/test_stage_rows.py::test_a_shaft_that_does_not_follow_in_speed_mode",
-             "tests/run/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
-             "tests/run/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
+             "tests/runner/test_guard_follows.py::test_a_shaft_that_stays_at_another_speed_trips",
+             "tests/runner/test_guard_follows.py::test_no_rig_that_does_what_it_can_trips")),
     84: Row("a log that is removed, cut short, or whose thread dies", "said at once: QS", "3",
             ("tests/faults/test_stage_rows.py::test_a_log_that_is_taken_away",
              "tests/recording/test_writer.py::test_a_log_that_was_taken_away_is_told_at_once",
              "tests/recording/test_writer.py::test_a_log_whose_thread_died_is_told_within_a_second")),
 }
 
-STREAMS = "tests/path/test_streams.py::"
+STREAMS = "tests/path/test_standard_streams.py::"
 FILES = "tests/path/test_files_of_a_run.py::"
 COMMAND_LINE: dict[int, Row] = {
     85: Row("rig.yaml confirms in the operator's place (run: yes, accept_no_watchdog …)", "refused, with the line and "
-            "the flag; consent to a profile's entries counts for the profile of the same file only", "2",
+            "the flag; an override of a profile's entries counts for the profile of the same file only", "2",
             ("tests/cli/test_only_the_operator.py::test_a_file_does_not_confirm",
              "tests/cli/test_only_the_operator.py::test_nothing_that_the_operator_answers_for_stands_in_a_file",
-             "tests/cli/test_only_the_operator.py::test_consent_in_a_file_is_for_the_profile_of_that_file"),
+             "tests/cli/test_only_the_operator.py::test_an_override_in_a_file_is_for_the_profile_of_that_file"),
             "the key is named with its line, nothing is connected to"),
     86: Row("a quantity in rig.yaml in another unit than the key's (speed_max_rad_s: 100 rpm, speed_max_rpm)",
             "converted and shown both ways, or refused without offering a number; both forms of a key are refused",
@@ -219,7 +219,7 @@ LOG: dict[int, Row] = {
              "the same result"),
 }
 
-VIRTUAL, IMPEDANCE = "tests/run/test_virtual_string.py::", "tests/run/test_impedance_run.py::"
+VIRTUAL, IMPEDANCE = "tests/runner/test_virtual_string.py::", "tests/runner/test_impedance_run.py::"
 SOFT_TORQUE: dict[int, Row] = {
     96: Row("virtual string: Ctrl-C while the bit sticks", "QS; the string's torque goes first", "130",
             (f"{VIRTUAL}test_ctrl_c_while_the_bit_sticks_takes_the_string_away_first",),
@@ -263,7 +263,7 @@ SOFT_TORQUE: dict[int, Row] = {
              "model_rejected, with its time constant"),
 }
 
-STRING, SESSION = "tests/run/test_stop_string.py::", "tests/session/"
+STRING, SESSION = "tests/runner/test_stop_string.py::", "tests/session/"
 BETWEEN: dict[int, Row] = {
     105: Row("Modbus: a status word that makes no sense (zeros of a gateway for a cycle, a pattern nobody knows)",
              "QS; never off while the shaft may turn", "6",
@@ -298,7 +298,7 @@ BETWEEN: dict[int, Row] = {
               f"{SESSION}test_confirm_speed.py::test_a_program_in_the_background_is_refused_not_stopped"),
              "a wish to stop, as Ctrl-C; nothing freezes the loop"),
     110: Row("a drive's lock is removed while a run holds it", "R for the second", "4",
-             (f"{SESSION}test_holder.py::test_a_lock_whose_file_was_removed_holds_all_the_same",),
+             (f"{SESSION}test_drive_lock.py::test_a_lock_whose_file_was_removed_holds_all_the_same",),
              "a name in the kernel holds it too (Linux)"),
     111: Row("the terminal takes nothing (Ctrl-S) when it is asked in motion; an answer typed before the question",
              "cycles and stop go on; no answer", "130, 4",
@@ -327,7 +327,7 @@ BETWEEN: dict[int, Row] = {
 }
 
 SCRIPTED, OVER_MODBUS = f"{HERE}test_rows_scripted.py::test_row", f"{HERE}test_modbus_scripted.py::test_row"
-OBSERVER, DOUBT = "tests/run/test_observer.py::", "tests/run/test_stop_doubt.py::"
+OBSERVER, DOUBT = "tests/runner/test_observer.py::", "tests/runner/test_stop_doubt.py::"
 
 LYING: dict[int, Row] = {
     115: Row("the drive's speed sensor is lost or frozen; its speed control follows it",
@@ -356,7 +356,7 @@ LYING: dict[int, Row] = {
              "no valid state: QS again and again; nothing is disabled", "8",
              (SCRIPTED, OVER_MODBUS,
               f"{DOUBT}test_a_drive_that_shows_no_state_gets_its_quick_stop_again_and_again",
-              "tests/run/test_standstill.py::test_a_report_that_shows_none")),
+              "tests/runner/test_standstill.py::test_a_report_that_shows_none")),
     121: Row("the shaft accelerates against its quick stop (polarity, stuck torque, wrong sensor)",
              "seen in two ways: torque off, 8; above a drill string only beyond the speed limit", "8",
              (SCRIPTED, f"{OBSERVER}test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways",

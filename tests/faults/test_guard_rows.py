@@ -12,10 +12,10 @@ import pytest
 from drivers.drive import Command, Counters, Mode, PowerState
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, LimitHit, ModeNotConfirmed, PreflightRefused
 from tdhil.errors import ExitCode, Interrupted, LogError, exit_code
-from tdhil.run.control_loop import ControlLoop
-from tdhil.run.settings import ExcitationRequest
-from tdhil.run.task import STAGES
-from tests.run.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.task import STAGES
+from tests.runner.fake_drive import LIMITS, NAN, PERIOD_S, FakeDrive, World
 
 IN_STAGE = 60
 """Cycles into a stage at which its fault begins."""

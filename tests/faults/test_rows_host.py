@@ -12,8 +12,8 @@ from tdhil.errors import LogBroken
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.run_log import RunLog
 from tdhil.report.live import LiveDisplay
-from tdhil.run import stage_planner
-from tdhil.run.control_loop import ControlLoop
+from tdhil.runner import stage_planner
+from tdhil.runner.control_loop import ControlLoop
 from tests.faults.rehearsal import at
 from tests.path.path_runs import tdhil
 

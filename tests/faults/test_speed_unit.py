@@ -22,11 +22,11 @@ from sim_bus.canopen.simulator import EmbeddedSimulator
 from sim_bus.modbus.embedded import EmbeddedModbusDrive
 from sim_bus.params import RigParams
 from tdhil.errors import exit_code
-from tdhil.run import speed_check
-from tdhil.run.runner import Runner
-from tdhil.run.settings import ExcitationRequest, MachineLimits, StopRequest
-from tdhil.run.task import Task
-from tests.run.fake_drive import FakeDisplay, FakeLog
+from tdhil.runner import speed_check
+from tdhil.runner.five_stages import Runner
+from tdhil.runner.settings import ExcitationRequest, MachineLimits, StopRequest
+from tdhil.runner.task import Task
+from tests.runner.fake_drive import FakeDisplay, FakeLog
 
 LIMITS = MachineLimits(
     speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=400.0, time_s=900.0, quick_stop_rad_s2=2.0,

@@ -8,11 +8,13 @@ import tomllib
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec
 from pathlib import Path
+from pkgutil import iter_modules
 from types import ModuleType
 
 import pytest
 
 from profiles import lazy_face
+from profiles.face import names_by_type_checking
 
 ROOT = Path(__file__).parents[2]
 # The stable API at the front door, and both halves of each bus, in folders of their rooms.
@@ -54,6 +56,13 @@ def test_a_name_is_loaded_when_it_is_taken(monkeypatch, tmp_path):
     assert get("answer") == 42
     with pytest.raises(AttributeError, match="module 'a_package' has no attribute 'question'"):
         get("question")
+
+
+@pytest.mark.parametrize("package", sorted(PACKAGES))
+def test_no_name_of_a_lazy_face_is_a_module_of_its_package(package):
+    # Python makes a package's attribute the module once that is loaded: the name would be the one or the other.
+    names = names_by_type_checking(PACKAGES[package].read_text(encoding="utf-8"))
+    assert set(names).isdisjoint(module.name for module in iter_modules([str(PACKAGES[package].parent)]))
 
 
 def test_estimation_loads_neither_drives_nor_files():

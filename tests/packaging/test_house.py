@@ -60,7 +60,7 @@ def test_help_of_a_command_comes_quickly(command):
 
 
 def test_what_a_log_says_of_its_run_is_read_without_a_virtual_string():
-    done = run("-c", "import sys\nfrom tdhil.run import precondition_warnings, speed_warnings, stage_warnings\n"
+    done = run("-c", "import sys\nfrom tdhil.runner import precondition_warnings, speed_warnings, stage_warnings\n"
                      "print([name for name in sys.modules if name.startswith('tdhil.soft_torque.')])")
     assert done.stdout == "[]\n", done.stderr
 

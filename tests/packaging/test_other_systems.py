@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from tdhil.session.log_place import LogPlace, is_live
+from tdhil.session.log_files import LogPlace, is_live
 
 _SCRIPT = """
 import importlib, os, pkgutil, select, signal, socket, sys

@@ -13,7 +13,7 @@ from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter
 from tdhil.recording.mcap_container import MAGIC
 from tdhil.recording.recording import Stage
-from tdhil.session.log_place import LogPlace, is_live
+from tdhil.session.log_files import LogPlace, is_live
 from tests.path.path_runs import identify, tdhil
 
 REFUSED = ("--simulate", "--seed", 1, "--fault", "wrong-identity", "--profile", "maxon/epos4")

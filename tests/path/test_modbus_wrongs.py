@@ -17,7 +17,7 @@ from profiles.modbus import ModbusProfile
 from sim_bus.modbus import embedded, registers
 from sim_bus.modbus.wrong_maps import parse
 from tdhil.recording.log_reader import read_frames
-from tdhil.session.consent import accepted_lines, require_accepted
+from tdhil.session.overrides import accepted_lines, require_accepted
 from tests.path.path_runs import Shaft, identify
 
 NAMES = [name for name in profile_names() if isinstance(load_profile(name), ModbusProfile)]

@@ -9,7 +9,7 @@ from drivers.errors import PreflightRefused
 from profiles.library import load_profile, profile_names, profile_path
 from profiles.modbus import ModbusProfile
 from tdhil.cli.main import main
-from tdhil.session.consent import require_accepted
+from tdhil.session.overrides import require_accepted
 from tests.path.path_runs import tdhil
 
 

@@ -12,10 +12,10 @@ from profiles.canopen import CanopenProfile
 from profiles.library import load_canopen_profile, load_profile, profile_names
 from sim_bus.canopen.simulator import EmbeddedSimulator, Simulator
 from sim_bus.params import RigParams
-from tdhil.cli.bus_commands import FoundDrive
 from tdhil.cli.buses.canopen_scan import match
 from tdhil.cli.buses.modbus_scan import parse_identification, parse_units
 from tdhil.cli.scan import starter
+from tdhil.cli.scan_common import FoundDrive
 from tdhil.config.rig import load_rig, require_limits
 from tdhil.session.buses import can_bus, modbus
 from tests.path.path_runs import tdhil

@@ -20,11 +20,11 @@ from tdhil.recording.builder import RecordingBuilder
 from tdhil.recording.log_format import VIRTUAL_COLUMNS, Event
 from tdhil.recording.log_reader import read_frames, read_run, read_samples
 from tdhil.recording.log_writer import RunWriter
-from tdhil.recording.packed import pack_recording, unpack_recording
+from tdhil.recording.npz_cache import pack_recording, unpack_recording
 from tdhil.recording.recording import LagPrior, Recording, Stage, before_abort
 from tdhil.recording.run_log import RunLog
 from tests.recording.log_runs import CONFIGURATION, FACTS, PERIOD_S, RESULT, STAGES, fill, make_run, same, sample
-from tests.recording.test_wire import SAMPLES
+from tests.recording.test_log_messages import SAMPLES
 
 
 def test_a_run_comes_back_as_it_was(tmp_path):

@@ -16,7 +16,7 @@ from profiles.visible_text import visible
 from tdhil.cli.main import main
 from tdhil.report.console import PlainConsole
 from tdhil.report.live import preflight_table
-from tdhil.run.settings import ExcitationRequest
+from tdhil.runner.settings import ExcitationRequest
 from tdhil.session.confirm import motion_summary
 
 EVIL = "\x1b[2J\x1b]0;x\x07A\x9b31m[/][red]\u202egnirts\u2066\x00\r\nDrive: safe\u2028 \x7f"
@@ -116,6 +116,6 @@ def test_the_head_of_a_column(tmp_path, capsys):
 
 @pytest.mark.parametrize("grade", ["ok", "bad"])
 def test_a_line_of_the_doctor_s(grade):
-    from tdhil.cli.finding import Finding
+    from tdhil.cli.doctor_finding import Finding
 
     assert harmless(Finding(grade, "drive", EVIL, EVIL).text)

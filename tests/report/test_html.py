@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tdhil.errors import UsageError
-from tdhil.report.content import Picture, report_of
+from tdhil.report.blocks import Picture, report_of
 from tdhil.report.document import result_document
 from tdhil.report.html import check_report_path, pictures_in, report_page, sha256_of, write_report
 from tdhil.report.plots import envelope

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from tdhil.estimation import FrictionPoint
-from tdhil.report.content import report_of
+from tdhil.report.blocks import report_of
 from tdhil.report.document import result_document
 from tests.report.findings import RUN, around, bare, full, open_sided, recording
 

@@ -17,9 +17,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from tdhil.service.access import Access
-from tdhil.service.answers import API
-from tdhil.service.asking import Rigs
 from tdhil.service.audit import Audit
+from tdhil.service.schemas import API
+from tdhil.service.start_request import Rigs
 from tdhil.service.store import Index, Store
 from tdhil.service.supervisor import Supervisor
 from tdhil.service.web import Web
@@ -78,7 +78,7 @@ def folder_of_locks(at: Path) -> str:
 @pytest.fixture
 def own_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the service does as long as nobody on this computer holds a drive, it does whatever else is tested on it."""
-    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (folder_of_locks(tmp_path / "locks"),))
+    monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (folder_of_locks(tmp_path / "locks"),))
 
 
 @pytest.fixture

@@ -17,10 +17,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from drivers import PreflightRefused
-from tdhil.service.attending import Board, Confirming, Lease
-from tdhil.service.states import Check, Confirmation, State, Stop, now, way_to
+from tdhil.service.attendance import Board, Confirming, Lease
+from tdhil.service.run_channel import STOP_FILE, Listener
+from tdhil.service.run_state import Check, Confirmation, State, Stop, now, way_to
 from tdhil.service.store import Store, read_json, write_json
-from tdhil.service.wire import STOP_FILE, Listener
 
 RESULT = {"verdict": "valid", "inertia_kg_m2": {"value": 104.0, "low_total": 100.0, "high_total": 108.0,
                                                  "repeatability_rel": 0.005}}

@@ -24,8 +24,8 @@ from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
 from tdhil.service.access import SESSION_S, STOPS_S, Access, Pace, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
-from tdhil.service.answers import API
-from tdhil.service.states import TooManyRuns, TooManyTries
+from tdhil.service.run_state import TooManyRuns, TooManyTries
+from tdhil.service.schemas import API
 from tdhil.session import hold
 from tests.service.conftest import Service, wait_for
 

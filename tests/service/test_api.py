@@ -15,8 +15,8 @@ import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from tdhil.errors import UsageError
-from tdhil.service.answers import API, ROUTES, SOCKETS, document
-from tdhil.service.states import State
+from tdhil.service.run_state import State
+from tdhil.service.schemas import API, ROUTES, SOCKETS, document
 from tests.service.conftest import HANGS_S, URL, Service, wait_for
 
 # -- what there is

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import pytest
 
 from drivers import Identity, PreflightRefused
-from tdhil.service.asking import read_rig, run_request
 from tdhil.service.run_process import RunProcess
-from tdhil.service.states import Conflict, now
+from tdhil.service.run_state import Conflict, now
+from tdhil.service.start_request import read_rig, run_request
 from tdhil.service.store import Request, Store
 from tests.path.path_runs import REAL, Peer, peer
 from tests.path.test_real_peer import RIG, enabled

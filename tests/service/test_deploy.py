@@ -17,9 +17,9 @@ import pytest
 from tdhil.cli.main import build_parser, main
 from tdhil.errors import ExitCode
 from tdhil.service import supervisor
-from tdhil.service.wire import lives
+from tdhil.service.run_channel import lives
 from tdhil.session import hold, holder_of, holders
-from tdhil.session.holder import FOLDERS
+from tdhil.session.drive_lock import FOLDERS
 from tdhil.session.real_time import PRIORITY
 from tests.service.conftest import wait_for
 
@@ -36,7 +36,7 @@ def locks(tmp_path, monkeypatch):
     folder = tmp_path / "lock"
     folder.mkdir()
     folder.chmod(0o1777)
-    monkeypatch.setattr("tdhil.session.holder.FOLDERS", (str(folder),))
+    monkeypatch.setattr("tdhil.session.drive_lock.FOLDERS", (str(folder),))
 
 
 def idle(data: Path) -> int:
@@ -160,7 +160,7 @@ def test_systemd_takes_the_unit(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="oom_score_adj is Linux's")
 def test_arithmetic_goes_first_where_memory_runs_out():
-    code = ("import pathlib, sys; from tdhil.service import work; work.main(['plan']);"
+    code = ("import pathlib, sys; from tdhil.service import worker; worker.main(['plan']);"
             "print(pathlib.Path('/proc/self/oom_score_adj').read_text(), file=sys.stderr)")
     done = subprocess.run([sys.executable, "-c", code], input=b"{}", capture_output=True)
     assert int(done.stderr.split()[-1]) == 500

@@ -24,7 +24,7 @@ from starlette.routing import Route
 
 from tdhil.service import door as door_module
 from tdhil.service.door import HEADERS_S, Door, Room, Seldom, raise_limit
-from tdhil.service.serving import Tls
+from tdhil.service.server import Tls
 from tests.service.conftest import HANGS_S, wait_for
 
 ROOM = Room(waiting=8, waiting_of_one=4, served=6, served_of_one=3)

@@ -25,9 +25,9 @@ from tdhil.recording import RunWriter, Stage
 from tdhil.recording.log_format import Event
 from tdhil.service import foxglove
 from tdhil.service import web as web_module
-from tdhil.service.answers import API
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
-from tdhil.service.serving import _listen
+from tdhil.service.schemas import API
+from tdhil.service.server import _listen
 from tdhil.service.web import Web
 from tests.recording.test_log_tail import COMMAND, sample, write
 from tests.service.conftest import HANGS_S, URL, Service, wait_for

@@ -15,9 +15,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from tdhil.service.states import Conflict, State, Status
+from tdhil.service.run_channel import stands_still
+from tdhil.service.run_state import Conflict, State, Status
 from tdhil.service.store import CONNECTION_FILE, write_json
-from tdhil.service.wire import stands_still
 from tdhil.session import kept_connection
 from tests.service.conftest import Service, wait_for
 

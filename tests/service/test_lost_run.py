@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tdhil.recording import read_run
-from tdhil.service.states import State
+from tdhil.service.run_state import State
 from tests.service.conftest import Service, wait_for
 
 LIMITS = ("limits: {speed_min_rad_s: 0.5, speed_max_rad_s: 10.0, torque_nm: 400.0, time_s: 900.0,"

@@ -11,11 +11,11 @@ import pytest
 from tdhil.errors import ExitCode
 from tdhil.recording import read_run
 from tdhil.report import has_extra
-from tdhil.service.asking import read_rig
+from tdhil.service.run_channel import STOP_FILE
 from tdhil.service.run_process import NICE, RunProcess, main
-from tdhil.service.states import State, Watch, now
+from tdhil.service.run_state import State, Watch, now
+from tdhil.service.start_request import read_rig
 from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
-from tdhil.service.wire import STOP_FILE
 from tests.service.conftest import Service, wait_for
 from tests.service.test_lost_run import LIMITS
 
@@ -167,7 +167,7 @@ def test_a_stop_file_reaches_a_run_of_the_service(tmp_path, rigs):
 def test_a_run_that_is_watched_no_more_is_stopped_by_nobody(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
     assert process.watched
-    process.attendant._unwatched(Watch("anna", now(), now(), "hidden", now()))
+    process.operator_interface._unwatched(Watch("anna", now(), now(), "hidden", now()))
     assert process.stop.why == "nobody watched the run for 5 s (its page is hidden)"
     assert (process.stop.signum, process.board.status.stop.by) == (15, "nobody watched")
     process.board.close()
@@ -177,15 +177,16 @@ def test_a_lease_and_a_code_are_handed_on_as_they_came(tmp_path):
     process = RunProcess(Asked(tmp_path, SIMULATED, motion="watched").folder)
     calls: list[object] = []
     watch = Watch("anna", now())
-    process.attendant.lease = SimpleNamespace(renew=lambda *given, **more: calls.append((given, more)) or watch)
+    process.operator_interface.lease = SimpleNamespace(
+        renew=lambda *given, **more: calls.append((given, more)) or watch)
     asked = {"do": "lease", "key": "k", "by": "anna", "new_key": None, "gone": "hidden"}
     assert process.answer(asked)["watch"]["by"] == "anna"
     assert calls.pop() == (("k", "anna"), {"new_key": "", "gone": "hidden"})
-    process.attendant.confirming = SimpleNamespace(
+    process.operator_interface.confirming = SimpleNamespace(
         take=lambda *given: calls.append(given), confirmed_by=None, void=None, code="123456", left_s=9.0, binding="b")
     assert process.answer({"do": "confirm", "code": 1, "binding": "b", "by": "anna", "lease": None})["status"]
     assert calls.pop() == ("1", "b", "anna", "")
     assert process.answer({"do": "code"}) == {"code": "123456", "left_s": 9.0, "binding": "b"}
-    process.attendant.confirming.confirmed_by = "anna"
+    process.operator_interface.confirming.confirmed_by = "anna"
     assert process.answer({"do": "code"}) == {"code": None}
     process.board.close()

@@ -23,7 +23,7 @@ from tdhil.errors import ExitCode, UsageError
 from tdhil.recording import read_run
 from tdhil.service import AccountsFile, attend
 from tdhil.service.client import ServiceError
-from tdhil.service.serving import require_way
+from tdhil.service.server import require_way
 from tdhil.service.store import Store
 from tests.service.conftest import HANGS_S, folder_of_locks, wait_for
 
@@ -37,8 +37,8 @@ QUICK = {"seed": 7, "rate_hz": 50}         # a fifth of the drive's usual rate, 
 
 SERVE = """
 import sys
-from tdhil.session import holder
-holder.FOLDERS = (sys.argv.pop(1),)        # a replay waits for whoever holds a drive: not for those of other tests
+from tdhil.session import drive_lock
+drive_lock.FOLDERS = (sys.argv.pop(1),)        # a replay waits for whoever holds a drive: not for those of other tests
 from tdhil.__main__ import console
 console()
 """
@@ -261,7 +261,7 @@ def test_a_token_goes_over_tls_alone():
 
 
 def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsys):
-    from tdhil.service.serving import _alone
+    from tdhil.service.server import _alone
 
     with _alone(tmp_path), pytest.raises(UsageError, match="another tdhil serve has this folder"):
         _alone(tmp_path)
@@ -280,7 +280,7 @@ def test_one_service_a_folder_and_a_folder_of_rigs_that_is_there(tmp_path, capsy
 ])
 def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tdhil.service.serving._uvicorn", lambda *_: pytest.fail("it served"))
+    monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: pytest.fail("it served"))
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "service.lock").mkdir(parents=True)
     assert main(["serve", "--port", "0", *arguments]) == ExitCode.USAGE
@@ -289,7 +289,7 @@ def test_what_cannot_be_served_is_said_in_words(tmp_path, capsys, monkeypatch, a
 
 
 def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("tdhil.service.serving._uvicorn",
+    monkeypatch.setattr("tdhil.service.server._uvicorn",
                         lambda app, listening, brake, *_: brake.__self__.not_at_rest.append("R1"))
     assert main(["serve", "--port", "0", "--data", str(tmp_path / "data")]) == ExitCode.STOP_NOT_CONFIRMED
     assert "NOT at rest, as far as is known: R1. Use the hard-wired stop." in capsys.readouterr().err
@@ -298,7 +298,7 @@ def test_a_shaft_that_is_not_seen_at_rest_is_the_exit_code(tmp_path, capsys, mon
 def test_a_rig_whose_file_has_no_rig_s_name_is_said_to_be_left_out(tmp_path, capsys, monkeypatch):
     for name in ("a.yaml", "rig 7.yaml", "b.yml", "notes.txt"):
         (tmp_path / name).write_text("run: {simulate: true}\n")
-    monkeypatch.setattr("tdhil.service.serving._uvicorn", lambda *_: None)
+    monkeypatch.setattr("tdhil.service.server._uvicorn", lambda *_: None)
     assert main(["serve", "--port", "0", "--rigs", str(tmp_path), "--data", str(tmp_path / "data")]) == ExitCode.OK
     assert "Left out, as no rig's file is called so: b.yml, rig 7.yaml." in capsys.readouterr().err
 

@@ -17,9 +17,9 @@ import pytest
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.service.audit import KEY_FILE, Audit, Head
-from tdhil.service.states import NotThere, State, Status, now, way_to
+from tdhil.service.run_channel import lives, take_life
+from tdhil.service.run_state import NotThere, State, Status, now, way_to
 from tdhil.service.store import Index, Request, Store, summary_of, write_json, write_whole
-from tdhil.service.wire import lives, take_life
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ import pytest
 from drivers import CommunicationLost, DataFileError
 from tdhil.errors import LogError
 from tdhil.service import supervisor as supervisor_module
-from tdhil.service.states import Conflict, NoRoom, State, Status, now, way_to
+from tdhil.service.run_channel import STOP_FILE, Refused
+from tdhil.service.run_state import Conflict, NoRoom, State, Status, now, way_to
 from tdhil.service.store import Request
 from tdhil.service.supervisor import KEYS
-from tdhil.service.wire import STOP_FILE, Refused
 from tests.service.conftest import FAKE, Service, wait_for
 
 

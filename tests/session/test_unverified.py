@@ -1,4 +1,4 @@
-"""Consent to what a profile only supposes: by name, all that is likely at once, and never by a typo."""
+"""Overrides of what a profile only supposes: by name, all that is likely at once, and never by a typo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from profiles.library import load_modbus_profile, load_profile, profile_names
 from profiles.modbus import ModbusProfile
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.session.consent import accepted_lines, check_names, doubtful, note, require_accepted
+from tdhil.session.overrides import accepted_lines, check_names, doubtful, note, require_accepted
 
 PLAIN = load_modbus_profile("generic/modbus")
 NAMES = [name for name, _ in PLAIN.entries()]
@@ -80,7 +80,7 @@ def test_everything_is_named_with_its_source() -> None:
 @pytest.mark.parametrize(
     ("name", "said"), [("wachdog", "'watchdog'"), ("cycle.sped", "'cycle.speed'"), ("x", "no such")]
 )
-def test_a_typo_is_no_consent(name: str, said: str) -> None:
+def test_a_typo_is_no_override(name: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         check_names(PLAIN, [name], "rig.yaml:3")
 

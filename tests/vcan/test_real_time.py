@@ -26,7 +26,7 @@ from typing import Any
 import pytest
 
 from tdhil.recording.log_reader import read_run
-from tdhil.run.stages import speed
+from tdhil.runner.stages import speed
 from tests.path.path_runs import INERTIA, PLAIN, Peer, identify, peer, wait_for
 from tests.vcan.vcan_runs import root_s_ip, run
 

@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.bus_commands import BusCommands, FoundDrive, ValueSeen
+from tdhil.cli.scan_common import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
     from profiles import Profile
-    from tdhil.cli.finding import Finding
+    from tdhil.cli.doctor_finding import Finding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
 
@@ -63,7 +63,7 @@ class CanopenCommands(BusCommands):
         """Link or bit rate, adapter, drive."""
         from drivers import TdhilError
         from tdhil.cli.buses import canopen_doctor
-        from tdhil.cli.finding import attempted, of_error, ok
+        from tdhil.cli.doctor_finding import attempted, of_error, ok
         from tdhil.config import DriveData
         from tdhil.session.buses import canopen
         from tdhil.session.buses.can_bus import link_report

@@ -10,7 +10,7 @@ from drivers import NO_WATCHDOG_FLAG, CommunicationLost, MonotonicClock, ObjectR
 from drivers.canopen import CanLink, Objects, State, check_parameters, decode, find_units, name
 from profiles import MARKER_INDEX, MARKER_TEXT
 from profiles.canopen import CanopenProfile
-from tdhil.cli.finding import Finding, Grade, bad, note, of_check, ok
+from tdhil.cli.doctor_finding import Finding, Grade, bad, note, of_check, ok
 
 if TYPE_CHECKING:
     import can

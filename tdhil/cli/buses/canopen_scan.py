@@ -16,7 +16,7 @@ from drivers import CommunicationLost, MonotonicClock, ObjectRefused
 from drivers.canopen import CanLink, Objects
 from profiles import MARKER_INDEX, MARKER_TEXT, load_profile, profile_names, visible
 from profiles.canopen import CanopenProfile
-from tdhil.cli.bus_commands import FoundDrive
+from tdhil.cli.scan_common import FoundDrive
 
 if TYPE_CHECKING:
     import can

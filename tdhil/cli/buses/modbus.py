@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from profiles.modbus import ModbusProfile
-from tdhil.cli.bus_commands import BusCommands, FoundDrive, ValueSeen
+from tdhil.cli.scan_common import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
     from profiles import Profile
-    from tdhil.cli.finding import Finding
+    from tdhil.cli.doctor_finding import Finding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
 
@@ -52,7 +52,7 @@ class ModbusCommands(BusCommands):
         """Line, drive, and each register of the profile."""
         from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
         from tdhil.cli.buses import modbus_doctor
-        from tdhil.cli.finding import attempted, of_error, ok
+        from tdhil.cli.doctor_finding import attempted, of_error, ok
         from tdhil.config import DriveData
         from tdhil.session.buses import modbus
 

@@ -22,7 +22,7 @@ from drivers.modbus import (
     settle,
 )
 from profiles.modbus import ModbusProfile, Parameter
-from tdhil.cli.finding import Finding, bad, note, of_check, ok
+from tdhil.cli.doctor_finding import Finding, bad, note, of_check, ok
 from tdhil.cli.profile_text import RegisterUse, register_uses, unit_text, watchdog_text
 
 

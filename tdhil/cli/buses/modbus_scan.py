@@ -26,8 +26,8 @@ from drivers.modbus import (
 )
 from profiles import load_profile, profile_names, visible
 from profiles.modbus import ModbusProfile, Register
-from tdhil.cli.bus_commands import FoundDrive
 from tdhil.cli.profile_text import register_uses
+from tdhil.cli.scan_common import FoundDrive
 from tdhil.config import DriveData, Origin, Setting
 from tdhil.session import Connection
 from tdhil.session.buses.modbus import SettingsRefused, config_of, open_line

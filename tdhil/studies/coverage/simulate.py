@@ -13,7 +13,7 @@ from tdhil.errors import TdhilError
 from tdhil.estimation import Options, identify
 from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.recording import Excitation, Recording, Segment
-from tdhil.run.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
+from tdhil.runner.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
 from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,32 @@
+"""A run as it goes: runner, control loop, guard, stop; the stages, the excitations, and the design of the motion."""
+
+from typing import TYPE_CHECKING
+
+from profiles import lazy_face
+
+if TYPE_CHECKING:
+    from tdhil.runner.design import (
+        Knowledge as Knowledge, assumed_noise as assumed_noise, interval_confidence as interval_confidence,
+    )
+    from tdhil.runner.five_stages import Runner as Runner
+    from tdhil.runner.guard import Guard as Guard
+    from tdhil.runner.planning import (
+        NOTHING_TO_EXPECT as NOTHING_TO_EXPECT, NOT_PREDICTED as NOT_PREDICTED, Planned as Planned,
+        plan_acquisition as plan_acquisition, refuse_hopeless as refuse_hopeless,
+    )
+    from tdhil.runner.preconditions import (
+        precondition_warnings as precondition_warnings, refuse_by_plan as refuse_by_plan,
+    )
+    from tdhil.runner.settings import (
+        ControlAssumptions as ControlAssumptions, ExcitationRequest as ExcitationRequest,
+        MachineLimits as MachineLimits, StopRequest as StopRequest,
+    )
+    from tdhil.runner.speed_check import speed_warnings as speed_warnings
+    from tdhil.runner.stage_log import stage_warnings as stage_warnings
+    from tdhil.runner.stages import course_of as course_of
+    from tdhil.runner.stop import not_confirmed as not_confirmed
+    from tdhil.runner.task import (
+        Display as Display, Idle as Idle, RunOutcome as RunOutcome, STAGES as STAGES, Task as Task,
+    )
+else:
+    __getattr__, __dir__ = lazy_face(__name__)

@@ -1,0 +1,426 @@
+"""Choose the excitation: of some dozen candidates the one that tells the inertia best in the time there is.
+
+What the user fixes stays fixed: `make_plan` takes every wish at its word, and what it refuses is no candidate. The
+usual multisine is always one of them, and only a clearly better one replaces it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from tdhil.config import told_before_echo
+from tdhil.estimation.frequency_domain import (
+    AVERAGE,
+    LAG_BOUND_S,
+    SHAPE_BOUND,
+    SKEW,
+    SPEED_LAG,
+    SPEED_SHAPE,
+    TORQUE_LAG,
+    TORQUE_SHAPE,
+    VISCOUS,
+)
+from tdhil.recording import FloatArray, LagPrior
+from tdhil.runner.design.prediction import (
+    RIGID,
+    SPEED_LAG_S,
+    TORQUE_LAG_S,
+    Noise,
+    assumed_theta,
+    expected_half_width,
+    predicted,
+    safe_half_width,
+)
+from tdhil.runner.excitation import (
+    LEAST_COUNTED,
+    DriveMode,
+    ExcitationWish,
+    MotionLimits,
+    Plan,
+    PlanRefused,
+    RigGuess,
+    Shape,
+    make_plan,
+    periodic_kind,
+    settling_periods,
+    unit_peak,
+)
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A quick figure for the search: the Cramér-Rao bound of J, the structure of the lags being open.
+#
+# The lines' information about the rigid model's theta = (J, B; τ_w, ρ_w, τ_T, ρ_T, u, d), whose last six are the
+# family of `signal_filters`: first-order lags, two poles, moving averages, delays. Shapes ρ and averages u are
+# bounded rather than unknown; here they count as known to about their bounds. So a high line buys little: what it
+# says of J it first has to say of the structure.
+
+
+_SKEW_SD_S = 0.3
+_AVERAGE_SHARE = 4.0       # u of an average that delays as long as the longest lag τ: (2 τ)²
+_CERTAIN = 1e-4
+
+
+def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> float:
+    """Least standard deviation of J after the plan, as a share of J; infinite where J can't be told."""
+    first = plan.segments[0]
+    period = first.reference.period_s
+    hertz = np.array(first.reference.lines_hz)
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    _, columns = RIGID.impedance_jacobian(theta, s)
+    variance = 4.0 * noise.error_density(hertz, theta) / period
+    counts = np.array([segment.periods - segment.settle_periods for segment in plan.segments], dtype=np.float64)
+    nu = float(np.sum(counts - 1.0))
+    if nu < 2.0:
+        return math.inf
+    amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
+    seen = amplitudes * np.abs(plan.followed(hertz) / (1.0 + s * theta[RIGID.at(SPEED_LAG)]))
+    weight = 2.0 * (counts @ seen**2) / variance * (nu - 1.0) / nu
+    fisher = np.einsum("k,ki,kj->ij", weight, columns.conj(), columns).real
+    fisher[VISCOUS, VISCOUS] += _tie(plan, counts * period, float(noise.error_density(np.zeros(1), theta)[0]))
+    for index, sd in _known(theta, prior).items():
+        fisher[RIGID.at(index), RIGID.at(index)] += sd**-2.0
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    try:
+        bound = float(np.linalg.inv(fisher * np.outer(scale, scale))[0, 0])
+    except np.linalg.LinAlgError:
+        return math.inf
+    return math.sqrt(bound) * float(scale[0]) / float(theta[0]) if bound > 0.0 else math.inf
+
+
+def _tie(plan: Plan, durations: FloatArray, density: float) -> float:
+    """1/sd² of B from the mean torque at the mean speeds."""
+    speeds = np.array([segment.reference.offset_rad_s for segment in plan.segments])
+    centred = speeds - np.sum(durations * speeds) / np.sum(durations)
+    return float(np.sum(durations * centred**2) / density)
+
+
+def _known(theta: FloatArray, prior: LagPrior) -> dict[int, float]:
+    """Standard deviations to begin with, of the reports' parameters: stated, or about the bounds of the fit."""
+    lags = theta[[RIGID.at(SPEED_LAG), RIGID.at(TORQUE_LAG)]]
+    longest = max(float(np.max(lags)), 1e-3)
+    speed, torque = prior.speed_lag_s is not None, prior.torque_lag_s is not None
+    return {
+        SPEED_LAG: max(prior.speed_lag_sd_s, _CERTAIN) if speed else LAG_BOUND_S,
+        SPEED_SHAPE: _CERTAIN if speed else SHAPE_BOUND,
+        TORQUE_LAG: max(prior.torque_lag_sd_s, _CERTAIN) if torque else LAG_BOUND_S,
+        TORQUE_SHAPE: _CERTAIN if torque else SHAPE_BOUND,
+        AVERAGE: _CERTAIN**2 if speed and torque else _AVERAGE_SHARE * longest**2,
+        SKEW: _SKEW_SD_S,
+    }
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Candidate multisines: which lines, how strong, phased so that they fit the most motion into the limits.
+
+
+HIGHEST_TURN = 0.24    # of 1/τ, Hz: the highest line, where τ is the longest lag that must be reckoned with
+LINES_LIMIT_HZ = (0.1, 2.0)
+"""The highest line, Hz: not below the first (a rig would take an hour), not above the second (structure, backlash)."""
+
+SLOPES = (1.0, 1.5, 2.0)                               # amplitude ~ harmonic^−slope
+_HARMONICS = ((1, 2, 3, 4), (1, 2, 3, 5), (1, 2, 3, 4, 5), (1, 2, 3, 4, 6), (1, 2, 3, 4, 5, 6), (1, 3, 5, 7, 9))
+_REACHES = (0.8, 1.0)                                  # of the highest line that is allowed
+_GRID = 128
+_TURN = 2.0 * np.pi * np.arange(_GRID) / _GRID
+_POPULATION, _KEPT, _ROUNDS, _STEP_RAD = 96, 6, 5, 0.8
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Lowest line and harmonics, with amplitudes ~ harmonic^−slope."""
+
+    lowest_hz: float
+    harmonics: tuple[int, ...]
+    slope: float
+
+    @property
+    def amplitudes(self) -> tuple[float, ...]:
+        """Relative to the first line's."""
+        return tuple(float(harmonic) ** -self.slope for harmonic in self.harmonics)
+
+
+def highest_line_hz(longest_lag_s: float) -> float:
+    """Above a quarter of 1/τ what nobody can know of a lag τ matters too much: the notes of `signal_filters`."""
+    return float(np.clip(HIGHEST_TURN / max(longest_lag_s, 1e-3), *LINES_LIMIT_HZ))
+
+
+def proposals(highest_hz: float, slope: float) -> Iterator[Proposal]:
+    """From few lines in a short period to many in a long one, none above ``highest_hz``."""
+    for harmonics, reach in product(_HARMONICS, _REACHES):
+        yield Proposal(reach * highest_hz / harmonics[-1], harmonics, slope)
+
+
+def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> Shape:
+    """The proposal with phases that allow the greatest amplitude within speed window and torque limit, peak 1.
+
+    A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
+    """
+    fit = _Room(proposal, limits, guess, mode)
+    rng = np.random.default_rng(len(proposal.harmonics))
+    phases = rng.uniform(0.0, 2.0 * np.pi, (_POPULATION, len(proposal.harmonics)))
+    room = fit.of(phases)
+    for turn in range(_ROUNDS):
+        best = phases[np.argsort(-room, kind="stable")[:_KEPT]]
+        around = np.repeat(best, _POPULATION // _KEPT - 1, axis=0)
+        phases = np.concatenate([best, around + rng.normal(0.0, _STEP_RAD * 0.5**turn, around.shape)])
+        room = fit.of(phases)
+    chosen = phases[int(np.argmax(room))] % (2.0 * np.pi)
+    return unit_peak(Shape(proposal.harmonics, proposal.amplitudes, tuple(float(phase) for phase in chosen)))
+
+
+class _Room:
+    """How much of a proposal fits, by its phases."""
+
+    def __init__(self, proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
+        harmonics, amplitudes = np.array(proposal.harmonics), np.array(proposal.amplitudes)
+        omega = 2.0 * np.pi * proposal.lowest_hz * harmonics
+        foresight = limits.foresight_s if mode == "torque" else 0.0
+        self._turns = np.exp(1j * np.outer(_TURN, harmonics))
+        self._speed = amplitudes.astype(np.complex128)
+        self._ahead = amplitudes * (1.0 + 1j * omega * foresight)
+        self._torque = amplitudes * (guess.viscous_nm_s_rad + 1j * omega * guess.inertia_kg_m2)
+        self._both_ends = mode == "speed" and guess.following is not None
+        if self._both_ends and guess.following is not None:     # what the shaft makes of the setpoint
+            gains = guess.following.shaft(proposal.lowest_hz * harmonics)
+            self._ahead, self._torque = amplitudes * gains, self._torque * gains
+        steady = max(guess.steady_torque_nm(limits.usable_low_rad_s), guess.steady_torque_nm(limits.usable_high_rad_s))
+        self._speed_room = (limits.usable_high_rad_s - limits.usable_low_rad_s) / guess.speed_swing_factor(mode)
+        self._torque_room = max(limits.usable_torque_nm - steady, 1e-9) / guess.torque_swing_factor(mode)
+
+    def of(self, phases: FloatArray) -> FloatArray:
+        """The amplitude that fits, (C,), for phases (C, K)."""
+        turned = np.exp(1j * phases.T)
+        speed, ahead, torque = (
+            (self._turns @ (weights[:, None] * turned)).real for weights in (self._speed, self._ahead, self._torque)
+        )
+        lowest = np.minimum(ahead.min(axis=0), speed.min(axis=0)) if self._both_ends else speed.min(axis=0)
+        span = np.maximum(ahead.max(axis=0), speed.max(axis=0)) - lowest
+        room: FloatArray = np.minimum(self._speed_room / span, self._torque_room / np.abs(torque).max(axis=0))
+        return room
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+OFFSET_SHARES = (0.2, 0.4)
+BETTER = 0.95         # of the usual multisine's interval: what a candidate must come down to
+_SLACK = 1.02         # of the usual plan's time: a transition may take a second longer
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What a design rests on besides limits and rough rig."""
+
+    noise: Noise
+    prior: LagPrior
+    winds_up: bool = False    # a drill string hangs on the shaft
+
+    def theta(self, guess: RigGuess) -> FloatArray:
+        """The rigid model's parameters to be reckoned with, (8,)."""
+        return assumed_theta(guess.inertia_kg_m2, guess.viscous_nm_s_rad, self.prior)
+
+    @property
+    def speed_lag_s(self) -> float:
+        """Stated, else what it may be."""
+        return SPEED_LAG_S if self.prior.speed_lag_s is None else self.prior.speed_lag_s
+
+    @property
+    def torque_lag_s(self) -> float:
+        """Stated, else what it may be."""
+        return TORQUE_LAG_S if self.prior.torque_lag_s is None else self.prior.torque_lag_s
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The plan, the relative half-width of J to be expected of it, and of the usual excitation in the same time; NaN
+    where none is predicted.
+    """
+
+    plan: Plan
+    half_width: float
+    usual_half_width: float
+
+
+def choose(
+    limits: MotionLimits,
+    guess: RigGuess,
+    wish: ExcitationWish,
+    known: Knowledge,
+    confidence: float,
+    time_s: float | None = None,
+) -> Choice:
+    """The plan with the tightest expected interval of J; raises PlanRefused where nothing fits.
+
+    ``time_s``: how long it may take, transitions included; None: as long as the usual plan. The information matrix
+    picks the best for each slope of the amplitudes, and the estimator's own interval has the last word: it also sees
+    where quite another set of lags would explain the lines, which is where amplitudes fall too steeply.
+    """
+    theta = known.theta(guess)
+
+    def width(plan: Plan) -> float:
+        return expected_half_width(plan, theta, known.noise, known.prior, confidence)
+
+    usual = make_plan(limits, guess, wish)
+    if told_before_echo(wish.kind):     # the prediction is of a rigid shaft
+        return Choice(_in_time(usual, wish, time_s), math.nan, math.nan)
+    if _fixed(wish):
+        usual = _in_time(usual, wish, time_s)
+        found = width(usual)
+        return Choice(usual, found, found)
+    allowed_s = _SLACK * usual.duration_s if time_s is None else time_s
+    if known.winds_up:
+        try:
+            return Choice(_for_string(limits, guess, wish, allowed_s), math.nan, math.nan)
+        except PlanRefused:        # too long for the time there is, say
+            pass
+    finalists: list[Plan] = []
+    for slope in SLOPES:
+        rated = [
+            (relative_sd(plan, theta, known.noise, known.prior), number, plan)
+            for number, plan in enumerate(_candidates(limits, guess, wish, known, allowed_s, slope))
+        ]
+        finalists += [plan for sd, _, plan in sorted(rated)[:1] if math.isfinite(sd)]
+    try:
+        best = _in_time(usual, wish, time_s)
+        best_width = usual_width = width(best)
+        bar = BETTER * usual_width
+    except PlanRefused:
+        if not finalists:
+            raise
+        best, best_width, usual_width, bar = finalists[0], math.inf, math.inf, math.inf
+    for plan in finalists:
+        found = width(plan)
+        if found < bar:
+            best, best_width, bar = plan, found, found
+    return Choice(best, best_width, usual_width)
+
+
+def choose_soonest(
+    limits: MotionLimits,
+    guess: RigGuess,
+    wish: ExcitationWish,
+    known: Knowledge,
+    confidence: float,
+    tolerance: float,
+    time_s: float,
+) -> Plan | None:
+    """The plan that is expected to meet a tolerance soonest if extended as it needs, with few periods at first.
+
+    None where no candidate fits into ``time_s``, what the user fixes leaves nothing to choose, or a string asks for
+    lines of its own. As in `choose` the information matrix picks for each slope, and the estimator's own interval has
+    the last word.
+    """
+    if _fixed(wish) or known.winds_up:
+        return None
+    theta, wish = known.theta(guess), replace(wish, settle_s=SETTLE_SOON_S)
+    rated: list[tuple[float, int, Plan]] = []
+    for slope in SLOPES:
+        fit = [plan.with_counted(count) for plan in _candidates(limits, guess, wish, known, time_s, slope)
+               for count in SOON_COUNTED]
+        widths = [_WIDTHS_OF_SD * relative_sd(plan, theta, known.noise, known.prior) for plan in fit]
+        of_slope = [(_until_s(*one, tolerance), len(rated) + number, one[0])
+                    for number, one in enumerate(zip(fit, widths, strict=True))]
+        rated += sorted(of_slope)[:_OF_A_SLOPE]
+    best, soonest_s = None, math.inf
+    for _, _, plan in sorted(rated)[:_FINALISTS]:
+        if plan.duration_s < soonest_s:
+            width = safe_half_width(predicted(plan, theta, known.noise, known.prior), confidence)
+            until_s = _until_s(plan, width, tolerance)
+            if until_s < soonest_s:
+                best, soonest_s = plan, until_s
+    return best
+
+
+SOON_COUNTED = (5, 6)     # periods at each mean speed at first, where time is what counts; four are too few: most runs
+                          # need more then, and some 14 minutes, as each look in vain asks for a higher confidence
+SETTLE_SOON_S = 8.0       # settling, where time is what counts: leaves 0.03 % of J at most, with reports' lags of 1 s
+_WIDTHS_OF_SD = 2.3       # half-width over the bound's standard deviation, as plans have it
+_OF_A_SLOPE, _FINALISTS = 4, 8
+_LEAST_MORE = 0.2         # of the periods at first: two of ten are the least that an extension has
+_SPREAD = 0.2             # of the logarithm of a half-width about the one that was predicted: 1 sd
+_QUANTILES = np.array([-1.5, -0.9, -0.5, -0.2, 0.2, 0.5, 0.9, 1.5])     # of a normal distribution, equally likely
+
+
+def _until_s(plan: Plan, width: float, tolerance: float) -> float:
+    """How long it may be expected to take until the tolerance is met, if its half-width is predicted so now."""
+    counted_s = sum(plan.counted * one.reference.period_s for one in plan.segments)
+    ratio = width * np.exp(_SPREAD * _QUANTILES) / tolerance
+    missing = np.where(ratio > 1.0, np.maximum(ratio**2 - 1.0, _LEAST_MORE), 0.0)
+    return plan.duration_s + counted_s * float(np.mean(missing))
+
+
+def _fixed(wish: ExcitationWish) -> bool:
+    """Does the wish leave no lines to choose?"""
+    return not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
+
+
+def refuse_unfit(
+    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
+) -> None:
+    """PlanRefused where `choose` would find nothing, without weighing what it would find."""
+    try:
+        _in_time(make_plan(limits, guess, wish), wish, time_s)
+    except PlanRefused:
+        if _fixed(wish) or time_s is None:
+            raise
+        if not any(True for slope in SLOPES for _ in _candidates(limits, guess, wish, known, time_s, slope)):
+            raise
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# With a drill string on the shaft: its lines tell the motor from what swings below, and both from the reports' filters.
+#
+# A rigid shaft's best lines are few, low and falling as ω^−2. Behind a string they leave J open by 3 to 7 %, however
+# little noise there is: of the shipped string's four lines one lies where the motor stands still, and two masses, a
+# string and filters of two poles bend the other three alike. Ten lines of equal torque, from below the lowest swing to
+# above the second one, leave 0.2 to 0.4 % open in the same time (1.3 % where two masses stand and any string that the
+# data allow counts), though a line may fall on a resonance, which the host's slow control damps. Lines from 0.1 Hz, of
+# which one less lies below the swing, leave twice as much; rising torques gain nothing.
+
+
+STRING = Proposal(0.08, tuple(range(1, 11)), 1.0)
+
+
+def _for_string(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, time_s: float) -> Plan:
+    shape = phased(STRING, limits, guess, wish.mode)
+    asked = replace(wish, shape=shape, frequency_hz=STRING.lowest_hz, offset_share=OFFSET_SHARES[0])
+    return _in_time(make_plan(limits, guess, asked), asked, time_s)
+
+
+def _candidates(
+    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float, slope: float
+) -> Iterator[Plan]:
+    speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)
+    for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):
+        period_s = 1.0 / proposal.lowest_hz
+        if speeds * (LEAST_COUNTED + settling_periods(period_s, wish.settle_s)) * period_s > time_s:
+            continue                   # too long before it is looked at, which takes its time
+        shape = phased(proposal, limits, guess, wish.mode)
+        for share in OFFSET_SHARES:
+            asked = replace(wish, shape=shape, frequency_hz=proposal.lowest_hz, offset_share=share)
+            try:
+                yield _in_time(make_plan(limits, guess, asked), asked, time_s)
+            except PlanRefused:
+                continue
+
+
+def _in_time(plan: Plan, wish: ExcitationWish, time_s: float | None) -> Plan:
+    """As many whole periods as fit; raises PlanRefused if those are too few to know the scatter."""
+    if time_s is None or wish.periods is not None:
+        return plan
+    segment = plan.segments[0]
+    between = plan.duration_s - sum(one.duration_s for one in plan.segments)
+    whole = math.floor((time_s - between) / (len(plan.segments) * segment.reference.period_s) + 1e-9)
+    counted = whole - segment.settle_periods
+    if counted < LEAST_COUNTED:
+        needed = len(plan.segments) * (LEAST_COUNTED + segment.settle_periods) * segment.reference.period_s + between
+        raise PlanRefused(
+            f"time: {time_s:.0f} s are too short, this excitation needs {needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more (or leave it out; limits.time_s bounds it, too), or a higher"
+            " --frequency",
+        )
+    return plan.with_counted(counted)

@@ -1,0 +1,296 @@
+"""The interval that the estimator itself would give: its own fit, on lines as they are expected.
+
+Everything about how an interval comes to be (lag structures, weights known by estimate, priors) is asked of
+`identify`, here and nowhere else in this room, so that what is predicted is what will be said.
+
+Lines without noise fit exactly, and would give too narrow an interval: −2 ln L = Σ 2(ν + M) ln(1 + q/ν) has the
+curvature (ν + M)/(ν + q), and q is about M where there is noise, but 0 here. So S is taken (ν + M)/ν times as large.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from tdhil.estimation import Levels, Line, Samples, Stretch, period_lines, tie_viscous
+from tdhil.estimation.frequency_domain import (
+    SPEED_LAG,
+    TORQUE_LAG,
+    Model,
+    fit_inertia,
+    known_of,
+    refuse_count,
+)
+from tdhil.recording import FloatArray, LagPrior, Segment
+from tdhil.runner.excitation import Plan
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How much disturbs the equation of motion: assumed from the machine's size, or measured at steady speed.
+#
+# What an estimator fights with at a line is the error of T − G W. With the load disturbance (density S_L, correlated
+# over τ_L) and the speed sensor's white noise (density S_ω) it has, behind the lag τ_T of the torque report, the
+# density
+#
+#     S(f) = (S_L/(1 + (ω τ_L)²) + |J s + B|² S_ω) / (1 + (ω τ_T)²),     s = jω,
+#
+# whatever regulates the shaft: torque that the drive itself makes is in both signals and cancels. Densities are two-
+# sided, per Hz. A line fitted to one period of length L then has E|r|² = 4 S/L, a mean over L the variance S(0)/L.
+
+
+RIGID = Model()
+"""The model that plans are made with; theta (8,) = (J, B) and the six parameters of the reports."""
+
+LOAD_SHARE = 0.0075        # of the torque limit: sd of the load where nobody has measured it
+LOAD_TIME_S = 0.5
+SENSOR_SHARE = 0.002       # of the highest speed: sd of the speed sensor in 2 ms
+_SENSOR_STEP_S = 0.002
+SPEED_LAG_S = 0.40         # what a drive's smoothing of its speed, and of its torque, may be where nobody says
+TORQUE_LAG_S = 0.15
+_LOW_LINES = 3             # of a stretch: its lowest lines tell the load
+_HIGH_LINES = 9            # … those behind them, up to this one, what grows with frequency
+_LEAST_SHARE = 1e-3        # of the assumed density: less than that, and something else will set the interval
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Densities S_L, (N·m)²·s, and S_ω, (rad/s)²·s; the load's correlation time, s."""
+
+    load_nm2_s: float
+    speed_rad2_s: float
+    load_time_s: float = LOAD_TIME_S
+    source: Literal["assumed", "measured"] = "assumed"
+
+    @property
+    def load_sd_nm(self) -> float:
+        """Standard deviation of the load disturbance: S_L = 2 sd² τ_L."""
+        return math.sqrt(0.5 * self.load_nm2_s / self.load_time_s)
+
+    def error_density(self, hertz: FloatArray, theta: FloatArray) -> FloatArray:
+        """S of T − G W, (N·m)²·s, at frequencies (K,); theta (8,) of the rigid model."""
+        omega = 2.0 * np.pi * np.asarray(hertz, dtype=np.float64)
+        shaft = (theta[0] * omega) ** 2 + theta[1] ** 2
+        load = self.load_nm2_s / (1.0 + (omega * self.load_time_s) ** 2)
+        lag = float(theta[RIGID.at(TORQUE_LAG)])
+        density: FloatArray = (load + shaft * self.speed_rad2_s) / (1.0 + (omega * lag) ** 2)
+        return density
+
+
+def assumed_noise(torque_limit_nm: float, speed_max_rad_s: float, load_sd_nm: float | None = None) -> Noise:
+    """Shares of what the machine can do, which is what a range of machines show; or a load that somebody states."""
+    load = LOAD_SHARE * torque_limit_nm if load_sd_nm is None else load_sd_nm
+    return Noise(2.0 * load**2 * LOAD_TIME_S, (SENSOR_SHARE * speed_max_rad_s) ** 2 * _SENSOR_STEP_S)
+
+
+def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior) -> FloatArray:
+    """(8,): first-order lags, as stated, else what they may be."""
+    theta = np.zeros(RIGID.size)
+    theta[:2] = inertia_kg_m2, viscous_nm_s_rad
+    theta[RIGID.at(SPEED_LAG)] = SPEED_LAG_S if prior.speed_lag_s is None else prior.speed_lag_s
+    theta[RIGID.at(TORQUE_LAG)] = TORQUE_LAG_S if prior.torque_lag_s is None else prior.torque_lag_s
+    return theta
+
+
+def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noise) -> Noise:
+    """Densities from stretches of steady speed, at the harmonics of each stretch's own length.
+
+    The error's line e = T − G W takes spectra and cross spectrum of the two signals at once, and stays the same under
+    whatever regulates the speed: |e|² L/4 is a reading of S with two degrees of freedom. The lowest lines of all
+    stretches tell S_L with the correlation time assumed, the next ones what |J s + B|² S_ω adds. With lags other than
+    theta's some of the drive's own torque stays in e, so that the reading errs on the high side.
+    """
+    frequencies: list[FloatArray] = []
+    readings: list[FloatArray] = []
+    for samples in steady:
+        read = _readings(samples, theta)
+        if read is not None:
+            frequencies.append(read[0])
+            readings.append(read[1])
+    if not readings:
+        return fallback
+    hertz, density = np.concatenate(frequencies), np.concatenate(readings)
+    low = np.concatenate([np.arange(len(part)) < _LOW_LINES for part in readings])
+    unit_load = Noise(1.0, 0.0).error_density(hertz, theta)
+    unit_speed = Noise(0.0, 1.0).error_density(hertz, theta)
+    load = float(np.mean(density[low] / unit_load[low]))
+    speed = float(np.mean((density[~low] - load * unit_load[~low]) / unit_speed[~low])) if np.any(~low) else 0.0
+    if not (math.isfinite(load) and math.isfinite(speed)):
+        return fallback
+    return Noise(max(load, _LEAST_SHARE * fallback.load_nm2_s), max(speed, 0.0), source="measured")
+
+
+def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Frequencies and readings of S, (K,) each, of one stretch; None if it is too short to tell."""
+    if len(samples) < 4 * _HIGH_LINES:
+        return None
+    interval = float(np.median(np.diff(samples.time_s)))
+    begin, length = float(samples.time_s[0]), float(samples.time_s[-1] - samples.time_s[0]) + interval
+    hertz = np.arange(1.0, _HIGH_LINES + 1.0) / length
+    lines = tuple(float(one) for one in hertz)
+    segment = Segment(begin, begin + length, length, 0, float(np.mean(samples.speed_rad_s)), lines, (), ())
+    try:
+        found = period_lines(Stretch(segment, (samples,), (0,)), samples)
+    except np.linalg.LinAlgError:       # samples that do not tell these frequencies apart
+        return None
+    torque = found.torque[0] - theta[1] * found.drift[0] * found.ramp[0]
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    error = torque - RIGID.impedance(theta, s) * found.speed[0]
+    readings: FloatArray = np.abs(error) ** 2 * length / 4.0
+    return hertz, readings
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+_NINE_IN_TEN = 1.28
+LEAST_NU = 2.0      # complex degrees of freedom of a line's weight, below which identification leaves it out
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a fit rests on: lines, levels, and what is stated of the lags."""
+
+    lines: tuple[Line, ...]
+    levels: Levels
+    prior: LagPrior
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The rigid model's parameters that the fit settled on, (8,), and J's relative half-width."""
+
+    theta: FloatArray
+    half_width: float
+
+
+def fit(evidence: Evidence, confidence: float) -> Fitted | None:
+    """The estimator's own fit; None where it would refuse."""
+    constraint = tie_viscous(evidence.levels)
+    lines = tuple(line for line in evidence.lines if line.excited and line.nu >= LEAST_NU)
+    priors, held = known_of(evidence.prior, len(lines), constraint)
+    if not lines or refuse_count(len(lines), constraint, priors) is not None:
+        return None
+    try:
+        inertia, _, found = fit_inertia(lines, constraint, priors, held, confidence)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return None
+    half = 0.5 * (inertia.high - inertia.low) / inertia.value if inertia.value > 0.0 else math.inf
+    theta = found.likelier.theta
+    if not (half > 0.0 and np.all(np.isfinite(theta))):
+        return None
+    return Fitted(theta, half)
+
+
+def noise_free(evidence: Evidence, fitted: Fitted) -> Evidence:
+    """The same with torques that the parameters explain exactly, and scatter enlarged for what is missing."""
+    lines = []
+    for line in evidence.lines:
+        g = complex(RIGID.impedance(fitted.theta, np.array([2j * np.pi * line.hertz]))[0])
+        share = (line.nu + len(line.speed)) / max(line.nu, 1.0)
+        lines.append(
+            replace(line, torque=g * line.speed, s_ww=share * line.s_ww, s_tt=share * line.s_tt, s_tw=share * line.s_tw)
+        )
+    levels, theta = evidence.levels, fitted.theta
+    coulomb = float(levels.weights @ (levels.torque - theta[0] * levels.drift - theta[1] * levels.speed))
+    torque = coulomb + theta[1] * levels.speed + theta[0] * levels.drift
+    return replace(evidence, lines=tuple(lines), levels=replace(levels, torque=torque))
+
+
+def longer(evidence: Evidence, scale: float, scatter: float = 1.0, at_last: bool = False) -> Evidence:
+    """The same motion ``scale`` times as long, with ``scatter`` times the variance.
+
+    ``at_last``: what it is longer by all goes to the last segment.
+    """
+    lines = []
+    for line in evidence.lines:
+        more = float(np.sum(line.periods)) * (scale - 1.0)
+        lines.append(
+            replace(
+                line, periods=_grown(line.periods, scale, at_last), nu=line.nu + more,
+                s_ww=scatter * line.s_ww, s_tt=scatter * line.s_tt, s_tw=scatter * line.s_tw,
+            )
+        )
+    levels = evidence.levels
+    dof = levels.dof * scale
+    duration = _grown(levels.duration, scale, at_last)
+    levels = replace(levels, duration=duration, density=scatter * levels.density, dof=dof)
+    return replace(evidence, lines=tuple(lines), levels=levels)
+
+
+def _grown(lengths: FloatArray, scale: float, at_last: bool) -> FloatArray:
+    """Lengths of segments, (S,), that add up to ``scale`` times as much."""
+    if not at_last:
+        return lengths * scale
+    grown = lengths.copy()
+    grown[-1] += (scale - 1.0) * np.sum(lengths)
+    return grown
+
+
+def half_width(evidence: Evidence, confidence: float) -> float:
+    """J's relative half-width; infinite where the estimator would refuse."""
+    found = fit(evidence, confidence)
+    return math.inf if found is None else found.half_width
+
+
+def safe_half_width(evidence: Evidence, confidence: float) -> float:
+    """The same, as noise leaves it in nine runs of ten.
+
+    Quite another set of lags may explain the lines nearly as well. Without noise its −2 ln L is D₀ above the best, with
+    noise D ~ N(D₀, 4 D₀); it widens the interval where D < t². That stays rarer than one in ten if √D₀ ≥ x + √(x² + t²)
+    with x = 1.28. So the profile is followed up to there, and scaled back: a parabola gives the same as ever, a second
+    valley within reach shows.
+    """
+    nu = [line.nu for line in evidence.lines if line.nu >= LEAST_NU]
+    if not nu:
+        return math.inf
+    from scipy.special import stdtr, stdtrit
+
+    dof = 2.0 * max(nu)
+    usual = float(stdtrit(dof, 0.5 + 0.5 * confidence))
+    reach = _NINE_IN_TEN + math.hypot(_NINE_IN_TEN, usual)
+    found = fit(evidence, float(2.0 * stdtr(dof, reach) - 1.0))
+    return math.inf if found is None else found.half_width * usual / reach
+
+
+def whole_periods(lines: Sequence[Line]) -> float:
+    """Periods that count in all segments together."""
+    return float(np.sum(lines[0].periods)) if lines else 0.0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a plan should bring, before it is run: the lines and levels that its motion and the noise lead to.
+
+
+def predicted(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> Evidence:
+    """Lines without noise and the covariance to be expected of them.
+
+    In torque mode the disturbance shows in speed alone (torque is what the host commands), in speed mode in torque
+    alone; either way T − G W has the variance 4 S/L of `noise`.
+    """
+    reference = plan.segments[0].reference
+    hertz = np.array(reference.lines_hz)
+    s = 2j * np.pi * hertz.astype(np.complex128)
+    g = RIGID.impedance(theta, s)
+    counts = np.array([float(segment.periods - segment.settle_periods) for segment in plan.segments])
+    nu = float(np.sum(counts - 1.0))
+    variance = 4.0 * noise.error_density(hertz, theta) / reference.period_s
+    amplitudes = np.array([segment.reference.amplitudes_rad_s for segment in plan.segments])
+    seen = amplitudes / (1.0 + s * theta[RIGID.at(SPEED_LAG)]) * plan.followed(hertz)
+    in_speed = plan.mode == "torque"
+    lines = []
+    for k, line_hz in enumerate(reference.lines_hz):
+        gain = float(abs(g[k])) ** 2
+        s_ww, s_tt = (variance[k] / gain, 1e-6 * variance[k]) if in_speed else (1e-6 * variance[k] / gain, variance[k])
+        lines.append(Line(line_hz, seen[:, k], g[k] * seen[:, k], counts, float(s_ww), float(s_tt), 0j, nu))
+    speeds = np.array([segment.reference.offset_rad_s for segment in plan.segments])
+    torques = np.array([segment.reference.mean_torque_nm for segment in plan.segments])
+    still = float(noise.error_density(np.zeros(1), theta)[0])
+    levels = Levels(speeds, torques, np.zeros(len(speeds)), counts * reference.period_s, still, nu)
+    return noise_free(Evidence(tuple(lines), levels, prior), Fitted(theta, 0.0))
+
+
+def expected_half_width(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior, confidence: float) -> float:
+    """Of J, as a share of J, after the plan as it stands, other lags than the true ones allowed for."""
+    return safe_half_width(predicted(plan, theta, noise, prior), confidence)

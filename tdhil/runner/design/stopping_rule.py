@@ -1,0 +1,308 @@
+"""When is it enough? What deciding by the scatter costs, and what deciding by the interval itself costs.
+
+By the scatter. A pilot of n₀ periods at each mean speed is run. Its scatter (never its value of J) says how tight the
+interval will be, and how many periods it takes; so many are run, and it is looked again. Of Gaussian data the means and
+the scatter about them are independent, so given the number of periods N the error of J̄ is what it would have been had
+N been fixed beforehand, N(0, σ²/N). Only the scatter is picked: where the pilot's s₀² came out small, N is small and
+s₀² keeps a large share of the pooled s². With t the quantile, the interval covers with
+
+    P = E[2 Φ(t s/σ) − 1],   s² = (ν₀ s₀² + ν₁ s₁²)/(ν₀ + ν₁),   ν₁ = ν₀ (N − 1),   N = N(s₀²),
+
+(N in pilots, s₀²/σ² = χ²/ν₀ and s₁²/σ² = χ²/ν₁ independent), which falls short of the confidence by some tenths of a
+percent, most where N is between one and two pilots. For the rule N = 1 where s₀² ≤ r σ², else a s₀²/(r σ²), whatever r
+and a may be, `working_confidence` makes up for it: the confidence whose quantile gives min over r and a of P equal to
+what was asked. Both expectations are sums over equally likely values. Further looks come where the first extension was
+not enough, seldom and with ν doubled: simulated, three of them change P by less than 0.0003. ν₀ is that of one line's
+variance; J rests on several lines and on B, so that the true ν₀ is larger and the correction a little too large.
+
+By the interval. It also depends on how the residuals fell: another set of lags may be excluded, or just not. So when
+the scatter says that it is enough, the interval itself is looked at; if it is too wide all the same, there is one more
+extension, and another look at it. Keeping an interval only where it is narrow is a choice by the data, of whatever
+kind. But the run's interval is one of several; it misses at most as often as any of these does, however the choice is
+made. That any does is P(I₁ misses) + P(I₂ misses and I₁ doesn't) + … , of which the k-th gets α_k = 0.7·0.3^(k − 1) α;
+they add up to α. Where the k-th misses the (k − 1)-th mostly does too, since it holds a share r of the same data: an
+interval misses where the signed root z of its likelihood ratio at the true J is too large, and such roots of data that
+grow have normal increments, so that z_k and z_(k − 1) are correlated with √r (Lan and DeMets' spending). An extension
+behind an interval is at most three times as long as all before it: r ≥ ¼ is reckoned with. Most runs pay a few percent
+of width for it, those that need a second look a sixth; were it at most as long (r ≥ ½, an eighth), runs whose lags are
+told apart late would need a third look and a fourth, which cost far more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from tdhil.estimation import (
+    Options,
+    identify,
+    measure_levels,
+    period_lines,
+    pooled_lines,
+    stretches,
+    tie_viscous,
+    usable_samples,
+)
+from tdhil.recording import FloatArray, Recording
+from tdhil.runner.design.prediction import (
+    LEAST_NU,
+    Evidence,
+    Fitted,
+    fit,
+    half_width,
+    longer,
+    noise_free,
+    whole_periods,
+)
+
+LOOKS = 4                 # extensions at most
+FIRST_SHARE = 0.7         # of the probability to miss that is left, spent on the next interval that is looked at
+MOST_BEHIND = 3.0         # of all before, that an extension behind an interval may be long: r ≥ ¼
+AIM = 0.7                 # probability with which one extension is enough; the way back for another costs little
+MARGIN = 1.05             # an interval comes out 4 % (1 sd) wider or narrower than its scatter says, as residuals fall
+_WORTH_SHARE = 0.1        # of the interval at the end of the time: what is nearer than this needs no more time
+_THRESHOLDS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)
+_MARGINS = (1.0, 1.3)
+_PILOTS, _EXTENSIONS = 128, 32
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When stage 5 ends; ``working`` are the confidences of the intervals, so that ``confidence`` holds after looking.
+
+    ``reachable``: may the tolerance be expected to be met in ``allowed_s``? If not, ``advice`` says what would help.
+    ``by_interval``: the scatter of a rigid shaft says nothing here, and the interval itself is looked at.
+    """
+
+    tolerance: float
+    confidence: float
+    pilot_dof: float
+    pilot_periods: int
+    expected_periods: int
+    allowed_s: float
+    reachable: bool
+    advice: str = ""
+    by_interval: bool = False
+
+    def working(self, seen: int) -> float:
+        """Of the interval that is looked at after ``seen`` others."""
+        return interval_confidence(self.confidence, self.pilot_dof, seen)
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        return asdict(self)
+
+
+def interval_confidence(confidence: float, pilot_dof: float, seen: int) -> float:
+    """The confidence to compute the interval with that is looked at after ``seen`` others."""
+    return working_confidence(spent_confidence(confidence, seen), pilot_dof)
+
+
+@lru_cache(maxsize=64)
+def spent_confidence(confidence: float, seen: int) -> float:
+    """Of the interval that is looked at after ``seen`` others, were its scatter known (above)."""
+    from scipy.special import ndtr, ndtri
+
+    spent = FIRST_SHARE * (1.0 - FIRST_SHARE) ** seen * (1.0 - confidence)
+    if seen == 0:
+        return 1.0 - spent
+    before = float(ndtri(0.5 + 0.5 * spent_confidence(confidence, seen - 1)))
+    root = math.sqrt(1.0 / (1.0 + MOST_BEHIND))
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+
+    def newly(edge: float) -> float:
+        """How often |z_k| is beyond ``edge`` and |z_(k − 1)| isn't beyond its own."""
+        z = edge + 4.0 * (nodes + 1.0)
+        inside = ndtr((before - root * z) / math.sqrt(1.0 - root**2)) - ndtr(
+            (-before - root * z) / math.sqrt(1.0 - root**2)
+        )
+        return float(8.0 * np.sum(weights * inside * np.exp(-0.5 * z * z)) / math.sqrt(2.0 * math.pi))
+
+    low, high = 0.0, float(-ndtri(0.5 * spent))
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if newly(middle) > spent else (low, middle)
+    return float(2.0 * ndtr(high) - 1.0)
+
+
+@lru_cache(maxsize=16)
+def working_confidence(confidence: float, pilot_dof: float) -> float:
+    """The confidence to compute intervals with so that they cover with ``confidence`` after the looks.
+
+    ``pilot_dof``: real degrees of freedom of a line's variance after the pilot.
+    """
+    rules = _rules(pilot_dof)
+    low, high = confidence, 1.0 - 0.2 * (1.0 - confidence)
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if _worst(rules, middle) >= confidence else (middle, high)
+    return high
+
+
+def worst_coverage(working: float, pilot_dof: float) -> float:
+    """Least P over the rules above, for intervals computed with the confidence ``working``."""
+    return _worst(_rules(pilot_dof), working)
+
+
+def _worst(rules: list[tuple[FloatArray, FloatArray]], working: float) -> float:
+    from scipy.special import ndtr, stdtrit
+
+    return min(
+        float(np.mean(2.0 * ndtr(stdtrit(dof, 0.5 + 0.5 * working)[:, None] * root) - 1.0)) for dof, root in rules
+    )
+
+
+def _rules(dof: float) -> list[tuple[FloatArray, FloatArray]]:
+    """For every r and a: degrees of freedom at the end (PILOTS,), and s/σ (PILOTS, EXTENSIONS)."""
+    from scipy.special import gammaincinv
+
+    s0 = gammaincinv(0.5 * dof, _equally_likely(_PILOTS)) * 2.0 / dof
+    found = []
+    for r, a in product(_THRESHOLDS, _MARGINS):
+        pilots = np.where(s0 <= r, 1.0, np.maximum(a * s0 / r, 1.0))
+        added = dof * (pilots - 1.0)
+        sums = 2.0 * gammaincinv(0.5 * np.maximum(added, 1e-6)[:, None], _equally_likely(_EXTENSIONS)[None, :])
+        pooled = (dof * s0[:, None] + np.where(added[:, None] > 0.0, sums, 0.0)) / (dof + added)[:, None]
+        found.append((dof + added, np.sqrt(pooled)))
+    return found
+
+
+def _equally_likely(count: int) -> FloatArray:
+    return (np.arange(count) + 0.5) / count
+
+
+def aimed_scatter(dof: float, added: float) -> float:
+    """By how much the pooled variance may still rise, at most with probability AIM: (ν₀ + ν₁ F)/(ν₀ + ν₁)."""
+    if added <= 0.0:
+        return 1.0
+    from scipy.special import fdtri
+
+    return float((dof + added * fdtri(added, dof, AIM)) / (dof + added))
+
+
+def least_scale(half_width: Callable[[float], float], tolerance: float, most: float) -> tuple[float, float, bool]:
+    """How many times as long the run must be: (scale, half-width then, whether that is enough); 1 ≤ scale ≤ ``most``.
+
+    ``half_width(scale)`` falls about as √(a/scale + b), b being what the lag structure leaves open however long it
+    takes. Where time is not enough, the scale at which nearly nothing is left to gain.
+    """
+    now = half_width(1.0)
+    if now <= tolerance or most <= 1.0:
+        return 1.0, now, now <= tolerance
+    end = half_width(most)
+    enough = end <= tolerance
+    if not enough and not math.isfinite(end):
+        return most, end, False
+    target = tolerance if enough else (1.0 + _WORTH_SHARE) * end
+    if now <= target:
+        return 1.0, now, enough
+    low, high = (1.0, now), (most, end)
+    for _ in range(4):
+        scale = _between(low, high, target)
+        found = half_width(scale)
+        if found <= target:
+            high = (scale, found)
+        else:
+            low = (scale, found)
+        if high[0] <= 1.05 * low[0] or (found <= target and found >= 0.97 * target):
+            break
+    return high[0], high[1], enough
+
+
+def _between(low: tuple[float, float], high: tuple[float, float], target: float) -> float:
+    """Where √(a/scale + b) through both points meets the target, kept off the ends."""
+    (x0, h0), (x1, h1) = low, high
+    share = 0.5
+    if math.isfinite(h0) and h0 > h1:
+        inverse = 1.0 / x1 + (1.0 / x0 - 1.0 / x1) * (target**2 - h1**2) / (h0**2 - h1**2)
+        scale = 1.0 / inverse
+        share = (scale - x0) / (x1 - x0)
+    return x0 + (x1 - x0) * min(max(share, 0.05), 0.95)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A look at the scatter: how tight is the interval already, and how much longer must it be?
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the scatter says: J's relative half-width now, and after ``scale`` times as many periods.
+
+    ``enough``: the tolerance is met then (now, if ``scale`` is 1). ``at_last``: all of what is more may be at the mean
+    speed where the shaft is, without a way back to the others. None of it knows how J came out but for what the
+    lines' weights owe to it, which is of second order: multiply torque by anything, and nothing here changes.
+    """
+
+    periods: float
+    half_width_now: float
+    scale: float
+    half_width_then: float
+    enough: bool
+    at_last: bool = False
+
+
+def look(
+    recording: Recording,
+    confidence: float,
+    tolerance: float,
+    most_scale: float,
+    pilot_dof: float,
+    most_at_last: float = 1.0,
+) -> Look | None:
+    """Look at what has been acquired so far; None where the estimator would refuse it."""
+    evidence = evidence_of(recording)
+    fitted = None if evidence is None else fit(evidence, confidence)
+    return None if evidence is None or fitted is None else _look(
+        evidence, fitted, confidence, tolerance, most_scale, pilot_dof, most_at_last
+    )
+
+
+def _look(
+    evidence: Evidence,
+    fitted: Fitted,
+    confidence: float,
+    tolerance: float,
+    most_scale: float,
+    pilot_dof: float,
+    most_at_last: float,
+) -> Look:
+    explained = noise_free(evidence, fitted)
+    dof = max(pilot_dof, 2.0 * evidence.lines[0].nu)
+    periods = whole_periods(evidence.lines)
+
+    def width(scale: float, at_last: bool = False) -> float:
+        return half_width(longer(explained, scale, aimed_scatter(dof, dof * (scale - 1.0)), at_last), confidence)
+
+    now = width(1.0)
+    scale, then, enough = least_scale(lambda x: now if x == 1.0 else width(x, True), tolerance, most_at_last)
+    if enough and scale > 1.0:
+        return Look(periods, now, scale, then, True, at_last=True)
+    scale, then, enough = least_scale(lambda x: now if x == 1.0 else width(x), tolerance, most_scale)
+    return Look(periods, now, scale, then, enough)
+
+
+def interval_of(recording: Recording, confidence: float) -> float:
+    """The relative half-width of the very interval that the run would end with; infinite where there is none."""
+    found = identify(recording, Options(confidence=confidence)).inertia
+    return math.inf if found is None else 0.5 * (found.high - found.low) / found.value
+
+
+def evidence_of(recording: Recording) -> Evidence | None:
+    """Lines and levels as identification will see them; None without enough whole periods."""
+    excitation = recording.excitation
+    if excitation is None or not excitation.segments:
+        return None
+    samples = usable_samples(recording)
+    cut = stretches(samples, excitation.segments)
+    fits = tuple(period_lines(stretch, samples) for stretch in cut)
+    levels = measure_levels(cut, fits, samples, recording.levels, 0.0)
+    constraint = tie_viscous(levels)
+    pooled = pooled_lines(fits, constraint.slope if constraint is not None else 0.0, levels.warming.own)
+    lines = tuple(line for line in pooled if line.excited and line.nu >= LEAST_NU)
+    return Evidence(lines, levels, recording.lag_prior) if lines else None

@@ -1,0 +1,22 @@
+"""What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
+
+from tdhil.runner.excitation.plan import (
+    LEAST_COUNTED as LEAST_COUNTED, ExcitationWish as ExcitationWish, Plan as Plan,
+    PlannedSegment as PlannedSegment, make_plan as make_plan, periodic_kind as periodic_kind,
+    settling_periods as settling_periods,
+)
+from tdhil.runner.excitation.pulses import (
+    CALM_S as CALM_S, SwingKind as SwingKind, SwingPlan as SwingPlan, Way as Way, make_swings as make_swings,
+)
+from tdhil.runner.excitation.reference import (
+    DriveMode as DriveMode, ExcitationKind as ExcitationKind, MotionLimits as MotionLimits,
+    PeriodicReference as PeriodicReference, PlanRefused as PlanRefused, RigGuess as RigGuess,
+    Transition as Transition, excitation_kind as excitation_kind, make_transition as make_transition,
+)
+from tdhil.runner.excitation.signals import (
+    ECHOES_S as ECHOES_S, PeriodicKind as PeriodicKind, Shape as Shape, tells_before_echo as tells_before_echo,
+    unit_peak as unit_peak,
+)
+from tdhil.runner.excitation.speed_loop import (
+    Following as Following, fit_following as fit_following, held_back_to as held_back_to,
+)

@@ -1,0 +1,392 @@
+"""Scale an excitation to the rig's speed window and torque limit, or refuse it before anything moves."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tdhil.config import DEFAULT_EXCITATION, told_before_echo
+from tdhil.recording import Segment
+from tdhil.runner.excitation import signals
+from tdhil.runner.excitation.reference import (
+    DriveMode,
+    MotionLimits,
+    PeriodicReference,
+    PlanRefused,
+    RigGuess,
+    Transition,
+    excitation_kind,
+    make_transition,
+)
+from tdhil.runner.excitation.signals import PeriodicKind, Shape, begun_at_rest
+
+_OFFSET_SHARE = 0.38     # of the usable window that the two mean speeds are at least apart: friction's lever
+LEAST_COUNTED = 6        # periods at each mean speed, settling aside: their scatter sets the weights
+RAMP_SHARE = 0.9         # of the acceleration that the drive's own ramp was seen to let through
+_BACKWARDS_SHARE = 0.012  # of the greatest speed: foreseen backwards less than this, the guard's own allowance is kept
+SETTLE_S = 10.0          # at least this long before the first period that counts
+
+
+@dataclass(frozen=True)
+class ExcitationWish:
+    """What the user asks for; None means that the plan chooses.
+
+    ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
+    deviation of speed from its mean. ``offsets_rad_s``: mean speeds, one segment each. ``periods``: per segment,
+    settling included. ``shape``: other lines for the multisine than its own; ``offset_share`` of the usable window: how
+    far apart two mean speeds of the plan's own choice are at least (friction's lever). ``settle_s``: how long each
+    segment settles at least.
+    """
+
+    kind: str = DEFAULT_EXCITATION
+    mode: DriveMode = "torque"
+    frequency_hz: float | None = None
+    amplitude_rad_s: float | None = None
+    offsets_rad_s: tuple[float, ...] | None = None
+    periods: int | None = None
+    shape: Shape | None = None
+    offset_share: float | None = None
+    settle_s: float = SETTLE_S
+
+
+@dataclass(frozen=True)
+class PlannedSegment:
+    """One mean speed: its reference from the segment's start, how long it lasts, and what it should reach."""
+
+    reference: PeriodicReference
+    periods: int
+    settle_periods: int
+    speed_min_rad_s: float    # predicted, if the rough inertia were right
+    speed_max_rad_s: float
+    torque_min_nm: float
+    torque_max_nm: float
+
+    @property
+    def duration_s(self) -> float:
+        return self.periods * self.reference.period_s
+
+    def recorded(self, start_s: float, end_s: float | None = None) -> Segment:
+        """The segment as a recording keeps it; ``end_s`` is rounded down to the last whole period that was run."""
+        end = start_s + self.duration_s if end_s is None else end_s
+        period = self.reference.period_s
+        whole = min(self.periods, max(0, math.floor((end - start_s) / period + 1e-6)))
+        return Segment(
+            start_s=start_s,
+            end_s=start_s + whole * period,
+            period_s=period,
+            settle_periods=self.settle_periods,
+            offset_rad_s=self.reference.offset_rad_s,
+            lines_hz=self.reference.lines_hz,
+            amplitudes_rad_s=self.reference.amplitudes_rad_s,
+            phases_rad=self.reference.phases_rad,
+        )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The whole of stage 5's motion, in order; transitions lead from each segment to the next."""
+
+    kind: str
+    mode: DriveMode
+    segments: tuple[PlannedSegment, ...]
+    limits: MotionLimits
+    guess: RigGuess
+
+    @property
+    def start_rad_s(self) -> float:
+        """The mean speed that it begins at."""
+        return self.segments[0].reference.offset_rad_s
+
+    def plain(self) -> dict[str, Any]:
+        """Its motion as plain data."""
+        return {
+            "segments": [
+                {
+                    "offset_rad_s": one.reference.offset_rad_s,
+                    "period_s": one.reference.period_s,
+                    "periods": one.periods,
+                    "settle_periods": one.settle_periods,
+                    "lines_hz": list(one.reference.lines_hz),
+                    "amplitudes_rad_s": list(one.reference.amplitudes_rad_s),
+                }
+                for one in self.segments
+            ],
+            "ways": [],
+        }
+
+    def parts(self) -> list[tuple[str, str]]:
+        """(where, what) for people: one for each mean speed."""
+        return [
+            (f"at {one.reference.offset_rad_s:.3g} rad/s",
+             f"{one.periods} periods of {one.reference.period_s:.3g} s, {one.settle_periods} to settle")
+            for one in self.segments
+        ]
+
+    def lines(self) -> list[tuple[float, float]]:
+        """(Hz, rad/s) of every line; the same at each mean speed."""
+        reference = self.segments[0].reference
+        return list(zip(reference.lines_hz, reference.amplitudes_rad_s, strict=True))
+
+    @property
+    def speed_min_rad_s(self) -> float:
+        return min(segment.speed_min_rad_s for segment in self.segments)
+
+    @property
+    def speed_max_rad_s(self) -> float:
+        return max(segment.speed_max_rad_s for segment in self.segments)
+
+    @property
+    def torque_min_nm(self) -> float:
+        return min(segment.torque_min_nm for segment in self.segments)
+
+    @property
+    def torque_max_nm(self) -> float:
+        return max(segment.torque_max_nm for segment in self.segments)
+
+    @property
+    def duration_s(self) -> float:
+        """Segments and the transitions between them; the first transition, from wherever the shaft is, comes on top."""
+        between = sum(
+            self.transition(before.reference.start_speed_rad_s, index + 1).duration_s
+            for index, before in enumerate(self.segments[:-1])
+        )
+        return between + sum(segment.duration_s for segment in self.segments)
+
+    def followed(self, hertz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """How much of a line of the reference the shaft makes, (K,): all, but for a drive's own speed control."""
+        following = self.guess.following
+        if self.mode != "speed" or following is None:
+            return np.ones(len(hertz), dtype=np.complex128)
+        return following.shaft(hertz)
+
+    @property
+    def counted(self) -> int:
+        """Periods that count at each mean speed."""
+        return self.segments[0].periods - self.segments[0].settle_periods
+
+    def with_counted(self, periods: int) -> "Plan":
+        """The same motion with so many periods that count at each mean speed, settling on top."""
+        segments = tuple(replace(segment, periods=segment.settle_periods + periods) for segment in self.segments)
+        return replace(self, segments=segments)
+
+    def extension_s(self, periods: int) -> float:
+        """So many more periods at each mean speed: on from the last one, then back to the others, which settle anew."""
+        others = self.segments[:-1]
+        again = sum(one.settle_periods * one.reference.period_s for one in others)
+        ways = sum(
+            self.transition(self.segments[-1].reference.start_speed_rad_s, index).duration_s
+            for index in range(len(others))
+        )
+        return again + ways + periods * sum(one.reference.period_s for one in self.segments)
+
+    def transition(self, from_rad_s: float, index: int) -> Transition:
+        """From a speed to the start of segment ``index``."""
+        to = self.segments[index].reference.start_speed_rad_s
+        return make_transition(from_rad_s, to, self.limits, self.guess, self.mode)
+
+
+def make_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish | None = None) -> Plan:
+    """A plan that stays within the limits even if the rough inertia is wrong by its stated error.
+
+    Raises PlanRefused, naming the limit, if what was asked for does not fit.
+    """
+    wish = wish or ExcitationWish()
+    shape, frequency = _shape_and_frequency(wish)
+    period = 1.0 / frequency
+    shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
+    fit = _Fit.of(shape, period, limits, guess, wish.mode)
+    amplitude, offsets = _amplitude_and_offsets(fit, wish)
+    settle = settling_periods(period, wish.settle_s)
+    periods = _periods(wish, period, settle)
+    return Plan(
+        wish.kind,
+        wish.mode,
+        tuple(fit.segment(offset, amplitude, periods, settle) for offset in offsets),
+        limits,
+        guess,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A shape of peak 1 with its peaks, against the limits."""
+
+    shape: Shape
+    period_s: float
+    limits: MotionLimits
+    guess: RigGuess
+    mode: DriveMode
+    up: float            # speed above and below its mean, per unit of amplitude
+    down: float
+    torque_up: float     # torque above and below its mean, N·m per rad/s of amplitude
+    torque_down: float
+    foreseen: float      # like ``up``, as far ahead as the guard looks
+
+    @classmethod
+    def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
+        following = guess.following if mode == "speed" else None
+        moved = shape if following is None else shape.followed(period_s, following)
+        speed = shape.deviation()
+        ahead = shape.foreseen_deviation(period_s, limits.foresight_s if mode == "torque" else 0.0)
+        torque = moved.torque_deviation(period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
+        both = np.concatenate([speed, moved.deviation()])
+        peaks = (float(np.max(both)), float(-np.min(both)), float(np.max(torque)), float(-np.min(torque)))
+        return cls(shape, period_s, limits, guess, mode, *peaks, foreseen=max(peaks[0], float(np.max(ahead))))
+
+    @property
+    def swing(self) -> float:
+        return self.guess.speed_swing_factor(self.mode)
+
+    @property
+    def ramp_room(self) -> float:
+        """The greatest amplitude that the drive's own speed ramp lets through."""
+        if self.mode == "torque" or math.isinf(self.limits.acceleration_rad_s2):
+            return math.inf
+        return RAMP_SHARE * self.limits.acceleration_rad_s2 / float(np.max(np.abs(self.shape.steepness(self.period_s))))
+
+    def largest_at(self, offset_rad_s: float) -> tuple[float, str]:
+        """The greatest amplitude that fits about a mean speed, and the limit that sets it."""
+        torque_factor = self.guess.torque_swing_factor(self.mode)
+        steady = self.guess.steady_torque_nm(offset_rad_s)
+        usable = self.limits.usable_torque_nm
+        candidates = [
+            ((self.limits.usable_high_rad_s - offset_rad_s) / (self.foreseen * self.swing), "speed window (upper end)"),
+            ((offset_rad_s - self.limits.usable_low_rad_s) / (self.down * self.swing), "speed window (lower end)"),
+            ((usable - steady) / (self.torque_up * torque_factor), "torque limit"),
+            ((usable + steady) / (self.torque_down * torque_factor), "torque limit"),
+        ]
+        if self.mode == "torque":
+            candidates.append(((steady - self.limits.least_torque_nm) / self.torque_down, "no braking torque"))
+        candidates.append((self.ramp_room, f"the drive's speed ramp ({self.limits.acceleration_rad_s2:.3g} rad/s²)"))
+        most = min(candidates, key=lambda candidate: candidate[0])
+        if self.mode == "speed" or self._never_backwards(offset_rad_s, most[0]):
+            return most
+        low, high = 0.0, most[0]
+        while high - low > 1e-3 * most[0]:
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._never_backwards(offset_rad_s, middle) else (low, middle)
+        return low, "standstill (as far ahead as the guard looks)"
+
+    def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
+        """Would the guard see the shaft turn backwards nowhere? As `guard.predicted_speed`, with the plan's torque."""
+        foresight_s, guess = self.limits.foresight_s, self.guess
+        swung = amplitude_rad_s * self.swing
+        speed = offset_rad_s + swung * self.shape.deviation()
+        rate = swung * self.shape.steepness(self.period_s)
+        torque = guess.steady_torque_nm(offset_rad_s) + amplitude_rad_s * self.shape.torque_deviation(
+            self.period_s, guess.inertia_kg_m2, guess.viscous_nm_s_rad
+        )
+        push = torque + guess.coulomb_nm
+        passes = (speed + foresight_s * rate < 0.0) & (push < 0.0)
+        beyond = push[passes] / guess.inertia_kg_m2 * (foresight_s + speed[passes] / rate[passes])
+        return bool(np.all(beyond >= -_BACKWARDS_SHARE * self.limits.speed_high_rad_s))
+
+    def segment(self, offset_rad_s: float, amplitude_rad_s: float, periods: int, settle: int) -> PlannedSegment:
+        reference = PeriodicReference(
+            offset_rad_s=offset_rad_s,
+            period_s=self.period_s,
+            lines_hz=tuple(harmonic / self.period_s for harmonic in self.shape.harmonics),
+            amplitudes_rad_s=tuple(amplitude_rad_s * a for a in self.shape.amplitudes),
+            phases_rad=self.shape.phases_rad,
+            guess=self.guess,
+        )
+        return PlannedSegment(
+            reference=reference,
+            periods=periods,
+            settle_periods=settle,
+            speed_min_rad_s=offset_rad_s - amplitude_rad_s * self.down,
+            speed_max_rad_s=offset_rad_s + amplitude_rad_s * self.up,
+            torque_min_nm=reference.mean_torque_nm - amplitude_rad_s * self.torque_down,
+            torque_max_nm=reference.mean_torque_nm + amplitude_rad_s * self.torque_up,
+        )
+
+
+def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
+    kind = periodic_kind(wish.kind)
+    frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
+    if not (math.isfinite(frequency) and frequency > 0.0):
+        raise PlanRefused(f"frequency must be positive, not {frequency:g} Hz")
+    if told_before_echo(wish.kind) and frequency > kind.frequency_hz:
+        raise PlanRefused(
+            f"{wish.kind} with lines {frequency:g} Hz apart can't tell an echo from what was before it",
+            f"Leave --frequency out ({kind.frequency_hz:g} Hz), or give a lower one",
+        )
+    if wish.shape is not None:
+        return wish.shape, frequency
+    return kind.shape(), frequency
+
+
+def periodic_kind(name: str) -> PeriodicKind:
+    """The periodic kind of that name. Raises PlanRefused where it is none."""
+    kind = excitation_kind(name)
+    if not isinstance(kind, PeriodicKind):
+        raise PlanRefused(f"{name} is no periodic excitation")
+    return kind
+
+
+def settling_periods(period_s: float, settle_s: float = SETTLE_S) -> int:
+    """How many periods go to settling."""
+    return max(1, math.ceil(settle_s / period_s - 1e-9))
+
+
+def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
+    if wish.periods is not None:
+        if wish.periods < settle + 1:
+            raise PlanRefused(
+                f"{wish.periods} periods are too few where {settle} of them settle",
+                f"Give --periods {settle + 1} or more",
+            )
+        return wish.periods
+    at_one_speed_s = periodic_kind(wish.kind).at_one_speed_s
+    if at_one_speed_s > 0.0:
+        return settle + max(10, math.ceil(at_one_speed_s / period_s - 1e-9))
+    # as long as the default multisine, and never fewer than six periods that count: their scatter sets the weights
+    counted = (signals.DEFAULT_PERIODS - 1) / signals.MULTISINE_FREQUENCY_HZ
+    return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
+
+
+def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tuple[float, ...]]:
+    if wish.amplitude_rad_s is not None and not (math.isfinite(wish.amplitude_rad_s) and wish.amplitude_rad_s > 0.0):
+        raise PlanRefused(f"amplitude must be positive, not {wish.amplitude_rad_s:g} rad/s")
+    if wish.offsets_rad_s is not None and not wish.offsets_rad_s:
+        raise PlanRefused("at least one offset is needed")
+    offsets = wish.offsets_rad_s or _default_offsets(fit, wish)
+    largest, limit, where = min((*fit.largest_at(offset), offset) for offset in offsets)
+    if largest <= 0.0:
+        raise PlanRefused(f"{limit} leaves no room for any excitation about {where:.3g} rad/s")
+    amplitude = largest if wish.amplitude_rad_s is None else wish.amplitude_rad_s
+    if amplitude > largest * (1.0 + 1e-9):
+        raise PlanRefused(
+            f"{limit}: an amplitude of {amplitude:g} rad/s about {where:.3g} rad/s does not fit; "
+            f"{largest:.3g} rad/s would"
+        )
+    return amplitude, tuple(offsets)
+
+
+def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
+    """Two mean speeds (one where friction's slope isn't asked for), as far apart as the swing allows.
+
+    The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit
+    allows at the upper end; whatever it does not need goes to the distance, which is what tells B.
+    """
+    low, high = fit.limits.usable_low_rad_s, fit.limits.usable_high_rad_s
+    span = (fit.foreseen + fit.down) * fit.swing
+    if periodic_kind(wish.kind).at_one_speed_s > 0.0:
+        return (low + (high - low) * fit.down / (fit.foreseen + fit.down),)
+    share = _OFFSET_SHARE if wish.offset_share is None else wish.offset_share
+    amplitude = (1.0 - share) * (high - low) / span
+    torque_room = fit.limits.usable_torque_nm - max(fit.guess.steady_torque_nm(low), fit.guess.steady_torque_nm(high))
+    torque_swing = max(fit.torque_up, fit.torque_down) * fit.guess.torque_swing_factor(fit.mode)
+    if torque_room <= 0.0:
+        raise PlanRefused(
+            f"torque limit: steady friction leaves nothing of the {fit.limits.usable_torque_nm:g} N·m "
+            "that a plan may use"
+        )
+    amplitude = min(amplitude, torque_room / torque_swing, fit.ramp_room)
+    if wish.amplitude_rad_s is not None:
+        amplitude = min(amplitude, wish.amplitude_rad_s) if wish.amplitude_rad_s > 0.0 else amplitude
+    first = low + amplitude * fit.down * fit.swing
+    second = high - amplitude * fit.foreseen * fit.swing
+    return first, second

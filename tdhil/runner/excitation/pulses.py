@@ -1,0 +1,255 @@
+"""Torque pulses and coast-down: from one speed to another and back, with calm in between.
+
+A pulse is a step of net torque, ΔT for some seconds, up or down; between two pulses the shaft is held at a steady
+speed, so that the momentum from calm to calm can be balanced without knowing any lag. Swings of full height alternate
+with half ones, and strong pulses with weaker ones, which spreads what they say over frequency.
+
+Coast-down lets go of the torque at the upper speed, and friction brings the shaft to the lower one. Of J, B and T_c,
+J dω/dt = −B ω − T_c tells the ratios only: multiply all three by anything, and the shaft coasts alike. What tells J is
+the torque of the way back up, so every coast is paired with a powered ramp, and the ramps differ in steepness.
+
+Whatever the rough inertia's error, the swing stays within the window; in torque mode that includes what the guard
+foresees (`limits.foresight_s`) while the torque pushes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Any
+
+from tdhil.runner.excitation.reference import (
+    DriveMode,
+    ExcitationKind,
+    MotionLimits,
+    PlanRefused,
+    RigGuess,
+    excitation_kind,
+)
+
+CALM_S = 3.5              # at every speed: momentum's balances want 2 s and more, behind the lags
+TOTAL_S = 210.0           # about as long as the usual multisine
+_LEAST_SWINGS = 6         # ways up and down
+_MOST_S = 12.0            # of one way: a heavy shaft takes its time, within reason
+_LEAST_S = 0.5
+_SHARES = (1.0, 0.6)      # of the steepest: pulses of two strengths
+_HEIGHTS = (0.0, 1.0, 0.5, 1.0)     # levels between the lowest and the highest speed, in turn
+_TOPS = (1.0, 0.6, 0.8)             # from which it coasts: no two rounds alike for long, or few frequencies are excited
+_SLACK = 1.1              # of what the guard foresees, since reports are noisy
+_TORQUE_SHARE = 0.9       # of the room that the torque limit leaves above friction
+
+
+@dataclass(frozen=True)
+class Way:
+    """From one steady speed to the next, in ``duration_s``; ``coasting``: without torque, so about so long."""
+
+    from_rad_s: float
+    to_rad_s: float
+    duration_s: float
+    guess: RigGuess
+    coasting: bool = False
+
+    @property
+    def acceleration_rad_s2(self) -> float:
+        return (self.to_rad_s - self.from_rad_s) / self.duration_s
+
+    def reference(self, t_s: float) -> tuple[float, float]:
+        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the calm behind it afterwards."""
+        if t_s >= self.duration_s:
+            return self.to_rad_s, self.guess.steady_torque_nm(self.to_rad_s)
+        rate = self.acceleration_rad_s2
+        speed = self.from_rad_s + rate * max(t_s, 0.0)
+        return speed, self.guess.steady_torque_nm(speed) + self.guess.inertia_kg_m2 * rate
+
+
+@dataclass(frozen=True)
+class SwingKind(ExcitationKind):
+    """Ways from one steady speed to another.
+
+    ``ways``: makes them without end, from the lowest and the highest speed, rad/s, the steepest that a powered way may
+    be, rad/s², and the rough rig. The first begins at the lowest speed.
+    """
+
+    ways: Callable[[float, float, float, RigGuess], Iterator[Way]] = field(kw_only=True)
+
+
+@dataclass(frozen=True)
+class SwingPlan:
+    """The whole of stage 5's motion: calm at ``start_rad_s``, then every way with the calm behind it."""
+
+    kind: str
+    mode: DriveMode
+    start_rad_s: float
+    ways: tuple[Way, ...]
+    speed_min_rad_s: float
+    speed_max_rad_s: float
+    torque_min_nm: float
+    torque_max_nm: float
+    limits: MotionLimits
+    guess: RigGuess
+
+    @property
+    def duration_s(self) -> float:
+        return CALM_S + sum(way.duration_s + CALM_S for way in self.ways)
+
+    def plain(self) -> dict[str, Any]:
+        """Its motion as plain data."""
+        return {
+            "segments": [],
+            "ways": [
+                {"from_rad_s": way.from_rad_s, "to_rad_s": way.to_rad_s, "duration_s": way.duration_s,
+                 "coasting": way.coasting}
+                for way in self.ways
+            ],
+        }
+
+    def parts(self) -> list[tuple[str, str]]:
+        """(where, what) for people."""
+        ways = f"{len(self.ways)} ways up and down, each with {CALM_S:g} s of calm behind it"
+        return [(f"{self.speed_min_rad_s:.3g} to {self.speed_max_rad_s:.3g} rad/s", ways)]
+
+    def lines(self) -> list[tuple[float, float]]:
+        """It has none."""
+        return []
+
+
+def make_swings(
+    kind: str,
+    limits: MotionLimits,
+    guess: RigGuess,
+    mode: DriveMode,
+    amplitude_rad_s: float | None = None,
+    offset_rad_s: float | None = None,
+    swings: int | None = None,
+    time_s: float | None = None,
+) -> SwingPlan:
+    """Plan them: ``swings`` ways of either direction, or as many as fit into ``time_s``. Raises PlanRefused.
+
+    ``amplitude_rad_s``: half of the way from the lower to the upper speed, about ``offset_rad_s``.
+    """
+    asked = swing_kind(kind)
+    if asked.needs_torque_mode and mode != "torque":
+        raise PlanRefused(f"{kind} needs a drive in torque mode: {asked.why_torque_mode}")
+    room = _Room(limits, guess, mode)
+    low, high, rate = room.swing(amplitude_rad_s, offset_rad_s)
+    endless = asked.ways(low, high, rate, guess)
+    total = TOTAL_S if time_s is None else time_s
+    if swings is not None:
+        ways = list(islice(endless, swings))
+    else:
+        ways, taken = [], CALM_S
+        for way in endless:
+            taken += way.duration_s + CALM_S
+            if taken > total and (len(ways) >= _LEAST_SWINGS or time_s is not None):
+                break
+            ways.append(way)
+    if len(ways) < _LEAST_SWINGS:
+        needed = CALM_S + sum(way.duration_s + CALM_S for way in islice(_again(ways, endless), _LEAST_SWINGS))
+        raise PlanRefused(
+            f"time: {len(ways)} ways up and down are too few to tell the inertia, {_LEAST_SWINGS} take {needed:.0f} s",
+            f"Give --max-time {math.ceil(needed)} or more, --periods {_LEAST_SWINGS} or more, or leave both out",
+        )
+    torques = [torque for way in ways if not way.coasting for torque in (way.reference(0.0)[1],
+               way.reference(0.999999 * way.duration_s)[1])]
+    lowest = min(torques) if all(not way.coasting for way in ways) else min(0.0, *torques)
+    return SwingPlan(kind, mode, low, tuple(ways), low, high, lowest, max(torques), limits, guess)
+
+
+def swing_kind(name: str) -> SwingKind:
+    """The kind of that name that goes from speed to speed. Raises PlanRefused where it is none."""
+    kind = excitation_kind(name)
+    if not isinstance(kind, SwingKind):
+        raise PlanRefused(f"{name} is a periodic excitation")
+    return kind
+
+
+def _again(ways: list[Way], rest: Iterator[Way]) -> Iterator[Way]:
+    yield from ways
+    yield from rest
+
+
+def _pulses(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+    """Up and down between the levels; each round another strength."""
+    at, number = low, 0
+    while True:
+        number += 1
+        to = low + _HEIGHTS[number % len(_HEIGHTS)] * (high - low)
+        share = _SHARES[(number // len(_HEIGHTS)) % len(_SHARES)]
+        yield Way(at, to, max(_LEAST_S, abs(to - at) / (share * rate)), guess)
+        at = to
+
+
+def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+    """Up under power, each time another steepness, and down without torque."""
+    number = 0
+    while True:
+        share = _SHARES[number % len(_SHARES)]
+        top = low + _TOPS[number % len(_TOPS)] * (high - low)
+        yield Way(low, top, max(_LEAST_S, (top - low) / (share * rate)), guess)
+        yield Way(top, low, coasting_s(top, low, guess), guess, coasting=True)
+        number += 1
+
+
+def coasting_s(from_rad_s: float, to_rad_s: float, guess: RigGuess) -> float:
+    """How long friction alone takes from one speed to a lower one: (J/B) ln(T(ω₀)/T(ω₁)), (J/T_c) Δω for B → 0.
+
+    Raises PlanRefused where there is next to no friction.
+    """
+    upper, lower = guess.steady_torque_nm(from_rad_s), guess.steady_torque_nm(to_rad_s)
+    if not (lower > 0.0 and upper > 0.0):
+        raise PlanRefused("coast-down: there is no friction to slow the shaft down; use --excitation pulses")
+    mean = upper if math.isclose(upper, lower, rel_tol=1e-9) else (upper - lower) / math.log(upper / lower)
+    return guess.inertia_kg_m2 * (from_rad_s - to_rad_s) / mean
+
+
+PULSES = SwingKind(ways=_pulses)
+COAST_DOWN = SwingKind(
+    ways=_coasts,
+    needs_torque_mode=True,
+    why_torque_mode="a shaft under speed control never coasts",
+    with_string=False,
+)
+
+
+class _Room:
+    """Lower and upper speed, and the steepest way between them, within the limits."""
+
+    def __init__(self, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
+        self._limits, self._guess = limits, guess
+        # At worst a way goes as much further as the shaft is lighter than thought.
+        self._beyond = guess.speed_swing_factor(mode) - 1.0
+        self._torque_factor = guess.torque_swing_factor(mode)
+        self._foresight_s = limits.foresight_s if mode == "torque" else 0.0
+
+    def swing(self, amplitude_rad_s: float | None, offset_rad_s: float | None) -> tuple[float, float, float]:
+        low, high = self._limits.usable_low_rad_s, self._limits.usable_high_rad_s
+        friction = self._guess.steady_torque_nm(high)
+        torque = _TORQUE_SHARE * (self._limits.usable_torque_nm - max(friction, 0.0)) / self._torque_factor
+        if torque <= 0.0:
+            raise PlanRefused(
+                f"torque limit: steady friction leaves nothing of the {self._limits.usable_torque_nm:g} N·m "
+                "that a plan may use"
+            )
+        rate = min(torque / self._guess.inertia_kg_m2, 0.9 * self._limits.acceleration_rad_s2)
+        # What the guard foresees may take a fifth of the window at either end; a shaft that light is pushed less.
+        rate = min(rate, (high - low) / 5.0 / self._foresight_s) if self._foresight_s > 0.0 else rate
+        ahead = _SLACK * rate * self._foresight_s
+        largest = (high - low - 2.0 * ahead) / (1.0 + 2.0 * self._beyond)
+        span = largest if amplitude_rad_s is None else 2.0 * amplitude_rad_s
+        if not (math.isfinite(span) and span > 0.0):
+            raise PlanRefused(f"amplitude must be positive, not {0.5 * span:g} rad/s")
+        span = min(span, _MOST_S * rate) if amplitude_rad_s is None else span
+        least, most = low + ahead + span * self._beyond, high - ahead - span * (1.0 + self._beyond)
+        if least > most * (1.0 + 1e-9) + 1e-9:
+            raise PlanRefused(
+                f"speed window: an amplitude of {0.5 * span:g} rad/s does not fit; {0.5 * largest:.3g} rad/s would"
+            )
+        bottom = least if offset_rad_s is None else offset_rad_s - 0.5 * span
+        if not least - 1e-9 <= bottom <= most + 1e-9:
+            raise PlanRefused(
+                f"speed window: swings of {0.5 * span:.3g} rad/s about {offset_rad_s:g} rad/s do not fit; "
+                f"about {least + 0.5 * span:.3g} to {most + 0.5 * span:.3g} rad/s they would"
+            )
+        return bottom, bottom + span, rate

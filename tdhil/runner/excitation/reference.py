@@ -1,0 +1,244 @@
+"""What an excitation must stay within, and what is known of the rig when it is planned."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from tdhil.config import EXCITATIONS, load
+from tdhil.runner.excitation.speed_loop import Following
+
+DriveMode = Literal["torque", "speed"]
+
+TORQUE_RESERVE = 0.15   # share of the torque limit that a plan leaves to the speed control
+SPEED_MARGIN = 0.03     # share of the speed window kept free at either end, for what drifts
+
+
+USUAL_STEP = "Change --amplitude, --offset, --frequency or the limits"
+
+
+class PlanRefused(ValueError):
+    """The wished motion doesn't fit; the message names the limit, what was needed, and what there is.
+
+    ``next_step``: which option would change that.
+    """
+
+    def __init__(self, what: str, next_step: str = USUAL_STEP) -> None:
+        super().__init__(what)
+        self.next_step = next_step
+
+
+@dataclass(frozen=True)
+class ExcitationKind:
+    """What there is to know of an excitation before it is planned; `tdhil.config.registry` lists them by name.
+
+    A kind is one of two families: `PeriodicKind` has lines, `SwingKind` goes from one steady speed to another.
+    ``needs_torque_mode``: it can't be had under the drive's speed control, and ``why_torque_mode`` says why in words.
+    ``with_string``: may it be run with a drill string on the shaft?
+    """
+
+    needs_torque_mode: bool = False
+    why_torque_mode: str = ""
+    with_string: bool = True
+
+    @property
+    def adaptive(self) -> bool:
+        """Can a tolerance end it, by the scatter from period to period?"""
+        return False
+
+
+def excitation_kind(name: str) -> ExcitationKind:
+    """The kind of that name. Raises PlanRefused where there is none."""
+    if name not in EXCITATIONS:
+        raise PlanRefused(f"unknown excitation {name!r}; there are {', '.join(EXCITATIONS)}")
+    found: ExcitationKind = load(EXCITATIONS, name)
+    return found
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """What a planned motion may use: the window that the shaft must not leave, rad/s, and the greatest torque, N·m.
+
+    The machine's own, which the guard holds, are `tdhil.runner.settings.MachineLimits`.
+
+    ``foresight_s``: in torque mode the guard holds speed + foresight·acceleration below the window's upper end, since
+    what is reported is old; the plan must keep that free too. ``acceleration_rad_s2``: what the drive's own speed ramp
+    lets through, where it was seen to hold the shaft back (speed mode only). ``least_torque_nm``: a torque mode's
+    torque stays above it, where braking can't be had.
+    """
+
+    speed_low_rad_s: float
+    speed_high_rad_s: float
+    torque_limit_nm: float
+    foresight_s: float = 0.0
+    acceleration_rad_s2: float = math.inf
+    least_torque_nm: float = -math.inf
+
+    def __post_init__(self) -> None:
+        values = (self.speed_low_rad_s, self.speed_high_rad_s, self.torque_limit_nm)
+        if not all(math.isfinite(value) for value in values):
+            raise PlanRefused("speed window and torque limit must be finite numbers")
+        if self.speed_low_rad_s >= self.speed_high_rad_s:
+            raise PlanRefused(
+                f"speed window is empty: {self.speed_low_rad_s:g} to {self.speed_high_rad_s:g} rad/s"
+            )
+        if self.torque_limit_nm <= 0.0:
+            raise PlanRefused(f"torque limit must be positive, not {self.torque_limit_nm:g} N·m")
+
+    @property
+    def width_rad_s(self) -> float:
+        return self.speed_high_rad_s - self.speed_low_rad_s
+
+    @property
+    def usable_low_rad_s(self) -> float:
+        return self.speed_low_rad_s + SPEED_MARGIN * self.width_rad_s
+
+    @property
+    def usable_high_rad_s(self) -> float:
+        return self.speed_high_rad_s - SPEED_MARGIN * self.width_rad_s
+
+    @property
+    def usable_torque_nm(self) -> float:
+        return (1.0 - TORQUE_RESERVE) * self.torque_limit_nm
+
+
+@dataclass(frozen=True)
+class RigGuess:
+    """A rough rig: T = inertia·dω/dt + viscous·ω + coulomb, forward rotation.
+
+    ``inertia_rel_error`` is how wrong the inertia may be (0.2 = a fifth either way); the plan keeps room for it.
+    ``following``: how the shaft follows a speed setpoint, where that was seen.
+    """
+
+    inertia_kg_m2: float
+    viscous_nm_s_rad: float = 0.0
+    coulomb_nm: float = 0.0
+    inertia_rel_error: float = 0.2
+    following: Following | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.inertia_kg_m2) and self.inertia_kg_m2 > 0.0):
+            raise PlanRefused(f"rough inertia must be positive, not {self.inertia_kg_m2:g} kg·m²")
+        if not (math.isfinite(self.viscous_nm_s_rad) and math.isfinite(self.coulomb_nm)):
+            raise PlanRefused("rough friction must be finite")
+        if not 0.0 <= self.inertia_rel_error < 0.9:
+            raise PlanRefused(f"relative error of the rough inertia must be in [0, 0.9): {self.inertia_rel_error:g}")
+
+    def steady_torque_nm(self, speed_rad_s: float) -> float:
+        """Torque that holds a steady speed, N·m."""
+        return self.coulomb_nm + self.viscous_nm_s_rad * speed_rad_s
+
+    def speed_swing_factor(self, mode: DriveMode) -> float:
+        """Real swing of speed over the planned one, at worst: in torque mode a lighter shaft swings further."""
+        return 1.0 / (1.0 - self.inertia_rel_error) if mode == "torque" else 1.05
+
+    def torque_swing_factor(self, mode: DriveMode) -> float:
+        """Real swing of torque over the planned one, at worst: in speed mode a heavier shaft needs more."""
+        return 1.0 if mode == "torque" else 1.0 / (1.0 - self.inertia_rel_error)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The reference of one segment, evaluated once a cycle.
+
+
+@dataclass(frozen=True)
+class PeriodicReference:
+    """Speed and feed-forward torque about one mean speed, from the segment's start.
+
+    speed(t)  = offset + Σ a_k cos(ω_k t + φ_k)
+    torque(t) = T_c + B·offset + Re Σ (J jω_k + B) a_k e^(j(ω_k t + φ_k))
+              = T_c + B·offset + Σ (B a_k cos(ω_k t + φ_k) − J ω_k a_k sin(ω_k t + φ_k))
+    """
+
+    offset_rad_s: float
+    period_s: float
+    lines_hz: tuple[float, ...]
+    amplitudes_rad_s: tuple[float, ...]
+    phases_rad: tuple[float, ...]
+    guess: RigGuess
+    _lines: tuple[tuple[float, float, float, float, float], ...] = field(init=False, repr=False, compare=False)
+    _mean_torque_nm: float = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        lines = []
+        for hertz, amplitude, phase in zip(self.lines_hz, self.amplitudes_rad_s, self.phases_rad, strict=True):
+            omega = 2.0 * math.pi * hertz
+            lines.append(
+                (
+                    omega,
+                    phase,
+                    amplitude,
+                    self.guess.viscous_nm_s_rad * amplitude,
+                    self.guess.inertia_kg_m2 * omega * amplitude,
+                )
+            )
+        object.__setattr__(self, "_lines", tuple(lines))
+        object.__setattr__(self, "_mean_torque_nm", self.guess.steady_torque_nm(self.offset_rad_s))
+
+    @property
+    def mean_torque_nm(self) -> float:
+        """Feed-forward torque that holds the mean speed, N·m."""
+        return self._mean_torque_nm
+
+    @property
+    def start_speed_rad_s(self) -> float:
+        """Speed at t = 0, where a transition must have brought the shaft."""
+        return self.reference(0.0)[0]
+
+    def reference(self, t_s: float) -> tuple[float, float]:
+        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` seconds after the segment's start."""
+        speed = self.offset_rad_s
+        torque = self._mean_torque_nm
+        for omega, phase, amplitude, in_phase, quadrature in self._lines:
+            argument = omega * t_s + phase
+            cosine = math.cos(argument)
+            speed += amplitude * cosine
+            torque += in_phase * cosine - quadrature * math.sin(argument)
+        return speed, torque
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# From one speed to another without a step of acceleration, with its feed-forward torque.
+
+
+_SHORTEST_S = 2.0
+_TORQUE_SHARE = 0.5   # of what the limit leaves above friction: a transition is in no hurry
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Half a cosine: v(t) = v0 + (v1 − v0)(1 − cos(π t / D)) / 2, and T = J v̇ + B v + T_c."""
+
+    from_rad_s: float
+    to_rad_s: float
+    duration_s: float
+    guess: RigGuess
+
+    def reference(self, t_s: float) -> tuple[float, float]:
+        """Speed (rad/s) and feed-forward torque (N·m), ``t_s`` after its start; the end's steady values afterwards."""
+        if t_s >= self.duration_s:
+            return self.to_rad_s, self.guess.steady_torque_nm(self.to_rad_s)
+        rate = math.pi / self.duration_s
+        half = 0.5 * (self.to_rad_s - self.from_rad_s)
+        t = max(t_s, 0.0)
+        speed = self.from_rad_s + half * (1.0 - math.cos(rate * t))
+        acceleration = half * rate * math.sin(rate * t)
+        return speed, self.guess.inertia_kg_m2 * acceleration + self.guess.steady_torque_nm(speed)
+
+
+def make_transition(
+    from_rad_s: float, to_rad_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode = "torque"
+) -> Transition:
+    """The quickest calm transition: at most half of the torque that friction leaves, and never under 2 s.
+
+    Raises PlanRefused if friction alone takes the torque.
+    """
+    friction = max(abs(guess.steady_torque_nm(from_rad_s)), abs(guess.steady_torque_nm(to_rad_s)))
+    room = _TORQUE_SHARE * (limits.usable_torque_nm - friction) / guess.torque_swing_factor(mode)
+    if room <= 0.0:
+        raise PlanRefused(
+            f"torque limit: friction takes {friction:g} N·m of the {limits.usable_torque_nm:g} N·m that a plan may use"
+        )
+    needed = math.pi * abs(to_rad_s - from_rad_s) * guess.inertia_kg_m2 / (2.0 * room)
+    if mode == "speed":
+        needed = max(needed, math.pi * abs(to_rad_s - from_rad_s) / (2.0 * limits.acceleration_rad_s2))
+    return Transition(from_rad_s, to_rad_s, max(_SHORTEST_S, needed), guess)

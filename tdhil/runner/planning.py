@@ -1,0 +1,286 @@
+"""The plan of stage 5, and of when it ends: from what is asked for and what stages 2 and 3 have shown. Pure.
+
+Without a tolerance the motion is planned for a fixed time. With one, a pilot is planned from what the noise leads to
+expect, and everything after it is decided by its scatter (`design.stopping_rule`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from tdhil.runner.design import (
+    MARGIN,
+    SOON_COUNTED,
+    Choice,
+    Evidence,
+    Knowledge,
+    Stopping,
+    choose,
+    choose_soonest,
+    half_width,
+    interval_confidence,
+    least_scale,
+    longer,
+    predicted,
+    refuse_unfit,
+)
+from tdhil.runner.excitation import (
+    LEAST_COUNTED,
+    ExcitationWish,
+    MotionLimits,
+    Plan,
+    PlanRefused,
+    RigGuess,
+    SwingKind,
+    SwingPlan,
+    excitation_kind,
+    fit_following,
+    held_back_to,
+    make_swings,
+    periodic_kind,
+)
+from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.stages import Course, reference_plan
+
+NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
+NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
+_PILOT_SHARE = 0.6        # of the periods that are expected to be needed: the rest is decided by the pilot's scatter
+_EVER = 1000.0            # times as long: what is open then stays open
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The plan (with a stopping rule: its pilot), and the relative half-width of J that may be expected at the end.
+
+    The half-width is infinite where none is to be expected, and not a number where none is predicted.
+    """
+
+    plan: Plan | SwingPlan
+    known: Knowledge
+    half_width: float
+    usual_half_width: float
+    stopping: Stopping | None = None
+    duration_s: float = 0.0
+
+    def said(self) -> str:
+        """One line for whoever watches."""
+        if not math.isfinite(self.half_width):
+            return NOT_PREDICTED if math.isnan(self.half_width) else NOTHING_TO_EXPECT
+        noise = f"noise {self.known.noise.source}"
+        share = f"±{100.0 * self.half_width:.2g} %"
+        expected = f"expected interval of J: {share} after {self.duration_s:.0f} s (repeatability; {noise})"
+        if self.stopping is None or self.stopping.reachable:
+            return expected
+        return f"±{100.0 * self.stopping.tolerance:.3g} % is not to be expected: {self.stopping.advice}; {expected}"
+
+    def plain(self) -> dict[str, Any]:
+        """As the run's configuration keeps it."""
+        return {
+            "expected_half_width": _finite(self.half_width),
+            "usual_half_width": _finite(self.usual_half_width),
+            "duration_s": self.duration_s,
+            "noise": asdict(self.known.noise),
+            "guess": asdict(self.plan.guess),
+        }
+
+
+def request_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
+    """The request as the excitation room takes it. Raises PlanRefused where it isn't periodic."""
+    periodic_kind(request.kind)
+    return ExcitationWish(
+        kind=request.kind,
+        mode="speed" if mode == "speed" else "torque",
+        frequency_hz=request.frequency_hz,
+        amplitude_rad_s=request.amplitude_rad_s,
+        offsets_rad_s=None if request.offset_rad_s is None else (request.offset_rad_s,),
+        periods=request.periods,
+    )
+
+
+def adaptive(request: ExcitationRequest) -> bool:
+    """Does the scatter decide when stage 5 ends? Not with a number of periods given, nor without several lines."""
+    return request.tolerance is not None and request.periods is None and excitation_kind(request.kind).adaptive
+
+
+def as_followed(
+    guess: RigGuess, limits: MotionLimits, course: Course, speed_lag_s: float
+) -> tuple[RigGuess, MotionLimits]:
+    """Rig and limits as the drive's own speed control leaves them, seen in the ramp of stage 2."""
+    signals = course.time_s, course.setpoint_rad_s, course.reported_rad_s
+    ramp = held_back_to(*signals)
+    following = fit_following(*signals, speed_lag_s, math.inf if ramp is None else ramp)
+    within = limits if ramp is None else replace(limits, acceleration_rad_s2=ramp)
+    return replace(guess, following=following), within
+
+
+def plan_acquisition(
+    request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: Knowledge, left_s: float
+) -> Planned:
+    """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
+    if isinstance(excitation_kind(request.kind), SwingKind):
+        return _swings(request, mode, limits, guess, known, left_s)
+    wish = request_of(request, mode)
+    if request.impedance is not None:
+        return _reference(request, limits, guess, wish, known, left_s)
+    allowed_s = left_s if request.max_time_s is None else min(left_s, request.max_time_s)
+    if not adaptive(request):
+        chosen = choose(limits, guess, wish, known, request.confidence, request.max_time_s)
+        return Planned(chosen.plan, known, chosen.half_width, chosen.usual_half_width, None, chosen.plan.duration_s)
+    chosen = choose(limits, guess, wish, known, request.confidence)
+    if chosen.plan.duration_s > allowed_s:
+        chosen = choose(limits, guess, wish, known, request.confidence, allowed_s)
+    planned = _with_pilot(request, chosen, known, allowed_s)
+    assert request.tolerance is not None
+    working = interval_confidence(request.confidence, pilot_dof(chosen.plan.with_counted(min(SOON_COUNTED))), 0)
+    soonest = choose_soonest(limits, guess, wish, known, working, request.tolerance / MARGIN, allowed_s)
+    if soonest is None:
+        return planned
+    sooner = _with_pilot(request, replace(chosen, plan=soonest), known, allowed_s, soonest.counted)
+    return sooner if sooner.stopping is not None and sooner.stopping.reachable else planned
+
+
+RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
+"""Shares of the inertia and the friction that are assumed: what suits none of these rigs will suit no other."""
+
+
+def refuse_hopeless(
+    request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: Knowledge
+) -> None:
+    """PlanRefused where what is asked for fits no rig, in none of ``modes``: that is known before anything moves.
+
+    The words are those of the assumed rig. What depends on the rig is left to be planned once that is known.
+    """
+    first: PlanRefused | None = None
+    swings = isinstance(excitation_kind(request.kind), SwingKind)
+    for inertia, friction in RIGS:
+        rig = replace(
+            guess, inertia_kg_m2=inertia * guess.inertia_kg_m2, viscous_nm_s_rad=friction * guess.viscous_nm_s_rad,
+            coulomb_nm=max(friction * guess.coulomb_nm, 1e-3 * limits.torque_limit_nm),
+        )
+        for mode in modes:
+            try:
+                if swings:
+                    plan_acquisition(request, mode, limits, rig, known, math.inf)
+                else:
+                    refuse_unfit(limits, rig, request_of(request, mode), known, request.max_time_s)
+                return
+            except PlanRefused as error:
+                first = first or error
+    if first is not None:
+        raise first
+
+
+def _reference(
+    request: ExcitationRequest, limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge,
+    left_s: float,
+) -> Planned:
+    """The speed reference's lines that the drive's own impedance is measured by."""
+    if request.impedance != "reference":
+        raise PlanRefused(
+            "by the torque offset the motion is planned in stage 4, from what a small offset does",
+            "Leave --dry-run out",
+        )
+    plan = reference_plan(limits, guess, wish)
+    if plan.duration_s > left_s:
+        raise PlanRefused(
+            f"time: it takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            "Raise limits.time_s in rig.yaml, or ask for fewer --periods",
+        )
+    return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
+
+
+def _swings(
+    request: ExcitationRequest,
+    mode: str,
+    limits: MotionLimits,
+    guess: RigGuess,
+    known: Knowledge,
+    left_s: float,
+) -> Planned:
+    """From speed to speed: there is no line to predict, and no scatter of periods to stop by."""
+    if request.frequency_hz is not None:
+        raise PlanRefused(
+            f"{request.kind} has no frequency; use --amplitude, --offset, --periods or --max-time",
+            "Leave --frequency out",
+        )
+    plan = make_swings(
+        request.kind,
+        limits,
+        guess,
+        "speed" if mode == "speed" else "torque",
+        request.amplitude_rad_s,
+        request.offset_rad_s,
+        request.periods,
+        request.max_time_s,
+    )
+    if plan.duration_s > left_s:
+        raise PlanRefused(
+            f"time: {request.kind} takes {plan.duration_s:.0f} s, and {max(left_s, 0.0):.0f} s are left",
+            "Raise limits.time_s in rig.yaml, or ask for less with --periods or --max-time",
+        )
+    return Planned(plan, known, math.nan, math.nan, None, plan.duration_s)
+
+
+def _with_pilot(
+    request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float, fewest: int = LEAST_COUNTED
+) -> Planned:
+    """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
+    assert request.tolerance is not None
+    if math.isnan(chosen.half_width):     # a string: a rigid shaft's scatter says nothing of it, beforehand or behind
+        plan = chosen.plan
+        stopping = Stopping(
+            request.tolerance, request.confidence, pilot_dof(plan), plan.counted, plan.counted, allowed_s, True,
+            by_interval=True,
+        )
+        return Planned(plan, known, math.nan, math.nan, stopping, plan.duration_s)
+    theta = known.theta(chosen.plan.guess)
+    least = chosen.plan.with_counted(fewest)
+    evidence = predicted(least, theta, known.noise, known.prior)
+    working = interval_confidence(request.confidence, pilot_dof(least), 0)
+    most = max(fewest, counted_in(chosen.plan, allowed_s))
+    scale, half, enough = least_scale(
+        lambda times: half_width(longer(evidence, times), working), request.tolerance / MARGIN, most / fewest
+    )
+    periods = min(most, math.ceil(scale * fewest - 1e-6))
+    pilot = max(fewest, math.floor(_PILOT_SHARE * periods))
+    plan = chosen.plan.with_counted(pilot)
+    stopping = Stopping(
+        tolerance=request.tolerance,
+        confidence=request.confidence,
+        pilot_dof=pilot_dof(plan),
+        pilot_periods=pilot,
+        expected_periods=periods,
+        allowed_s=allowed_s,
+        reachable=enough,
+        advice="" if enough else _advice(evidence, working, request.tolerance, known),
+    )
+    after_pilot = plan.extension_s(periods - pilot) if periods > pilot else 0.0
+    return Planned(plan, known, half, chosen.usual_half_width, stopping, plan.duration_s + after_pilot)
+
+
+def pilot_dof(plan: Plan) -> float:
+    """Real degrees of freedom of a line's variance: two for every period but the first of each segment."""
+    return 2.0 * sum(segment.periods - segment.settle_periods - 1 for segment in plan.segments)
+
+
+def counted_in(plan: Plan, time_s: float) -> int:
+    """How many periods that count at each mean speed fit into a time, with a pilot and one extension."""
+    period = sum(one.reference.period_s for one in plan.segments)
+    return math.floor((time_s - plan.with_counted(0).duration_s - plan.extension_s(0)) / period + 1e-9)
+
+
+def _advice(evidence: Evidence, confidence: float, tolerance: float, known: Knowledge) -> str:
+    """What would bring the tolerance within reach."""
+    ever = half_width(longer(evidence, _EVER), confidence)
+    if ever > tolerance:
+        lags = "state the drive's filters on reported speed and torque (drive_data in rig.yaml)"
+        known_lags = known.prior.speed_lag_s is not None and known.prior.torque_lag_s is not None
+        what = "state them more exactly" if known_lags else lags
+        return f"the lags leave ±{100.0 * ever:.2g} % open however long it takes; {what}, or set both filters equal"
+    return "allow more time (--max-time, limits.time_s), a wider speed window or more torque"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,505 @@
+"""An independent look at the unit of speed, before stage 2 goes to its second mean speed.
+
+All that the host knows of the shaft's speed comes through one number of the profile, the setpoint's size as well. Where
+it is ten times too small the shaft turns ten times as fast as is asked for and reported, and no limit in rad/s
+holds. So on the way to the first mean speed the drive's own angle is read beside the cycle, where it has one. The ramp
+goes on past `slow_speed`, at which a tenfold error does no harm, only while the angle agrees; at the first mean speed
+the ratio of both is taken over the whole level. Where no angle tells, the operator says what he sees.
+
+What is refused: a ratio off one by more than `TOLERANCE` and what the speed's own count leaves open; either sign.
+Encoders, gears and slip of good rigs are within a few per cent; units that are wrong are off by 2, 4, 2π, 10, 60.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, NoReturn
+
+from drivers import Command, Mode, Positioned, PositionReading, PreflightRefused, Sample
+from tdhil.config import SPEED_UNIT_TOLERANCE
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.settings import ControlAssumptions, MachineLimits
+from tdhil.runner.task import ConfirmSpeed, Say, nobody_sees
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The angle that a drive counts, held against the speed that it reports. Pure: it is shown both, and reckons.
+#
+# Over one stretch the shaft's true way stands in the drive's angle, and in the integral of its reported speed as well,
+# however unsteady it turns. Their ratio is that of the true unit of speed to the one that the profile has. A reported
+# speed that lags is late by the same way at both ends of a stretch whose ends are equally fast.
+
+
+WINDOW_S = 0.25
+"""The angle's own speed is that over so long, at least."""
+LEAST_WINDOW = 3
+"""Readings between which it is taken, at least."""
+SEEN_FASTER = 12.0
+"""An angle that starts over is followed up to a shaft so many times faster than it is believed to be."""
+EXACT = 0.03
+"""A ratio counts once it is known this well, as a share of itself, …"""
+LEAST_S = 2.0
+"""… over no less time than this."""
+STOOD_RAD = 8.2
+"""An angle that hasn't changed over so much reported way (1.3 turns: even a counter of turns would) stands still."""
+
+
+class Ratio(NamedTuple):
+    """True way over reported way of a stretch, and how far it may be off for counts and time."""
+
+    value: float
+    half_width: float
+
+
+@dataclass(frozen=True)
+class _Point:
+    time_s: float
+    angle_rad: float
+    way_rad: float
+    half_width_s: float
+
+
+class Angles:
+    """Of one drive over one run; `restart` begins a new stretch."""
+
+    def __init__(self) -> None:
+        self.where = ""
+        self.count_rad: float | None = None        # the smallest step seen: one count is no more than that
+        self.blind = False                         # the readings came too seldom for an angle that starts over
+        self._way_rad = 0.0                        # by the reported speed
+        self._before: Sample | None = None
+        self._last: _Point | None = None
+        self._raw_rad = 0.0
+        self._recent: list[_Point] = []
+        self._first: _Point | None = None          # of this stretch
+        self._changed: _Point | None = None        # where the count changed first in this stretch, and last
+        self._changed_last: _Point | None = None
+
+    def restart(self) -> None:
+        """A new stretch begins with the next reading; what a count is stays known."""
+        self._first = self._changed = self._changed_last = None
+        self.blind = False
+
+    def saw(self, sample: Sample) -> None:
+        """One cycle's reported speed."""
+        if not sample.fresh:
+            return
+        if self._before is not None:
+            mean = 0.5 * (self._before.speed_rad_s + sample.speed_rad_s)
+            self._way_rad += mean * (sample.time_s - self._before.time_s)
+        self._before = sample
+
+    def read(self, reading: PositionReading, believed_rad_s: float) -> None:
+        """One reading; ``believed_rad_s``: how fast the shaft would be, were the unit of speed right."""
+        self.where = reading.where
+        last, angle = self._last, reading.position_rad
+        if last is not None:
+            step = angle - self._raw_rad
+            wraps = reading.wraps_rad
+            if wraps is not None:
+                step -= wraps * round(step / wraps)
+                farthest = SEEN_FASTER * abs(believed_rad_s) * (reading.time_s - last.time_s)
+                self.blind = self.blind or farthest > 0.5 * wraps
+            angle = last.angle_rad + step
+            if step != 0.0:
+                self.count_rad = abs(step) if self.count_rad is None else min(self.count_rad, abs(step))
+        self._raw_rad = reading.position_rad
+        point = self._last = _Point(reading.time_s, angle, self._way_at(reading.time_s), reading.half_width_s)
+        self._recent.append(point)
+        while len(self._recent) > LEAST_WINDOW + 1 and point.time_s - self._recent[1].time_s >= WINDOW_S:
+            del self._recent[0]
+        if self._first is None:
+            self._first = point
+        elif last is not None and angle != last.angle_rad:
+            self._changed = self._changed or point
+            self._changed_last = point
+
+    def _way_at(self, time_s: float) -> float:
+        """The reported way at the moment of a reading: a late host reads the angle well after its last sample."""
+        if self._before is None:
+            return self._way_rad
+        return self._way_rad + self._before.speed_rad_s * (time_s - self._before.time_s)
+
+    def speed_rad_s(self) -> tuple[float, float] | None:
+        """By the angle alone, how fast the shaft has been just now: at least, at most (magnitudes); None too early."""
+        recent = self._recent
+        if self.count_rad is None or len(recent) <= LEAST_WINDOW or self.blind:
+            return None
+        took_s = recent[-1].time_s - recent[0].time_s
+        if took_s < 0.99 * WINDOW_S:
+            return None
+        turned = abs(recent[-1].angle_rad - recent[0].angle_rad)
+        return max(0.0, turned - self.count_rad) / took_s, (turned + self.count_rad) / took_s
+
+    def ratio(self) -> Ratio | None:
+        """Of this stretch; None while that is not known well enough."""
+        first, last = self._first, self._last
+        if first is None or last is None or self.blind or last.time_s - first.time_s < LEAST_S:
+            return None
+        way = abs(last.way_rad - first.way_rad)
+        count = self.count_rad
+        start, end = self._changed, self._changed_last
+        if start is None or end is None:
+            # Not one count: standing still, if it ever counted as finely as that, or over the whole of a turn.
+            return Ratio(0.0, 0.0) if way > (STOOD_RAD if count is None else min(STOOD_RAD, 5.0 * count)) else None
+        way_rad = end.way_rad - start.way_rad
+        turned = end.angle_rad - start.angle_rad
+        spent_s = end.time_s - start.time_s
+        if spent_s < 0.9 * LEAST_S or turned == 0.0 or count is None:
+            return None
+        # At a change the angle is known to one count, and to what it moves between two readings.
+        between = abs(turned) * self._every_s() / spent_s
+        half = 2.0 * min(count, between) / abs(turned) + (start.half_width_s + end.half_width_s) / spent_s
+        if half > EXACT:
+            return None
+        if abs(way_rad) < 1e-3 * abs(turned):
+            way_rad = 1e-3 * turned
+        value = turned / way_rad
+        return Ratio(value, half * abs(value))
+
+    def _every_s(self) -> float:
+        recent = self._recent
+        return (recent[-1].time_s - recent[0].time_s) / max(1, len(recent) - 1)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+TOLERANCE = SPEED_UNIT_TOLERANCE
+NOTED = 0.02
+"""A difference beyond this is told: the inertia is wrong by as much if it is the speed that is off."""
+SLOW_SHARE = 0.05
+"""Of the highest speed, at which a wrong unit is to be found: ten times that is half of it."""
+TOO_FAST = 2.0
+"""A shaft whose angle moves so many times faster than was asked for stays where it is until both have been compared."""
+FASTEST_SHARE = 0.7
+"""Of the highest speed, by the angle: beyond it nothing is compared any more."""
+HARMLESS_SHARE = 0.1
+EVERY_S, EVERY_CYCLES, SELDOM_S = 0.05, 3, 0.25
+"""How often the angle is read: this often, or each third cycle of a slower line, or at least so often."""
+LEVEL_EVERY_S = 0.25
+"""Of a level, which is longer."""
+TIMED_S = 0.02
+"""A reading that is known less well in time than this, and than is usual on its line, is none: the host was late."""
+SILENT = 5
+"""So many readings in a row without an answer: the drive tells no angle."""
+SEEN_S = 3.0
+"""What the operator is told of the reported speed is the mean over so long."""
+TURNS_WAITED = 3.2
+"""At the slow speed, for a counter of whole turns."""
+LONGEST_WAIT_S = 60.0
+BY_POSITION, BY_OPERATOR, BY_NAME, UNSEEN = "position", "operator", "--accept-speed-unit", "nobody"
+_WHERE = "unit of speed"
+_CHECK = "Check the speed scaling in the profile (unit of the speed's setpoint and of the reported speed)"
+_IF_RIGHT = "; if the speed is right, its position entry (counts per turn), or say position: null there"
+
+
+@dataclass(frozen=True)
+class SpeedWitness:
+    """Who says what he sees of the shaft where no angle tells. ``accepted``: the operator took the unit by name."""
+
+    confirm: ConfirmSpeed = nobody_sees
+    simulated: bool = False
+    accepted: bool = False
+    say: Say = field(default=lambda _text: None)
+
+
+def slow_speed(limits: MachineLimits, resolution_rad_s: float) -> float:
+    """Where the first look is taken, rad/s: a whole number of seconds a turn where that is easily watched."""
+    slow = max(SLOW_SHARE * limits.speed_max_rad_s, 5.0 * resolution_rad_s)
+    turn_s = 2.0 * math.pi / slow
+    return 2.0 * math.pi / math.floor(turn_s) if turn_s >= 4.0 else slow
+
+
+class _Paused(NamedTuple):
+    """Where the ramp waits, and what for: only until the angle is seen to follow (or for a full comparison)."""
+
+    speed_rad_s: float
+    until_compared: bool
+
+
+class SpeedUnitCheck:
+    """Of one run's stage 2: `ramp` to the first mean speed, `level` around its level, `conclude` behind it."""
+
+    def __init__(
+        self, loop: ControlLoop, limits: MachineLimits, assumptions: ControlAssumptions, resolution_rad_s: float,
+        witness: SpeedWitness,
+    ) -> None:
+        self._loop = loop
+        self._limits = limits
+        self._lag_s = 2.0 * assumptions.largest_speed_lag_s
+        self._resolution_rad_s = resolution_rad_s
+        self._witness = witness
+        self._slow_rad_s = slow_speed(limits, resolution_rad_s)
+        self._drive: Positioned | None = loop.drive if isinstance(loop.drive, Positioned) else None
+        self._angles = Angles()
+        self._next_s = -math.inf
+        self._every_s = 0.0
+        self._silent = 0
+        self._usual_half_s = math.inf              # of a reading's time
+        self._highest_rad_s = 0.0                  # asked for so far
+        self._done = False
+        self._lost = ""                            # why no angle tells
+        self._watching = False
+        self._wraps_rad: float | None = None
+
+    # -- the three parts -------------------------------------------------------------------------------------
+
+    def ramp(self, start_rad_s: float, end_rad_s: float, rate_rad_s2: float) -> None:
+        """To the first mean speed, in speed mode. Raises PreflightRefused for a wrong unit of speed."""
+        self._begin()
+        loop = self._loop
+        if abs(end_rad_s) < self._slow_rad_s:      # so slow that it would show nothing
+            self._pause(_Paused(math.copysign(self._slow_rad_s, end_rad_s or 1.0), True))
+        steps = max(1, round(abs(end_rad_s - start_rad_s) / rate_rad_s2 / loop.period_s))
+        span = end_rad_s - start_rad_s
+        passed = False
+        for step in range(1, steps + 1):
+            wanted = start_rad_s + span * step / steps
+            if not self._done and not passed and abs(wanted) > self._slow_rad_s:
+                passed = True
+                if not self._follows(self._slow_rad_s):
+                    self._pause(_Paused(math.copysign(self._slow_rad_s, wanted), self._coarse()))
+            self._cycle(wanted)
+            if not self._done and self._too_fast(wanted):
+                self._pause(_Paused(wanted, True))
+
+    def level(self) -> None:
+        """The level at the first mean speed begins: what is compared begins here."""
+        self._angles.restart()
+        if not self._wraps_soon():
+            self._every_s = max(LEVEL_EVERY_S, self._every_s)
+
+    def conclude(self, command: Command) -> None:
+        """Behind the level, before anything faster. Raises PreflightRefused."""
+        if not self._done:
+            ratio = self._angles.ratio() if self._watching and not self._lost else None
+            if ratio is None:
+                self._ask(command)
+            else:
+                self._judge(ratio, command)
+        self._end()
+
+    # -- watching --------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        self._every_s = max(EVERY_S, min(EVERY_CYCLES * self._loop.period_s, SELDOM_S))
+        reading = None if self._drive is None else self._read()
+        if reading is None:
+            self._lost = "the drive tells no angle of its shaft"
+            if self._witness.simulated or self._witness.accepted:
+                self._settle_without()
+            return
+        self._watching = True
+        self._loop.observer = self._observe
+
+    def _end(self) -> None:
+        self._done = True
+        self._watching = False
+        self._loop.observer = None
+
+    def _read(self) -> PositionReading | None:
+        assert self._drive is not None
+        return self._drive.read_position()
+
+    def _observe(self, command: Command, sample: Sample) -> None:
+        """After every cycle of the bench, whoever asked for it."""
+        angles = self._angles
+        angles.saw(sample)
+        self._highest_rad_s = max(self._highest_rad_s, abs(command.speed_rad_s))
+        if self._lost or sample.time_s < self._next_s - 0.5 * self._loop.period_s:
+            return
+        self._next_s = sample.time_s + self._every_s
+        reading = self._read()
+        if reading is None:
+            self._silent += 1
+            if self._silent >= SILENT:
+                self._lost = "the drive no longer tells the angle of its shaft"
+            return
+        self._silent = 0
+        self._usual_half_s = min(self._usual_half_s, reading.half_width_s)
+        if reading.half_width_s > max(TIMED_S, 2.0 * self._usual_half_s):
+            return                                 # nobody knows well enough when that was: the next one will do
+        angles.read(reading, max(self._highest_rad_s, abs(sample.speed_rad_s)))
+        self._wraps_rad = reading.wraps_rad
+        self._refuse_fastest(command, sample)
+
+    def _wraps_soon(self) -> bool:
+        """Would an angle that starts over be lost track of if it were read less often?"""
+        low_rad_s = max(self._highest_rad_s, self._slow_rad_s)
+        return self._wraps_rad is not None and 0.5 * self._wraps_rad < SEEN_FASTER * low_rad_s * LEVEL_EVERY_S
+
+    def _coarse(self) -> bool:
+        """Has the angle not been seen to move yet, or in steps too large to tell a speed?"""
+        count = self._angles.count_rad
+        return count is None or count > 0.5 * self._slow_rad_s * WINDOW_S
+
+    def _follows(self, wanted_rad_s: float) -> bool:
+        """Does the angle move, and no faster than it should?"""
+        if not self._watching or self._lost or self._angles.blind:
+            return False
+        seen = self._angles.speed_rad_s()
+        return seen is not None and not self._coarse() and seen[1] <= max(
+            TOO_FAST * abs(wanted_rad_s), HARMLESS_SHARE * self._limits.speed_max_rad_s
+        )
+
+    def _too_fast(self, wanted_rad_s: float) -> bool:
+        seen = self._angles.speed_rad_s()
+        harmless = HARMLESS_SHARE * self._limits.speed_max_rad_s
+        return seen is not None and seen[0] > max(TOO_FAST * abs(wanted_rad_s), harmless)
+
+    def _refuse_fastest(self, command: Command, sample: Sample) -> None:
+        seen, fastest = self._angles.speed_rad_s(), FASTEST_SHARE * self._limits.speed_max_rad_s
+        believed = max(abs(command.speed_rad_s), abs(sample.speed_rad_s))
+        if seen is None or seen[0] <= fastest or seen[0] <= TOO_FAST * believed:
+            return
+        self._refuse(
+            f"the shaft's angle moves at {seen[0]:.3g} rad/s or more, where {command.speed_rad_s:.3g} rad/s were asked"
+            f" for and {sample.speed_rad_s:.3g} are reported: the unit of speed is too small by a factor of about"
+            f" {seen[0] / believed:.2g}",
+            command,
+        )
+
+    # -- waiting, comparing, asking --------------------------------------------------------------------------
+
+    def _cycle(self, speed_rad_s: float) -> Sample:
+        return self._loop.cycle(Command(Mode.SPEED, speed_rad_s, 0.0))
+
+    def _waited(self, speed_rad_s: float, seconds: float) -> Iterator[None]:
+        for _ in range(self._loop.cycles(seconds)):
+            self._cycle(speed_rad_s)
+            yield
+
+    def _pause(self, paused: _Paused) -> None:
+        """Hold a slow speed until both have been compared; where that can't be, ask."""
+        speed_rad_s, command = paused.speed_rad_s, Command(Mode.SPEED, paused.speed_rad_s, 0.0)
+        if self._watching and not self._lost:
+            for _ in self._waited(speed_rad_s, self._lag_s):
+                if not paused.until_compared and self._follows(speed_rad_s):
+                    return
+            self._angles.restart()
+            turn_s = 2.0 * math.pi / abs(speed_rad_s)
+            longest_s = min(LONGEST_WAIT_S, max(2.0 * self._lag_s + 3.0, TURNS_WAITED * turn_s))
+            for _ in self._waited(speed_rad_s, longest_s):
+                if self._lost:
+                    break
+                ratio = self._angles.ratio()
+                if ratio is not None:
+                    self._judge(ratio, command)
+                    return
+            if self._too_fast(speed_rad_s):
+                self._refuse(f"the shaft's angle moves too fast for the {speed_rad_s:.3g} rad/s asked for", command)
+        self._ask(command)
+
+    def _judge(self, ratio: Ratio, command: Command) -> None:
+        """Compare with one. Raises PreflightRefused; an angle that stands still is put to the operator."""
+        value = ratio.value
+        if value == 0.0:
+            self._lost = f"the angle in {self._angles.where} doesn't move while the drive reports that the shaft turns"
+            if self._witness.simulated and not self._witness.accepted:
+                self._refuse(self._lost, command)
+            self._ask(command)
+            return
+        open_share = 0.5 * self._resolution_rad_s / max(abs(command.speed_rad_s), 1e-9) + ratio.half_width
+        off = abs(value - 1.0)
+        self._loop.guard.observer.compare_position(value)
+        if off > TOLERANCE + open_share:
+            self._contradicted(value, command)
+        else:
+            self._seen(BY_POSITION, value, self._angles.where)
+            self._log(f"the angle in {self._angles.where} moves {value:.4f} times as far as the reported speed says")
+            if off > NOTED + open_share:
+                self._witness.say(
+                    f"the angle in {self._angles.where} moves {100.0 * (value - 1.0):+.1f} % as against the reported"
+                    " speed: the inertia is off by as much if the speed is"
+                )
+        self._done = True
+
+    def _contradicted(self, value: float, command: Command) -> None:
+        """Too fast for the second mean speed: refused in any case; else unless the unit was taken by name."""
+        if value < 0.0:
+            what = f"the shaft's angle moves against the reported speed ({value:.3g} of its way): a sign is inverted"
+            step = "Is the sign of speed or position inverted (607Eh, encoder wiring, direction settings)?"
+        else:
+            way = f"too {'small' if value > 1.0 else 'large'} by a factor of {max(value, 1.0 / value):.3g}"
+            what = f"the shaft turns {value:.3g} times as fast as the drive reports: the unit of speed is {way}"
+            step = _CHECK + _IF_RIGHT
+        span = self._limits.speed_max_rad_s - self._limits.speed_min_rad_s
+        fastest = abs(value) * (self._limits.speed_min_rad_s + 0.7 * span)
+        if not self._witness.accepted or fastest > self._limits.speed_max_rad_s:
+            self._refuse(what, command, step)
+        self._seen(BY_NAME, value, self._angles.where)
+        self._loop.log.learn(speed_unit_accepted=True)
+        self._log(f"{what}; the unit was accepted by {BY_NAME}")
+        self._witness.say(f"{what}; the unit was accepted by {BY_NAME}")
+
+    def _refuse(self, what: str, command: Command, step: str = _CHECK + _IF_RIGHT) -> NoReturn:
+        """Raise PreflightRefused, behind one more cycle, which raises what is wrong with the drive or the host.
+
+        An angle that was read when a frozen host woke up, or of a drive that has stopped by itself since its last
+        sample, says nothing of a unit.
+        """
+        self._loop.observer = None
+        self._loop.cycle(command)
+        raise PreflightRefused(what, where=f"{_WHERE}, {self._angles.where}", next_step=step)
+
+    def _ask(self, command: Command) -> None:
+        """The operator says whether the shaft turns as fast as the drive reports. Raises PreflightRefused if not."""
+        loop, why = self._loop, self._lost or "the angle that the drive tells was not fit to be compared"
+        self._lost = why
+        if self._witness.accepted or self._witness.simulated:
+            self._settle_without()
+            return
+        loop.hold(command, self._lag_s)
+        seen = loop.hold(command, SEEN_S)
+        mean_rad_s = sum(sample.speed_rad_s for sample in seen) / len(seen)
+        if abs(mean_rad_s) < 0.2 * abs(command.speed_rad_s):
+            self._refuse(
+                f"the shaft doesn't follow a speed of {command.speed_rad_s:.3g} rad/s (reported: {mean_rad_s:.3g}), at"
+                f" which its unit could be looked at ({why})",
+                command,
+                f"Does the drive hold so low a speed? If its unit has been seen to be right, take it by {BY_NAME}",
+            )
+        self._log(f"{why}: the operator is asked whether the shaft turns at {mean_rad_s:.3f} rad/s")
+        loop.quiet = True
+        try:
+            self._witness.confirm(mean_rad_s, why, lambda: self._again(command))
+        finally:
+            loop.quiet = False
+        self._seen(BY_OPERATOR, None, "")
+        self._log(f"the operator saw the shaft turn at {mean_rad_s:.3f} rad/s")
+        self._done = True
+
+    def _again(self, command: Command) -> None:
+        self._loop.cycle(command)
+
+    def _settle_without(self) -> None:
+        """Nobody looks: a simulated drive, or one whose unit the operator has taken by name."""
+        accepted = self._witness.accepted
+        text = f"{self._lost}: the unit of speed was " + (f"accepted by {BY_NAME}" if accepted else "not looked at")
+        self._log(text)
+        self._witness.say(text)
+        self._seen(BY_NAME if accepted else UNSEEN, None, "")
+        self._done = True
+
+    def _seen(self, by: str, ratio: float | None, where: str) -> None:
+        self._loop.log.configure(speed_unit={"seen_by": by, "ratio": ratio, "where": where})
+
+    def _log(self, text: str) -> None:
+        self._loop.log.event(self._loop.now_s, "probe", text)
+
+
+def speed_warnings(run: Any) -> tuple[str, ...]:
+    """For the result, from the log's configuration: the same live and replayed."""
+    found = run.get("speed_unit")
+    if not isinstance(found, dict):
+        return ()
+    by, ratio = found.get("seen_by"), found.get("ratio")
+    if by == BY_NAME:
+        return (f"the unit of speed was accepted by {BY_NAME}, not looked at: J is wrong by as much as that unit is",)
+    if isinstance(ratio, int | float) and abs(ratio - 1.0) > NOTED:
+        return (
+            f"the drive's angle moves {100.0 * (ratio - 1.0):+.1f} % as against its reported speed: J is off by as much"
+            " if the speed is",
+        )
+    return ()

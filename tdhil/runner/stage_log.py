@@ -1,0 +1,135 @@
+"""Keeps the book of the stages: each is announced, shown, judged and written to the log, however it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from drivers import Counters, Drive, Preflight, Rehearsed, Telling
+from tdhil.recording import RunLog, Stage
+from tdhil.runner import preconditions
+from tdhil.runner.task import Display, Say
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What others did on the drive's bus in a run, for the log, whoever watches, and the result.
+
+
+def summary(drive: Drive) -> tuple[str, ...]:
+    """Of all of the run, a line each; nothing of a drive that doesn't notice."""
+    return drive.summary() if isinstance(drive, Telling) else ()
+
+
+def tell(drive: Drive, configure: Callable[..., None], say: Callable[[str], None]) -> None:
+    """At the end: into the log's configuration, and to whoever watches."""
+    if lines := summary(drive):
+        configure(others=list(lines))
+        for line in lines:
+            say(f"on the drive's bus: {line}")
+
+
+def stage_warnings(run: Mapping[str, Any]) -> tuple[str, ...]:
+    """For the result, from the log's configuration: the same live and replayed."""
+    found = run.get("others")
+    return tuple(f"on the drive's bus: {line}" for line in found) if isinstance(found, list) else ()
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How well a stage was seen: from what went wrong on the bus and in the loop while it ran. Pure.
+
+
+TOLERATED_LOSS = 0.01
+"""A stage with a larger share of cycles without feedback counts as degraded; a few are an ordinary scheduler's."""
+
+TOLERATED_LATE = 0.05
+"""The same for cycles that began late, and for feedback that came after its cycle or twice."""
+
+FEW_LATE = 10
+"""So many of these are nothing, in however short a stage."""
+
+
+def stage_quality(before: Counters, after: Counters) -> tuple[str, str]:
+    """(``ok`` or ``degraded``, what there is to say)."""
+    cycles = after.cycles - before.cycles
+    parts, outcome = [], "ok"
+    some_late = max(FEW_LATE, TOLERATED_LATE * cycles)
+    for count, tolerated, text in (
+        (after.missed - before.missed, TOLERATED_LOSS * cycles, "without feedback"),
+        (after.late - before.late, some_late, "with feedback that came late or twice"),
+        (after.overruns - before.overruns, some_late, "that began late"),
+    ):
+        if count:
+            parts.append(f"{count} of {cycles} cycles {text}")
+        if count > tolerated:
+            outcome = "degraded"
+    errors, passive = after.error_frames - before.error_frames, after.passive - before.passive
+    if errors:
+        parts.append(f"{errors} error frames" + (", the adapter was error-passive" if passive else ""))
+    if passive or errors > TOLERATED_LOSS * cycles:
+        outcome = "degraded"
+    return outcome, ", ".join(parts)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+class StageBook:
+    """Of one run. ``stages`` are those that have ended; ``preflight`` is set once there is one."""
+
+    def __init__(self, drive: Drive, log: RunLog, display: Display, say: Say) -> None:
+        self.stages: list[Stage] = []
+        self.preflight: Preflight | None = None
+        self._drive = drive
+        self._log = log
+        self._display = display
+        self._say = say
+
+    @contextmanager
+    def stage(self, name: str, expected_s: float) -> Iterator[None]:
+        """What runs inside is that stage. Raises what it raises: an aborted stage stays aborted."""
+        start_s = self._now_s()
+        before = self._drive.counters
+        try:
+            self._display.stage_started(name, expected_s)
+            self._announce(name)
+            yield
+        except BaseException as error:
+            preconditions.correct(error, self.preflight)
+            try:
+                self._end(Stage(name, start_s, self._now_s(), "aborted", _short(error)))
+            except Exception as also:  # the first cause stays the cause
+                error.add_note(f"and the end of the stage was not taken: {also}")
+            raise
+        after = self._drive.counters
+        if after.wall_jumps > before.wall_jumps:
+            self._log.event(self._now_s(), "clock",
+                            "the wall clock jumped: stamps on the bus moved, the times in this log did not")
+        if after.passive > before.passive:
+            self._tell_bus("the adapter is error-passive: check bit rate, termination and cable")
+        outcome, detail = stage_quality(before, after)
+        self._end(Stage(name, start_s, self._now_s(), outcome, detail))
+
+    def skip(self, name: str, why: str) -> None:
+        """A stage that this run doesn't need."""
+        self._display.stage_started(name, 0.0)
+        self._end(Stage(name, self._now_s(), self._now_s(), "skipped", why))
+
+    def _now_s(self) -> float:
+        return self._drive.clock.now_s()
+
+    def _tell_bus(self, text: str) -> None:
+        self._log.event(self._now_s(), "bus", text)
+        self._say(text)
+
+    def _announce(self, name: str) -> None:
+        """A drive may pass it on to a simulated peer, whose scripted faults wait for it."""
+        if isinstance(self._drive, Rehearsed):
+            self._drive.announce(name)
+
+    def _end(self, stage: Stage) -> None:
+        self.stages.append(stage)
+        self.stages[-1] = stage = self._log.stage(stage)
+        self._display.stage_ended(stage)
+
+
+def _short(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"[:300]

@@ -1,0 +1,158 @@
+"""What stage 5 will do, planned while the shaft turns; told, shown and logged before any of it is done."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from drivers import Command, LimitHit, Mode, PreflightRefused
+from tdhil.config import told_before_echo
+from tdhil.estimation import Samples
+from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
+from tdhil.runner.adaptive_duration import Decision, Enough
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.design import Knowledge, Noise, assumed_noise, measured_noise
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, tells_before_echo
+from tdhil.runner.guard import LIGHTEN, Guard
+from tdhil.runner.planning import Planned, as_followed, plan_acquisition
+from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.stages import Course, SpeedResult
+from tdhil.runner.task import Display, Say, Task
+
+MOST_WANDER = 0.8
+"""Of the speed window, that may be kept free of the excitation because a string under load takes the shaft there."""
+
+RESERVE_S = 30.0
+"""Of the run's time limit, kept for stage 4 and the transitions when stage 5 is planned."""
+
+
+class StagePlanner:
+    """Of one run, whose bench it keeps going while it reckons."""
+
+    def __init__(self, loop: ControlLoop, log: RunLog, display: Display, say: Say) -> None:
+        self._loop = loop
+        self._log = log
+        self._display = display
+        self._say = say
+
+    def plan(self, task: Task, speed: SpeedResult, mode: Mode, prior: LagPrior) -> Planned:
+        """From what stage 2 has shown; the shaft goes on as it turns meanwhile.
+
+        Raises LimitHit where no plan fits the shaft within its limits, PreflightRefused where it would have to brake
+        and must not, and whatever a cycle raises.
+        """
+        loop = self._loop
+        request, limits, model = task.request, task.limits, speed.model
+        # Where its torque is held, a string under load takes the shaft from its mean: that stays free at either end.
+        free = speed.wander_rad_s if mode is Mode.TORQUE else 0.0
+        width = limits.speed_max_rad_s - limits.speed_min_rad_s
+        if 2.0 * free >= MOST_WANDER * width:
+            raise LimitHit(
+                f"the speed window of {width:.3g} rad/s leaves no room for an excitation: {loop.guard.disturbed}",
+                where="plan of stage 5",
+                next_step=f"The shaft was stopped. {LIGHTEN}",
+            )
+        room = Guard.room(limits, task.assumptions, free)
+        if speed.swing is not None:     # it may hide how the shaft brakes, which then isn't asked for
+            room = replace(room, least_torque_nm=loop.guard.least_torque_nm)
+        course = speed.course if mode is Mode.SPEED else None
+        last = loop.last
+        speed_now = max(0.0, last.speed_rad_s) if last else 0.0
+        keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
+        left_s = loop.guard.left_s(loop.now_s) - RESERVE_S
+        assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
+        theta = Knowledge(assumed, prior).theta(model)
+
+        work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
+                       left_s, limits.winds_up)
+        try:
+            planned = loop.compute(work, keep)
+        except PlanRefused as error:
+            raise LimitHit(
+                f"no plan of stage 5 fits this shaft, as stages 2 and 3 have shown it: {error}",
+                where="plan of stage 5",
+                next_step=f"The shaft was stopped. {error.next_step}",
+            ) from error
+        plan = planned.plan
+        # Where the amplitude ends because no braking torque is had, rounding may leave it just below zero.
+        if mode is Mode.TORQUE and plan.torque_min_nm < -1e-9 * limits.torque_nm and loop.guard.no_braking:
+            raise PreflightRefused(
+                f"the plan needs braking torque, down to {plan.torque_min_nm:.0f} N·m: {loop.guard.no_braking}",
+                where="plan of stage 5",
+                next_step=loop.guard.to_brake,
+            )
+        if course is not None:
+            self._note_following(plan)
+        self._display.planned(plan)
+        self._log.event(
+            loop.now_s,
+            "plan",
+            f"{plan.kind} in {plan.mode} mode, {plan.duration_s:.0f} s, speed {plan.speed_min_rad_s:.2f} to "
+            f"{plan.speed_max_rad_s:.2f} rad/s, torque {plan.torque_min_nm:.0f} to {plan.torque_max_nm:.0f} N·m",
+        )
+        self._tell(planned.said())
+        if speed.swing is not None and not told_before_echo(request.kind) and tells_before_echo(limits.echo_s):
+            self._tell(
+                "the string below will drown some of these lines; --excitation prbs asks only for the time before an"
+                " echo, and tells more of J above a bit"
+            )
+        self._log.configure(plan=planned.plain())
+        if planned.stopping is not None:
+            self._log.configure(stopping=planned.stopping.plain() | {"decisions": []})
+        return planned
+
+    def enough(self, planned: Planned) -> Enough | None:
+        """Asks the scatter, where a tolerance was given; every decision is in the log before it is carried out."""
+        rule = planned.stopping
+        if rule is None:
+            return None
+        told: list[dict[str, Any]] = []
+
+        def note(decision: Decision) -> None:
+            told.append(decision.plain())
+            self._log.configure(stopping=rule.plain() | {"decisions": list(told)})
+            self._tell(decision.why)
+
+        assert isinstance(planned.plan, Plan)
+        return Enough(rule, planned.plan, lambda: self._log.recording(complete=True), note)
+
+    def _note_following(self, plan: Plan | SwingPlan) -> None:
+        """What slow sampling of a stepped setpoint may do to J is identification's to say; it needs these."""
+        following, ramp = plan.guess.following, plan.limits.acceleration_rad_s2
+        if math.isfinite(ramp):
+            self._tell(f"the drive's own speed ramp holds the shaft to {ramp:.3g} rad/s²; stage 5 stays below it")
+        if following is None:
+            self._tell("how the drive follows its setpoint was not clear; stage 5 takes it to follow at once")
+            return
+        self._log.learn(
+            stepped_setpoint=SteppedSetpoint(
+                self._loop.period_s, following.zero_s, following.first_s, following.second_s2
+            )
+        )
+
+    def _tell(self, text: str) -> None:
+        self._log.event(self._loop.now_s, "plan", text)
+        self._say(text)
+
+
+def _reckon(
+    request: ExcitationRequest,
+    mode: Mode,
+    room: MotionLimits,
+    model: RigGuess,
+    prior: LagPrior,
+    assumed: Noise,
+    steady: tuple[Samples, ...],
+    theta: FloatArray,
+    course: Course | None,
+    left_s: float,
+    winds_up: bool,
+) -> Planned:
+    """The arithmetic: plain data in and out, so that it can be done anywhere."""
+    known = Knowledge(measured_noise(steady, theta, assumed), prior, winds_up)
+    if course is None:
+        return plan_acquisition(request, mode.value, room, model, known, left_s)
+    seen, within = as_followed(model, room, course, known.speed_lag_s)
+    return plan_acquisition(request, mode.value, within, seen, known, left_s)

@@ -1,0 +1,267 @@
+"""Stage 5, acquire: the planned excitation, in torque mode or in speed mode.
+
+In torque mode the feed-forward of the plan moves the shaft and a slow host loop keeps its mean where it belongs;
+in speed mode the reference goes to the drive's own loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from drivers import Command, Mode, Sample
+from tdhil.recording import Excitation, Segment
+from tdhil.runner.adaptive_duration import Decision, Enough
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SwingPlan, Way
+from tdhil.runner.guard import kept_within
+from tdhil.runner.settings import ControlAssumptions, MachineLimits
+from tdhil.runner.stages.hold import MeanSpeedControl
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A slow small motion beside the excitation of speed mode, where the drive reports speed in coarse steps. Pure.
+#
+# Under speed control one period repeats the last, and so does the rounding of its reports to whole rpm, say: a
+# pattern that adds up on the excited lines instead of averaging out, and that no scatter between periods shows. A
+# triangle of a count or two, whose period has no whole ratio to the excitation's, makes every period round elsewhere.
+
+
+COUNTS = 2.0              # peak of the triangle, in counts of the reported speed
+COARSE_SHARE = 0.002      # of the window: finer counts than this need none
+MOST_SHARE = 0.015        # of the window: half of the margin that a plan keeps free at either end
+PERIODS = (math.sqrt(5.0) - 1.0) / 2.0
+"""Of the excitation's period: the golden ratio is the farthest from every whole ratio."""
+
+
+def dither_peak(resolution_rad_s: float, window_rad_s: float) -> float:
+    """Peak of the triangle, rad/s; 0 where the reported speed is fine enough."""
+    if resolution_rad_s < COARSE_SHARE * window_rad_s:
+        return 0.0
+    return min(COUNTS * resolution_rad_s, MOST_SHARE * window_rad_s)
+
+
+def dither(time_s: float, period_s: float, peak_rad_s: float) -> float:
+    """What is added to the speed setpoint, rad/s; begins at zero."""
+    turn = (time_s / (PERIODS * period_s) + 0.25) % 1.0
+    return peak_rad_s * (1.0 - 4.0 * abs(turn - 0.5))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+Reference = Callable[[float], tuple[float, float]]
+Announce = Callable[[Excitation], None]
+
+
+class Follower:
+    """Follows a reference for a while, one command a cycle."""
+
+    def __init__(
+        self,
+        loop: ControlLoop,
+        limits: MachineLimits,
+        mode: Mode,
+        control: MeanSpeedControl | None,
+        dither_rad_s: Callable[[float], float] | None = None,
+    ) -> None:
+        self._loop = loop
+        self._dither_rad_s = dither_rad_s
+        self._limits = limits
+        self._mode = mode
+        self._control = control
+        last = loop.last
+        self.time_s = last.time_s if last else loop.now_s
+        self.reported_rad_s = last.speed_rad_s if last else 0.0
+        self.wanted_rad_s = self.reported_rad_s
+
+    def follow(self, reference: Reference, duration_s: float) -> float:
+        """Run ``reference`` for a duration from the next cycle on; the control time at which it began."""
+        start_s = self.time_s + self._loop.period_s
+        # By time, not by a number of cycles: a slow line keeps its period on average at best.
+        self.follow_until(reference, start_s, start_s + max(duration_s, self._loop.period_s))
+        return start_s
+
+    def follow_until(self, reference: Reference, start_s: float, end_s: float) -> None:
+        """Go on with a reference that began at ``start_s`` up to the last cycle before ``end_s``."""
+        while self.time_s + 1.5 * self._loop.period_s < end_s:
+            self.step(reference, start_s)
+
+    def step(self, reference: Reference, start_s: float) -> None:
+        """One cycle of a reference that began at ``start_s``."""
+        self._step(*reference(self.time_s + self._loop.period_s - start_s))
+
+    def _step(self, speed_rad_s: float, torque_nm: float) -> None:
+        limits = self._limits
+        if self._control is not None:
+            torque_nm += self._control.update(speed_rad_s - self.reported_rad_s, self._loop.period_s)
+            torque_nm = max(torque_nm, self._loop.guard.least_torque_nm)
+        torque_nm = kept_within(torque_nm, -limits.torque_nm, limits.torque_nm)
+        lowest = -limits.speed_max_rad_s if limits.allow_reverse else 0.0
+        setpoint = speed_rad_s + (0.0 if self._dither_rad_s is None else self._dither_rad_s(self.time_s))
+        wanted = kept_within(setpoint, lowest, limits.speed_max_rad_s)
+        self.saw(self._loop.cycle(Command(self._mode, wanted, torque_nm)), wanted)
+
+    def saw(self, sample: Sample, wanted_rad_s: float) -> None:
+        """Where the shaft is, after a cycle in which it was to have this speed."""
+        self.time_s, self.reported_rad_s, self.wanted_rad_s = sample.time_s, sample.speed_rad_s, wanted_rad_s
+
+
+def run_acquire(
+    loop: ControlLoop,
+    limits: MachineLimits,
+    plan: Plan,
+    control: MeanSpeedControl | None,
+    announce: Announce,
+    enough: Enough | None = None,
+    speed_resolution_rad_s: float = 0.0,
+) -> None:
+    """Every segment of the plan, with its transitions. ``announce`` is told the excitation as it grows.
+
+    A segment is announced with its planned end when it begins, so that a log which ends in it can be read. With
+    ``enough`` the plan is a pilot: once it is through, the last segment goes on while the scatter is looked at, and if
+    more is wanted so many periods more at its mean speed and then, unless that is enough, settled anew at the others.
+    In speed mode a coarse ``speed_resolution_rad_s`` is dithered (`dither`).
+    """
+    begun_s = loop.now_s
+    dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
+    course = _Course(loop, plan, Follower(loop, limits, Mode(plan.mode), control, dither_rad_s), announce)
+    for index in range(len(plan.segments)):
+        course.go_to(index)
+    while enough is not None:
+        decision = course.ask(enough.question(loop.now_s - begun_s))
+        enough.decided(decision)
+        if decision.periods == 0:
+            break
+        course.go_on(decision.periods)
+        for index in () if decision.at_last else course.others():
+            course.go_to(index, decision.periods)
+    announce(course.excitation)
+
+
+def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[[float], float] | None:
+    peak_rad_s = dither_peak(resolution_rad_s, plan.limits.width_rad_s) if plan.mode == Mode.SPEED.value else 0.0
+    if peak_rad_s == 0.0:
+        return None
+    period_s = plan.segments[0].reference.period_s
+    return lambda time_s: dither(time_s - begun_s, period_s, peak_rad_s)
+
+
+class _Course:
+    """Where stage 5 is: the segments that are done, and the one that the shaft is in."""
+
+    def __init__(self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce) -> None:
+        self._loop, self._plan, self._follower, self._announce = loop, plan, follower, announce
+        self._done: list[Segment] = []
+        self._index = 0
+        self._segment: PlannedSegment = plan.segments[0]
+        self._start_s = 0.0
+
+    @property
+    def excitation(self) -> Excitation:
+        """What has been run."""
+        return Excitation(self._plan.kind, self._plan.mode, tuple(self._done))
+
+    def go_to(self, index: int, counted: int | None = None) -> None:
+        """To another mean speed, and through its segment: as planned, or with so many periods that count."""
+        segment, follower = self._plan.segments[index], self._follower
+        if counted is not None:
+            segment = replace(segment, periods=segment.settle_periods + counted)
+        transition = self._plan.transition(follower.wanted_rad_s, index)
+        follower.follow(transition.reference, transition.duration_s)
+        self._tell(segment.recorded(follower.time_s + self._loop.period_s))
+        self._start_s = follower.follow(segment.reference.reference, segment.duration_s)
+        self._index, self._segment = index, segment
+        self._done.append(self._recorded())
+
+    def ask(self, work: Callable[[], Decision]) -> Decision:
+        """What has been run is announced; then the segment goes on for as long as the look takes (real time)."""
+        self._announce(self.excitation)
+        reference = self._segment.reference.reference
+        return self._loop.compute_while(work, lambda: self._follower.step(reference, self._start_s))
+
+    def go_on(self, periods: int) -> None:
+        """So many periods more where the shaft is."""
+        self._done.pop()
+        segment = self._segment = replace(self._segment, periods=self._segment.periods + periods)
+        self._tell(segment.recorded(self._start_s))
+        self._follower.follow_until(segment.reference.reference, self._start_s, self._start_s + segment.duration_s)
+        self._done.append(self._recorded())
+
+    def others(self) -> list[int]:
+        """The other mean speeds, the one before first."""
+        return [index for index in reversed(range(len(self._plan.segments))) if index != self._index]
+
+    def _tell(self, planned: Segment) -> None:
+        self._announce(Excitation(self._plan.kind, self._plan.mode, (*self._done, planned)))
+
+    def _recorded(self) -> Segment:
+        # The last period is whole when its last sample is there: the one before the cycle that would begin the next.
+        return self._segment.recorded(self._start_s, self._follower.time_s + 1.5 * self._loop.period_s)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Stage 5 with torque pulses or coast-down: every way of the plan, and the calm behind each.
+#
+# A powered way follows its reference like any other motion. Coasting is zero torque until the shaft, by what the
+# reports may be late, is about to reach its lower speed; time alone would have to trust the rough friction.
+
+
+_LONGEST = 2.0            # times the planned coasting, at most: friction may have been taken too high
+
+
+def run_swings(
+    loop: ControlLoop,
+    limits: MachineLimits,
+    plan: SwingPlan,
+    control: MeanSpeedControl | None,
+    assumptions: ControlAssumptions,
+    announce: Announce,
+) -> None:
+    """All of it. Raises what the bench raises. The slow loop stands still while the shaft coasts."""
+    announce(Excitation(plan.kind, plan.mode))
+    follower = Follower(loop, limits, Mode(plan.mode), control)
+    follower.follow(_calm(plan.start_rad_s, plan.guess), CALM_S)
+    for way in plan.ways:
+        if way.coasting:
+            _coast(loop, way, follower, assumptions)
+            follower.follow(_calm(way.to_rad_s, plan.guess), CALM_S)
+        else:
+            follower.follow(way.reference, way.duration_s + CALM_S)
+
+
+def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float, float]]:
+    steady = speed_rad_s, guess.steady_torque_nm(speed_rad_s)
+    return lambda _: steady
+
+
+def _coast(loop: ControlLoop, way: Way, follower: Follower, assumptions: ControlAssumptions) -> None:
+    """Zero torque down to the lower speed."""
+    command = Command(Mode.TORQUE, way.to_rad_s, 0.0)
+    # The report comes late, so that the shaft is slower already: by half of the longest plausible lag, say.
+    late_s = 0.5 * assumptions.largest_speed_lag_s + loop.period_s
+    stop_at = way.to_rad_s + late_s * way.guess.steady_torque_nm(way.to_rad_s) / way.guess.inertia_kg_m2
+    end_s = follower.time_s + _LONGEST * way.duration_s
+    while follower.time_s < end_s:
+        sample = loop.cycle(command)
+        follower.saw(sample, way.to_rad_s)
+        if sample.fresh and sample.speed_rad_s <= stop_at:
+            return
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+def run_plan(
+    loop: ControlLoop,
+    limits: MachineLimits,
+    plan: Plan | SwingPlan,
+    control: MeanSpeedControl | None,
+    assumptions: ControlAssumptions,
+    announce: Announce,
+    enough: Enough | None,
+    speed_resolution_rad_s: float,
+) -> None:
+    """Run a plan of either family, whatever the excitation. Raises what the bench raises."""
+    if isinstance(plan, SwingPlan):
+        run_swings(loop, limits, plan, control, assumptions, announce)
+    else:
+        run_acquire(loop, limits, plan, control, announce, enough, speed_resolution_rad_s)

@@ -1,0 +1,425 @@
+"""The braking probe: one small braking torque at low speed, before any motion in torque mode depends on its sign.
+
+The sign probe of stage 1 only ever pushes forward. A drive (or a profile) that takes a torque setpoint below zero for
+one above it passes that, and would speed the shaft up where it is to brake it. Stage 2 ends at its lower speed; there,
+at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`braking_pulse`), and the answer awaited
+(`braking_answer`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
+torque below zero through in torque mode.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from drivers import Command, Mode, PreflightRefused, Sample
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.guard import LIGHTEN
+from tdhil.runner.settings import ControlAssumptions, MachineLimits
+from tdhil.runner.stages.speed import SpeedResult, mean_speeds, ramp_speed
+from tdhil.runner.stages.steady import CALM_S, WINDOW_S, calm_string, swing_of, trace, wait_until_steady, widest
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The braking probe's pulse: how strong, how long, and what it would do on a drive that takes it the wrong way. Pure.
+#
+# A drive that reads its signed torque setpoint as unsigned takes every braking torque for full torque forward. So one
+# braking torque is tried at low speed, for a time that is fixed before it begins: nothing that the drive reports has
+# to come in time for it to end. With
+#
+#     ω_0 the speed, T_f the torque that flows (friction), T_b the braking torque, t_p how long it is asked for,
+#     t_r the reaction time, from a setpoint to the torque that follows it (a lost frame included), J_min the smallest
+#     inertia that the rough one leaves open, T_lim the torque limit that the drive has confirmed in preflight,
+#
+# the most that a misreading can do is T_lim forward from the first braking setpoint until the one behind the last has
+# acted, with no friction at all, and that must stay well below the speed limit:
+#
+#     ω_0 + T_lim / J_min · (t_p + t_r)  ≤  ω_0 + 0.8 (ω_max − ω_0)                                            (up)
+#
+# On a drive that takes it rightly the shaft must stay in its window, and turn forward; t_c is a cycle, which may be
+# lost:
+#
+#     ω_0 − (T_f + T_b) / J_min · (t_p + t_c)  ≥  ω_0 − 0.6 (ω_0 − ω_min)                                      (down)
+#
+# and the guard, which looks t_r and the longest reporting lag τ ahead, must not see it turn back: T_b is what
+# friction holds at standstill, or less than would take the shaft there in t_r + τ. The change by which the answer is
+# known, (T_f + T_b) t_p / J, must stand out of the noise. A shaft for which that can't be had gets no braking torque
+# at all, in the whole run.
+#
+# With a drill string the torque comes down and up again on ramps, of torque_ramp_nm_s or, where friction would bring
+# the shaft to rest meanwhile, as slow as half a second each allows. That ramp is for letting go of trapped torque for
+# good; here the string keeps its twist, since the shaft neither stops nor turns back.
+#
+# A string that swings pushes and brakes on its own. It is damped beforehand; what is left of its swing, at its worst
+# for all of the pulse, counts as noise of the speed, and where that hides the answer there is no pulse.
+
+
+UP_SHARE, DOWN_SHARE = 0.8, 0.6
+SEEN_SHARE = 0.06
+"""The change of speed that is aimed at, as a share of the speed limit, where noise asks for no more."""
+
+LEAST_SHARE = 0.15
+"""Of the torque limit, that the braking torque should have at least; else it is as strong as what flows."""
+
+LEAST_FLOWING_SHARE = 0.5
+"""Of what flows. With less, a drive that takes the size without the sign would slow down almost as much."""
+
+HELD_SHARE = 0.9
+"""Of the friction that holds the shaft at standstill."""
+
+LONGEST_S = 1.0
+STRING_EDGE_S = 0.5
+CLEAR, WANTED_CLEAR = 2.0, 6.0
+"""The change must be, and should be, so many times what counts as noise."""
+
+STRING_CLEAR = 4.0
+"""The change of torque must be so many times what the string swings by: until the answer is heard, it pushes for about
+twice as long as the pulse."""
+
+
+CLEAR_WANDER, WANTED_WANDER = 1.25, 2.0
+"""As `CLEAR` and `WANTED_CLEAR`, of what a restless string takes the shaft from its mean by while nobody holds it:
+noise of the report is gone in a cycle, and this goes on until the answer is heard."""
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """``torque_nm`` is the braking torque, below zero. ``cycles`` at it, and the ``edge_cycles`` of each ramp.
+
+    ``slowing_rad_s``: by how much it slows the shaft. ``highest_rad_s``: what the wrong reading would come to at worst.
+    """
+
+    flowing_nm: float
+    torque_nm: float
+    cycles: int
+    edge_cycles: int
+    slowing_rad_s: float
+    highest_rad_s: float
+
+    def setpoints_nm(self) -> list[float]:
+        """One a cycle, from the first below what flows to the one that is what flows again."""
+        step_nm = (self.torque_nm - self.flowing_nm) / (self.edge_cycles + 1)
+        edge = [self.flowing_nm + step_nm * (n + 1) for n in range(self.edge_cycles)]
+        return [*edge, *[self.torque_nm] * self.cycles, *reversed(edge), self.flowing_nm]
+
+
+@dataclass(frozen=True)
+class NoPulse:
+    """Why there is none that is safe and can be seen, and what would help."""
+
+    why: str
+    next_step: str
+
+
+@dataclass(frozen=True)
+class Before:
+    """The steady rotation that it starts from: what flows (less its offset), and what counts as noise of a report.
+
+    ``swing_nm``: what a drill string on it may push with meanwhile, either way; ``wander_rad_s``: how far it takes the
+    shaft from its mean.
+    """
+
+    speed_rad_s: float
+    flowing_nm: float
+    speed_noise_rad_s: float
+    swing_nm: float = 0.0
+    wander_rad_s: float = 0.0
+
+
+def plan_pulse(
+    limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions, before: Before, period_s: float
+) -> Pulse | NoPulse:
+    """The pulse for this shaft on this line (``period_s`` a cycle)."""
+    lightest = assumptions.smallest_inertia_share * model.inertia_kg_m2
+    reaction_s = assumptions.reaction_s
+    room_up = UP_SHARE * (limits.speed_max_rad_s - before.speed_rad_s)
+    down = before.speed_rad_s - max(0.0, limits.speed_min_rad_s)
+    room_down = min(DOWN_SHARE * down, down - before.wander_rad_s)
+    ahead_s = reaction_s + assumptions.largest_speed_lag_s
+    slowest = before.speed_rad_s - room_down - before.speed_noise_rad_s
+    turning_back_nm = slowest * lightest / ahead_s - model.steady_torque_nm(before.speed_rad_s)
+    braking_nm = min(
+        max(before.flowing_nm, LEAST_SHARE * limits.torque_nm),
+        max(HELD_SHARE * model.coulomb_nm, turning_back_nm),
+        limits.probe_torque_nm,
+        limits.torque_nm,
+    )
+    change_nm = before.flowing_nm + braking_nm
+    up_s = room_up * lightest / limits.torque_nm - reaction_s
+    down_s = room_down * lightest / change_nm - period_s
+    if up_s < period_s:
+        bearable_nm = room_up * lightest / (reaction_s + period_s)
+        return NoPulse(
+            f"{limits.torque_nm:g} N·m, the torque limit, could speed a shaft of {model.inertia_kg_m2:.3g} kg·m² up to "
+            f"its limit within {reaction_s + period_s:.2g} s, should the drive take a braking torque the wrong way",
+            f"Lower limits.torque_nm to {bearable_nm:.2g} N·m or less, if that moves the shaft; else use --mode speed",
+        )
+    if down_s < period_s:
+        return NoPulse(
+            f"friction and {braking_nm:.3g} N·m would take the shaft out of its window within {2.0 * period_s:.2g} s",
+            "Use --mode speed",
+        )
+    wanted_rad_s = max(
+        SEEN_SHARE * limits.speed_max_rad_s, WANTED_CLEAR * before.speed_noise_rad_s,
+        WANTED_WANDER * before.wander_rad_s,
+    )
+    wanted_s = wanted_rad_s * model.inertia_kg_m2 / change_nm
+    longest_s = min(max(wanted_s, period_s), LONGEST_S, up_s, down_s)
+    edge = _edge_cycles(limits, change_nm, min(up_s, down_s), period_s)
+    # Both edges together change as much as the full torque would in the time of one, and both may be misread.
+    cycles = max(1, min(_whole(longest_s, period_s) - edge, _whole(up_s, period_s) - 2 * edge))
+    slowing = change_nm * (cycles + edge) * period_s / model.inertia_kg_m2
+    if slowing < CLEAR * before.speed_noise_rad_s or braking_nm < LEAST_FLOWING_SHARE * before.flowing_nm:
+        return NoPulse(
+            f"{braking_nm:.3g} N·m would slow the shaft by {slowing:.2g} rad/s, too little to tell",
+            "Use --mode speed, or raise limits.probe_torque_nm",
+        )
+    exposed_s = (cycles + 2 * edge) * period_s + reaction_s
+    if change_nm < STRING_CLEAR * before.swing_nm:
+        return NoPulse(
+            f"the string swings by ±{before.swing_nm:.3g} N·m, which would hide what {change_nm:.3g} N·m do to it",
+            "Use --mode speed, or let the string come to rest: lift the bit off bottom, or take weight off it",
+        )
+    if slowing < CLEAR_WANDER * before.wander_rad_s:
+        return NoPulse(
+            f"the string takes the shaft ±{before.wander_rad_s:.2g} rad/s from its mean, which would hide the"
+            f" {slowing:.2g} rad/s that {braking_nm:.3g} N·m would slow it by",
+            f"{LIGHTEN}; a lower limits.torque_nm would allow a longer one; or use --mode speed",
+        )
+    highest = before.speed_rad_s + limits.torque_nm / lightest * exposed_s
+    return Pulse(before.flowing_nm, -braking_nm, cycles, edge, slowing, highest)
+
+
+def _edge_cycles(limits: MachineLimits, change_nm: float, longest_s: float, period_s: float) -> int:
+    """Cycles of a ramp down or up, none without a string; both, and a cycle between, take ``longest_s`` at most."""
+    if not limits.winds_up:
+        return 0
+    wanted_s = change_nm / limits.torque_ramp_nm_s if limits.torque_ramp_nm_s > 0.0 else STRING_EDGE_S
+    room = (_whole(longest_s, period_s) - 1) // 2
+    return max(0, min(round(min(wanted_s, STRING_EDGE_S) / period_s), room))
+
+
+def _whole(time_s: float, period_s: float) -> int:
+    """Whole cycles in a time."""
+    return math.floor(time_s / period_s + 1e-9)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a shaft answers to a braking torque: slower, faster or nothing. Pure; fed with one sample a cycle.
+#
+# The reported speed decides, since it is the shaft itself: whichever comes first, half of the expected change
+# downwards or as much upwards. Reported torque and torque demand are quicker: should either clearly rise, it is over
+# at once. That they fall proves nothing about the shaft, and is no condition.
+#
+# A demand that is reported may still be that of the speed loop when torque mode has just been displayed: it counts once
+# it has followed the switch, or would have had to.
+
+
+MEAN_S = 0.05
+"""What is looked at is a mean over this time, or one sample where that is longer."""
+
+SPEED_SHARE, ANSWER_TORQUE_SHARE = 0.5, 0.3
+"""Of the expected change, that counts as one."""
+
+NOISE_SD, NOISE_QUANTA = 3.0, 1.5
+"""Standard deviations, or quanta, that don't count as a change."""
+
+
+class Answer(Enum):
+    """Which way the shaft went."""
+
+    SLOWER = "slower"
+    FASTER = "faster"
+
+
+def speed_noise_rad_s(steady: Sequence[Sample], resolution_rad_s: float) -> float:
+    """What counts as noise of the reported speed, rad/s, from samples of steady rotation."""
+    return max(NOISE_SD * float(trace(steady).speed_rad_s.std()), NOISE_QUANTA * resolution_rad_s)
+
+
+class Listener:
+    """Compares what comes with the steady rotation before; ``why`` says in words what was seen last."""
+
+    def __init__(
+        self, pulse: Pulse, steady: Sequence[Sample], period_s: float, reaction_s: float = 0.0,
+        demand_nm: float | None = None,
+    ) -> None:
+        """``steady``: in speed mode; ``demand_nm``: what was seen last of the drive's demand, in torque mode."""
+        before = trace(steady)
+        self.before_rad_s = self.speed_rad_s = float(before.speed_rad_s.mean())
+        self.before_nm = self.torque_nm = self.lowest_nm = float(before.torque_nm.mean())
+        self._pulse = pulse
+        self._change_rad_s = SPEED_SHARE * pulse.slowing_rad_s
+        change_nm = ANSWER_TORQUE_SHARE * (pulse.flowing_nm - pulse.torque_nm)
+        self._rise_nm = max(change_nm, NOISE_SD * float(before.torque_nm.std()))
+        followed = demand_nm is not None and demand_nm < pulse.flowing_nm + self._rise_nm
+        self._demand_deaf = 0 if followed else math.ceil(reaction_s / period_s - 1e-9)
+        self._recent: deque[tuple[float, float]] = deque(maxlen=max(1, round(MEAN_S / period_s)))
+        self.why = ""
+
+    def hear(self, sample: Sample) -> Answer | None:
+        """None as long as it isn't clear."""
+        if not sample.fresh:
+            return None
+        self._recent.append((sample.speed_rad_s, sample.torque_nm))
+        self.speed_rad_s, self.torque_nm = (float(mean) for mean in np.mean(self._recent, axis=0))
+        self.lowest_nm = min(self.lowest_nm, self.torque_nm)
+        full = len(self._recent) == self._recent.maxlen
+        self.why = f"the speed went from {self.before_rad_s:.3f} to {self.speed_rad_s:.3f} rad/s"
+        if full and self.speed_rad_s >= self.before_rad_s + self._change_rad_s:
+            return Answer.FASTER
+        if full and self.torque_nm >= self.before_nm + self._rise_nm:
+            self.why = f"the reported torque went from {self.before_nm:.1f} to {self.torque_nm:.1f} N·m"
+            return Answer.FASTER
+        demand = sample.torque_demand_nm
+        risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
+        # Deaf at most until the reaction time is over, and no longer than until the demand has once been what flows.
+        self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
+        if risen and self._demand_deaf <= 0:
+            self.why = f"the drive's torque demand went from {self._pulse.flowing_nm:.1f} to {demand:.1f} N·m"
+            return Answer.FASTER
+        if full and self.speed_rad_s <= self.before_rad_s - self._change_rad_s:
+            return Answer.SLOWER
+        return None
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+NOT_YET = "no braking torque has been tried yet"
+"""Why the guard lets none through until then."""
+
+TRIES = 2
+STEADY_S = 1.0
+RAMP_S = 5.0
+"""Slowing down over the whole window takes so long, or longer on a heavy shaft."""
+
+TORQUE_SHARE = 0.25
+"""Of the torque limit, that slowing down may take."""
+
+
+def slow_speed(limits: MachineLimits, wander_rad_s: float = 0.0) -> float:
+    """The speed of the probe, rad/s: the lower one of stage 2 if the shaft turns forward there.
+
+    Above a string that takes the shaft ``wander_rad_s`` from its mean so much faster, up to the middle of the window.
+    """
+    low_rad_s, high_rad_s = mean_speeds(limits)
+    if low_rad_s <= 0.0:
+        return 0.25 * limits.speed_max_rad_s
+    middle_rad_s = 0.5 * (limits.speed_min_rad_s + limits.speed_max_rad_s)
+    return min(low_rad_s + wander_rad_s, middle_rad_s, high_rad_s)
+
+
+def slow_down(
+    loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, assumptions: ControlAssumptions,
+    speed_resolution_rad_s: float,
+) -> tuple[tuple[Sample, ...], SpeedResult]:
+    """Down to the probe's speed in speed mode; the samples of steady rotation there, and what is known by now.
+
+    Of a drill string so many samples that its swing shows in them, and averages out where it gets no calmer. Where it
+    swings further than it did before, the probe is tried so much faster. LimitHit if there is no steady rotation.
+    """
+    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    target = _ramp_to(loop, limits, speed, speed.high.speed_rad_s)
+    if not limits.winds_up:
+        command = Command(Mode.SPEED, target, 0.0)
+        loop.hold(command, assumptions.largest_speed_lag_s)
+        settled = wait_until_steady(loop, command, target, tolerance, timeout_s=60.0)
+        return tuple(settled[-loop.cycles(STEADY_S) :]), speed
+    while True:
+        calmed = calm_string(loop, limits, target, tolerance)
+        restless = calmed.swing.restless(limits)
+        if restless:
+            speed = replace(speed, swing=widest(speed.swing, calmed.swing))
+            loop.guard.disturbed = speed.disturbed
+        if slow_speed(limits, speed.wander_rad_s) <= target + tolerance:
+            return tuple(calmed.samples[-loop.cycles(2.0 * WINDOW_S if restless else CALM_S) :]), speed
+        target = _ramp_to(loop, limits, speed, target)
+
+
+def _ramp_to(loop: ControlLoop, limits: MachineLimits, speed: SpeedResult, from_rad_s: float) -> float:
+    """To the probe's speed, in speed mode; that speed, rad/s."""
+    target = slow_speed(limits, speed.wander_rad_s)
+    span = limits.speed_max_rad_s - max(0.0, limits.speed_min_rad_s)
+    rate = min(span / RAMP_S, TORQUE_SHARE * limits.torque_nm / speed.model.inertia_kg_m2)
+    ramp_speed(loop, from_rad_s, target, rate)
+    return target
+
+
+def probe_braking(
+    loop: ControlLoop, limits: MachineLimits, model: RigGuess, assumptions: ControlAssumptions,
+    steady: Sequence[Sample],
+    flowing_nm: float, speed_resolution_rad_s: float, where: str, wander_rad_s: float = 0.0,
+) -> list[Sample]:
+    """Try it, in torque mode, at ``flowing_nm`` and the speed of ``steady``; its samples, none if no pulse is safe.
+
+    Where neither slower nor faster is clear it is tried once more. Raises PreflightRefused, naming ``where``, on any
+    answer but a slower shaft; and what the bench raises.
+    """
+    samples: list[Sample] = []
+    unclear = ""
+    # Under speed control the torque shows what the string does; behind the switch it is what is commanded.
+    swing_nm = swing_of(steady, loop.period_s).torque_nm if limits.winds_up else 0.0
+    steady = steady[-loop.cycles(STEADY_S) :]
+    for _ in range(TRIES):
+        noise = speed_noise_rad_s(steady, speed_resolution_rad_s)
+        before = Before(float(trace(steady).speed_rad_s.mean()), flowing_nm, noise, swing_nm, wander_rad_s)
+        pulse = plan_pulse(limits, model, assumptions, before, loop.period_s)
+        if isinstance(pulse, NoPulse):
+            loop.guard.no_braking, loop.guard.to_brake = pulse.why, pulse.next_step
+            loop.log.event(loop.now_s, "probe", f"no braking torque in this run: {pulse.why}")
+            return samples
+        demand_nm = None if loop.last is None else loop.last.torque_demand_nm
+        listener = Listener(pulse, steady, loop.period_s, assumptions.reaction_s, demand_nm)
+        answer, seen = _try(loop, pulse, listener, before.speed_rad_s, assumptions)
+        samples += seen
+        if answer is Answer.FASTER:
+            raise PreflightRefused(
+                f"the drive takes a negative torque for a positive one: on {pulse.torque_nm:.1f} N·m {listener.why}",
+                where=f"braking probe, {where}",
+                next_step="Is the setpoint signed there as the profile says, in two's complement, and does no direction"
+                " bit turn it round? Correct the profile or the drive's settings",
+            )
+        if answer is Answer.SLOWER:
+            loop.log.event(
+                loop.now_s, "probe",
+                f"the shaft slowed down: {listener.why}, reported torque down to {listener.lowest_nm:.1f} N·m",
+            )
+            return samples
+        unclear = f"{-pulse.torque_nm:.1f} N·m did not slow it by {pulse.slowing_rad_s:.2f} rad/s: {listener.why}"
+        steady = samples[-loop.cycles(STEADY_S / 2.0) :]
+    raise PreflightRefused(
+        f"a braking torque does not slow the shaft: {unclear}",
+        where=f"braking probe, {where}",
+        next_step="Does the drive take the size of the setpoint without its sign, or does a ramp or limit of its own"
+        " hold the torque back? Check type and direction in the profile and the drive's manual",
+    )
+
+
+def _try(
+    loop: ControlLoop, pulse: Pulse, listener: Listener, speed_rad_s: float, assumptions: ControlAssumptions
+) -> tuple[Answer | None, list[Sample]]:
+    """The pulse in full, then what flowed before it until the reports have caught up; cut short by a faster shaft."""
+    loop.log.event(
+        loop.now_s, "probe",
+        f"braking torque tried at {speed_rad_s:.2f} rad/s: {pulse.torque_nm:.1f} N·m for"
+        f" {pulse.cycles * loop.period_s:.2g} s (taken for full torque forward it would lead to"
+        f" {pulse.highest_rad_s:.2f} rad/s at most)",
+    )
+    loop.guard.no_braking = ""
+    answer: Answer | None = None
+    seen: list[Sample] = []
+    late = loop.cycles(2.0 * assumptions.largest_speed_lag_s + assumptions.reaction_s)
+    for torque_nm in (*pulse.setpoints_nm(), *[pulse.flowing_nm] * late):
+        seen.append(loop.cycle(Command(Mode.TORQUE, speed_rad_s, torque_nm)))
+        heard = listener.hear(seen[-1])
+        if heard is Answer.FASTER:
+            return heard, seen
+        answer = answer or heard
+        if answer is not None and torque_nm == pulse.flowing_nm:
+            break
+    return answer, seen

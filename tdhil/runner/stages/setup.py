@@ -1,0 +1,101 @@
+"""Stage 1, setup: offsets at standstill, and the sign probe. Connecting and preflight come before it.
+
+The probe ramps torque until the shaft moves or the probe limit is reached, forward only and over a bounded
+travel: a drive whose torque and speed disagree in sign would run away in torque mode, and this is where it shows
+at walking pace.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from drivers import Command, LimitHit, Mode, PreflightRefused
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.settings import MachineLimits
+from tdhil.runner.stages.steady import trace
+
+STANDSTILL_S = 1.0
+RAMP_S = 5.0
+"""The probe torque is reached after this long, if nothing moves before."""
+TORQUE_SEEN_S = 0.5
+"""A torque beyond the probe's, in speed mode, ends it after so long; and the torque is off again after so long, s."""
+
+
+def measure_offsets(loop: ControlLoop, limits: MachineLimits) -> tuple[float, float]:
+    """Mean reported speed and torque at standstill. Raises PreflightRefused if the shaft turns."""
+    held = trace(loop.hold(Command(Mode.SPEED, 0.0, 0.0), STANDSTILL_S))
+    if len(held.time_s) == 0:
+        raise PreflightRefused("no feedback from the drive", where="TPDO1", next_step="Is the node operational?")
+    speed = float(held.speed_rad_s.mean())
+    if abs(speed) > 0.01 * limits.speed_max_rad_s:
+        raise PreflightRefused(
+            f"the shaft already turns at {speed:.3f} rad/s", where="setup", next_step="Let it come to rest first"
+        )
+    return speed, float(held.torque_nm.mean())
+
+
+def probe_sign(loop: ControlLoop, limits: MachineLimits, mode: Mode, speed_resolution_rad_s: float) -> float | None:
+    """Move the shaft a little; the torque at which it moved (None in speed mode).
+
+    Raises PreflightRefused when it turns the wrong way, or not at all.
+    """
+    threshold_rad_s = max(6.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    recent: deque[float] = deque(maxlen=loop.cycles(0.1))
+    travel_rad = 0.0
+    torque_nm = speed_rad_s = 0.0
+    strained = 0
+    before_s = loop.enable(mode, Command(mode, 0.0, 0.0)).time_s
+    for step in range(1, loop.cycles(RAMP_S + 2.0) + 1):
+        share = min(1.0, step * loop.period_s / RAMP_S)
+        if mode is Mode.TORQUE:
+            torque_nm = share * limits.probe_torque_nm
+        else:
+            speed_rad_s = share * 0.1 * limits.speed_max_rad_s
+        try:
+            sample = loop.cycle(Command(mode, speed_rad_s, torque_nm))
+        except LimitHit as error:
+            if recent and sum(recent) < 0.0:
+                raise _wrong_way(sum(recent) / len(recent)) from error
+            raise
+        recent.append(sample.speed_rad_s)
+        mean_rad_s = sum(recent) / len(recent)
+        travel_rad += sample.speed_rad_s * (sample.time_s - before_s)
+        before_s = sample.time_s
+        if mean_rad_s < -threshold_rad_s:
+            raise _wrong_way(mean_rad_s)
+        if mean_rad_s > threshold_rad_s:
+            return torque_nm if mode is Mode.TORQUE else None
+        # In speed mode the drive itself raises the torque: no further than the probe may go.
+        if mode is Mode.SPEED and abs(sample.torque_nm) > limits.probe_torque_nm > 0.0:
+            strained = strained + 1
+            if strained >= loop.cycles(TORQUE_SEEN_S):
+                break
+        if abs(travel_rad) > limits.probe_travel_rad:
+            _end_torque(loop, mode)
+            raise PreflightRefused(
+                f"the shaft travelled {travel_rad:.2f} rad without a clear direction", where="sign probe",
+                next_step="Is the speed signal noisy, or its scale wrong?",
+            )
+    _end_torque(loop, mode)
+    raise PreflightRefused(
+        f"the shaft did not move up to {limits.probe_torque_nm:g} N·m"
+        if mode is Mode.TORQUE
+        else f"the shaft did not follow a speed of {speed_rad_s:.3f} rad/s",
+        where="sign probe",
+        next_step="Is the brake released? Else raise limits.probe_torque_nm in rig.yaml"
+        if mode is Mode.TORQUE
+        else "Is the brake released, the drive's enable there, and its lowest speed below this one?",
+    )
+
+
+def _end_torque(loop: ControlLoop, mode: Mode) -> None:
+    """Command zero torque before the stop: its speed control would go on with the torque that flows."""
+    if mode is Mode.TORQUE:
+        loop.hold(Command(Mode.TORQUE, 0.0, 0.0), TORQUE_SEEN_S)
+
+
+def _wrong_way(speed_rad_s: float) -> PreflightRefused:
+    return PreflightRefused(
+        f"the shaft turned backwards ({speed_rad_s:.3f} rad/s) on a forward command", where="sign probe",
+        next_step="The sign of speed or torque is inverted: check encoder wiring and the drive's direction settings",
+    )

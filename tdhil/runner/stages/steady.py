@@ -1,0 +1,244 @@
+"""When a speed counts as steady, and what is then read off it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers import Command, LimitHit, Mode, Sample
+from tdhil.estimation import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
+from tdhil.recording import FloatArray, Level
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.settings import MachineLimits
+from tdhil.runner.string_release import SwingDamper
+
+
+@dataclass(frozen=True)
+class SteadyLevel:
+    """Means over a stretch of steady speed, with their scatter; SI at the motor shaft."""
+
+    level: Level
+    speed_rad_s: float
+    torque_nm: float
+    speed_sd_rad_s: float
+    torque_sd_nm: float
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Samples as arrays (N,), only the fresh ones."""
+
+    time_s: FloatArray
+    speed_rad_s: FloatArray
+    torque_nm: FloatArray
+
+
+def trace(samples: Iterable[Sample]) -> Trace:
+    """Arrays of the fresh samples."""
+    rows = [(sample.time_s, sample.speed_rad_s, sample.torque_nm) for sample in samples if sample.fresh]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return Trace(table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy())
+
+
+def steady_level(samples: Sequence[Sample]) -> SteadyLevel:
+    """What a stretch of steady speed says."""
+    held = trace(samples)
+    return SteadyLevel(
+        Level(float(held.time_s[0]), float(held.time_s[-1])),
+        float(held.speed_rad_s.mean()),
+        float(held.torque_nm.mean()),
+        float(held.speed_rad_s.std()),
+        float(held.torque_nm.std()),
+    )
+
+
+BLOCK_S = 0.5
+BLOCKS = 4
+
+
+def wait_until_steady(
+    loop: ControlLoop, command: Command, target_rad_s: float, tolerance_rad_s: float, timeout_s: float
+) -> list[Sample]:
+    """Hold a command until the mean speed of four half-second blocks in a row is at the target.
+
+    Raises LimitHit when that doesn't happen in time.
+    """
+    seen: list[Sample] = []
+    good = 0
+    for _ in range(max(BLOCKS, round(timeout_s / BLOCK_S))):
+        block = loop.hold(command, BLOCK_S)
+        seen += block
+        mean = sum(sample.speed_rad_s for sample in block) / len(block)
+        good = good + 1 if abs(mean - target_rad_s) <= tolerance_rad_s else 0
+        if good >= BLOCKS:
+            return seen
+    torque_nm = sum(sample.torque_nm for sample in block) / len(block)
+    torque, helps = loop.guard.torque_told(torque_nm, block[-1].limit_active)
+    raise LimitHit(
+        f"the speed did not settle at {target_rad_s:.3f} rad/s within {timeout_s:g} s (last {mean:.3f} rad/s);"
+        f" {torque}",
+        where=f"at {loop.now_s:.1f} s",
+        next_step=helps,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A drill string is steady when it swings no more, not when the shaft has its speed: behind a stiff speed loop waves run
+# up and down for minutes while the top hardly shows it. So the top yields (`SwingDamper`) until the torque is calm. A
+# string under load is never quite calm: its bit disturbs. Once yielding takes nothing more away, what is left is taken
+# for what there is, unless it is a swing that feeds itself: a bit that sticks and slips, on which nothing can be
+# measured.
+
+
+CALM_SHARE = 0.02
+"""Of the torque limit, within which the torque of a calm string swings, either way of its mean."""
+
+CALM_S = 6.0
+"""For so long: half a swing of a string that swings in 12 s."""
+
+WINDOW_S = 12.0
+NO_CALMER = 0.75
+"""Of what it was over the time before: a swing that is still above this share gets no smaller."""
+
+STICK_SLIP_TORQUE_SHARE = 0.5
+"""Of the mean torque: a swing that feeds itself goes so far. Where ζ is known, that tells it (`STICK_SLIP_SHARE`)."""
+
+MOST_CALMING_S = 120.0
+
+
+@dataclass(frozen=True)
+class Swing:
+    """How a string swings: half of peak to peak; ``period_s`` 0 and ``regular`` 0 where nothing repeats."""
+
+    torque_nm: float
+    speed_rad_s: float
+    period_s: float
+    regular: float
+
+    @property
+    def told(self) -> str:
+        """In words."""
+        every = f" every {self.period_s:.1f} s" if self.regular >= STICK_SLIP_REGULAR else ""
+        return (
+            f"the string below swings by ±{self.torque_nm:.0f} N·m{every}, the top by ±{self.speed_rad_s:.2f} rad/s,"
+            " and gets no calmer"
+        )
+
+    def restless(self, limits: MachineLimits) -> bool:
+        """Does it swing further than a calm string?"""
+        return self.torque_nm > CALM_SHARE * limits.torque_nm
+
+
+@dataclass(frozen=True)
+class Calmed:
+    """``setpoints_rad_s``: one a sample. ``swing``: what is left of it. ``damper`` goes on with it."""
+
+    samples: list[Sample]
+    setpoints_rad_s: list[float]
+    swing: Swing
+    damper: SwingDamper
+
+
+def widest(*swings: Swing | None) -> Swing | None:
+    """Whichever takes the shaft furthest; None where there is none."""
+    return max((one for one in swings if one is not None), key=lambda one: one.speed_rad_s, default=None)
+
+
+def swing_of(samples: Sequence[Sample], period_s: float) -> Swing:
+    """From means over half a second, so that noise of the reports doesn't count."""
+    width = max(1, round(BLOCK_S / 2.0 / period_s))
+    seen = trace(samples)
+    blocks = len(seen.time_s) // width
+    if blocks < 2:
+        return Swing(0.0, 0.0, 0.0, 0.0)
+    torque, speed = (part[-blocks * width:].reshape(blocks, width).mean(axis=1)
+                     for part in (seen.torque_nm, seen.speed_rad_s))
+    after_s, regular = repeats(torque, width * period_s)
+    return Swing(0.5 * float(np.ptp(torque)), 0.5 * float(np.ptp(speed)), after_s, regular)
+
+
+def hold_damped(loop: ControlLoop, damper: SwingDamper, seconds: float) -> tuple[list[Sample], list[float]]:
+    """The samples of a time in which the top yields, and the speeds that were asked for."""
+    samples: list[Sample] = []
+    setpoints: list[float] = []
+    for _ in range(loop.cycles(seconds)):
+        last = loop.last
+        setpoints.append(damper.step(last.torque_nm if last is not None and last.fresh else math.nan))
+        samples.append(loop.cycle(Command(Mode.SPEED, setpoints[-1], 0.0)))
+    return samples, setpoints
+
+
+def calm_string(loop: ControlLoop, limits: MachineLimits, target_rad_s: float, tolerance_rad_s: float) -> Calmed:
+    """Turn at a speed, yielding, until the string is calm or gets no calmer.
+
+    Raises LimitHit where the mean speed isn't had in time, and where the string sticks and slips.
+    """
+    damper = SwingDamper(limits.torque_nm, limits.speed_max_rad_s, target_rad_s, loop.period_s)
+    samples: list[Sample] = []
+    setpoints: list[float] = []
+    calm, window = loop.cycles(CALM_S), loop.cycles(WINDOW_S)
+    for _ in range(round(MOST_CALMING_S / BLOCK_S)):
+        seen, asked = hold_damped(loop, damper, BLOCK_S)
+        samples += seen
+        setpoints += asked
+        if len(samples) < calm:
+            continue
+        last = swing_of(samples[-calm:], loop.period_s)
+        there = abs(_mean_speed(samples[-calm:]) - target_rad_s) <= tolerance_rad_s
+        if there and last.torque_nm <= CALM_SHARE * limits.torque_nm:
+            return Calmed(samples, setpoints, last, damper)
+        if len(samples) < 2 * window:
+            continue
+        now = swing_of(samples[-window:], loop.period_s)
+        before = swing_of(samples[-2 * window : -window], loop.period_s)
+        if now.torque_nm >= NO_CALMER * before.torque_nm:
+            left = swing_of(samples[-2 * window :], loop.period_s)
+            mean_nm = float(trace(samples[-2 * window :]).torque_nm.mean())
+            if _feeds_itself(left, limits.wave_impedance_nm_s_rad, target_rad_s, mean_nm):
+                raise stick_slip(left, target_rad_s, f"at {loop.now_s:.1f} s")
+            # The top yields to what comes up, so that its mean is as far off as that may take it.
+            allowed_rad_s = max(2.0 * tolerance_rad_s, 0.5 * left.speed_rad_s)
+            if abs(_mean_speed(samples[-window:]) - target_rad_s) <= allowed_rad_s:
+                loop.log.event(
+                    loop.now_s, "string",
+                    f"the string gets no calmer at {target_rad_s:.2f} rad/s: its torque goes ±{left.torque_nm:.0f} N·m",
+                )
+                return Calmed(samples, setpoints, left, damper)
+    left = swing_of(samples[-2 * window :], loop.period_s)
+    mean = _mean_speed(samples[-window:])
+    torque, helps = loop.guard.torque_told(
+        float(trace(samples[-window:]).torque_nm.mean()), samples[-1].limit_active, left.restless(limits)
+    )
+    raise LimitHit(
+        f"the string did not settle at {target_rad_s:.3f} rad/s within {MOST_CALMING_S:g} s (mean speed {mean:.3f}"
+        f" rad/s, torque swinging by ±{left.torque_nm:.0f} N·m"
+        + (f" every {left.period_s:.1f} s" if left.regular >= STICK_SLIP_REGULAR else "") + f"); {torque}",
+        where=f"at {loop.now_s:.1f} s",
+        next_step=helps,
+    )
+
+
+def _feeds_itself(swing: Swing, wave_impedance_nm_s_rad: float, speed_rad_s: float, mean_nm: float) -> bool:
+    """Does a swing that repeats go as far as that of a bit that sticks and slips?"""
+    by_speed_nm = STICK_SLIP_SHARE * wave_impedance_nm_s_rad * speed_rad_s
+    return swing.regular >= STICK_SLIP_REGULAR and swing.torque_nm >= (
+        by_speed_nm or STICK_SLIP_TORQUE_SHARE * abs(mean_nm)
+    )
+
+
+def stick_slip(swing: Swing, speed_rad_s: float, where: str) -> LimitHit:
+    """The error of a string whose swing feeds itself."""
+    return LimitHit(
+        f"the string sticks and slips at {speed_rad_s:.2f} rad/s: its torque swings by ±{swing.torque_nm:.0f} N·m every"
+        f" {swing.period_s:.1f} s, the top by ±{swing.speed_rad_s:.2f} rad/s, and yielding does not end it",
+        where=where,
+        next_step="Lift the bit off bottom, take weight off it, or raise limits.speed_min_rad_s above the speed at"
+        " which it turns steadily",
+    )
+
+
+def _mean_speed(samples: Sequence[Sample]) -> float:
+    return math.fsum(sample.speed_rad_s for sample in samples) / len(samples)

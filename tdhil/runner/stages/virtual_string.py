@@ -1,0 +1,183 @@
+"""Stage 5 with a virtual string: the drive in torque mode, string, bit and speed controller in the host; or the drive
+in its own speed loop, the string's torque through its torque offset.
+
+What may end it beside the guard, which holds speed, torque and time as ever: a shaft that does not do what its torque
+says, a loop that swings more than string and bit can, and energy that the loop's own errors put into the shaft. However
+it ends, the string's torque goes first: on the regular way it is faded out, and in every other case the stop's first
+cycle commands none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from drivers import Command, LimitHit, Mode, PreflightRefused, Sample
+from tdhil.runner.control_loop import ControlLoop
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.guard import kept_within
+from tdhil.runner.settings import MachineLimits
+from tdhil.runner.stages.steady import wait_until_steady
+from tdhil.soft_torque import (
+    RPM,
+    EvaluationCase,
+    HostLoop,
+    Phase,
+    Program,
+    Window,
+    program_for,
+    refuse_untrue,
+)
+
+STRANGE_SHARE, STRANGE_COUNTS, STRANGE_SDS = 0.015, 8.0, 6.0
+"""Of the speed limit, counts of the reported speed, and standard deviations of its noise: by the most of these the
+report may be away from what the observer expects. A lag or an inertia that is believed wrongly by a tenth makes it a
+fifth of the first; a lost load or torque is seen in a tenth of a second."""
+RMS_S = 5.0
+ENERGY_SHARE = 0.05
+"""Of what the string holds as the bit breaks away, that may have been put in."""
+SAME_RIG = 0.5
+"""By so much, or by what it is uncertain by, stage 2's rough inertia may differ from the result's."""
+TORQUE_SHARE, RAMP_S = 0.25, 5.0
+"""In the drive's own loop the first set speed is gone to with this share of the torque limit, or all of the window in
+so long."""
+RESERVE_S = 20.0
+BEFORE_S = 150.0
+"""Stages 1 to 4, about: what is left of the time limit is looked at before anything moves."""
+
+_TOLD = {
+    Phase.HOLD: "virtual string: coupled; the bit shall stick and slip",
+    Phase.RAMP: "virtual string: ramp of the set speed",
+    Phase.STEADY: "virtual string: the bit turns",
+    Phase.RELEASED: "virtual string: the bit is off bottom",
+}
+
+Keep = Callable[[Sequence[float]], None]
+
+
+def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, foresight_s: float) -> Program:
+    """The virtual string's course within the limits. Raises PreflightRefused or EvaluationRefused, and says why."""
+    if limits.load != "none":
+        raise PreflightRefused(
+            f"a virtual string was asked for, and load is {limits.load}", where="load in rig.yaml",
+            next_step="Evaluate before the string is below the drive",
+        )
+    refuse_untrue(case, period_s)
+    window = Window(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
+    program = program_for(case, window)
+    needed_s = program.longest_s + BEFORE_S + RESERVE_S
+    if needed_s > limits.time_s:
+        raise PreflightRefused(
+            f"the virtual string takes up to {needed_s:.0f} s, and the run may take {limits.time_s:g} s",
+            where="limits.time_s in rig.yaml", next_step="Raise it",
+        )
+    return program
+
+
+def refuse_other_rig(case: EvaluationCase, model: RigGuess) -> None:
+    """PreflightRefused where the shaft that turns can't be the one of the result."""
+    ratio = model.inertia_kg_m2 / case.rig.inertia_kg_m2
+    open_by = 1.0 + max(SAME_RIG, 3.0 * model.inertia_rel_error)
+    if not 1.0 / open_by <= ratio <= open_by:
+        raise PreflightRefused(
+            f"the result says {case.rig.inertia_kg_m2:.4g} kg·m² at the motor, and this shaft has about "
+            f"{model.inertia_kg_m2:.4g}",
+            where="--controller and --result", next_step="Identify this rig, and tune with what comes of it",
+        )
+
+
+def go_to(
+    loop: ControlLoop, limits: MachineLimits, model: RigGuess, speed_rad_s: float, speed_resolution_rad_s: float
+) -> None:
+    """Ramp to that speed in speed mode, and settle there. Raises what the bench raises, LimitHit if it doesn't."""
+    begun = max(0.0, loop.last.speed_rad_s) if loop.last is not None else 0.0
+    rate = min(TORQUE_SHARE * limits.torque_nm / model.inertia_kg_m2, limits.speed_max_rad_s / RAMP_S)
+    steps = loop.cycles(abs(speed_rad_s - begun) / rate)
+    for step in range(1, steps + 1):
+        loop.cycle(Command(Mode.SPEED, begun + (speed_rad_s - begun) * step / steps, 0.0))
+    tolerance = max(2.0 * speed_resolution_rad_s, 0.01 * limits.speed_max_rad_s)
+    wait_until_steady(loop, Command(Mode.SPEED, speed_rad_s, 0.0), speed_rad_s, tolerance, timeout_s=90.0)
+
+
+def run_virtual_string(
+    loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program, keep: Keep,
+    say: Callable[[str], None], resolution_rad_s: float, noise_rad_s: float,
+) -> None:
+    """All of the course, from steady rotation at its first speed; ``keep`` gets a row a cycle.
+
+    ``resolution_rad_s``, ``noise_rad_s``: of the reported speed, a count and a standard deviation.
+    Raises LimitHit, and what the bench raises.
+    """
+    host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm,
+                    case.own_loop)
+    ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program, resolution_rad_s, noise_rad_s)
+    last = loop.last
+    speed = last.speed_rad_s if last is not None else program.start_rad_s * ratio
+    torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
+    host.begin(speed, torque)
+    if case.own_loop:
+        torque = 0.0
+        loop.guard.allow_torque_offset(limits.torque_nm)
+    phase: Phase = host.phase
+    clamped = False
+    while host.phase is not Phase.DONE:
+        wanted = kept_within(host.set_rad_s * ratio, 0.0, limits.speed_max_rad_s)
+        command = Command(Mode.SPEED, wanted, 0.0, torque) if case.own_loop else Command(Mode.TORQUE, wanted, torque)
+        sample = loop.cycle(command)
+        torque = host.step(sample.time_s, sample.speed_rad_s if sample.fresh else None)
+        keep(host.row)
+        watch.see(host, sample)
+        if (host.clamped or (case.own_loop and sample.limit_active)) and not clamped:
+            clamped = True
+            loop.log.event(loop.now_s, "limits", "virtual string: the torque limit acts; it is faded out")
+            say("the torque limit acts: the virtual string is faded out, and there will be no result")
+            host.cut()
+        if host.phase is not phase:
+            phase = host.phase
+            text = _TOLD.get(phase, "")
+            if phase is Phase.TRIAL:
+                text = f"virtual string: does the bit end turning at {host.set_rad_s / RPM:.1f} rpm?"
+            if text:
+                loop.log.event(loop.now_s, "string", text)
+                say(text)
+
+
+class _Watch:
+    """Looks at every cycle of the loop, and raises LimitHit."""
+
+    def __init__(
+        self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program,
+        resolution_rad_s: float, noise_rad_s: float,
+    ) -> None:
+        assert case.string.bit is not None
+        self._observer = loop.guard.observer
+        self._strange_rad_s = max(
+            STRANGE_SHARE * limits.speed_max_rad_s, STRANGE_COUNTS * resolution_rad_s, STRANGE_SDS * noise_rad_s
+        )
+        self._gear = case.rig.gear_ratio
+        self._peak_nm = program.peak_nm
+        wound_up_j = 0.5 * case.string.bit.static_nm**2 / case.string.stiffness_nm_rad
+        self._most_j = ENERGY_SHARE * wound_up_j
+        self._squares: deque[float] = deque(maxlen=loop.cycles(RMS_S))
+        self._sum = 0.0
+
+    def see(self, host: HostLoop, sample: Sample) -> None:
+        where = f"virtual string at {sample.time_s:.3f} s"
+        self._observer.expected(host.innovation_rad_s * self._gear, self._strange_rad_s, sample)
+        if not host.put_in_j <= self._most_j:
+            raise LimitHit(
+                f"the loop's errors have put {host.put_in_j:.0f} J into the shaft", where=where,
+                next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+            )
+        if len(self._squares) == self._squares.maxlen:
+            self._sum -= self._squares[0]
+        self._squares.append(host.net_nm**2)
+        self._sum += self._squares[-1]
+        if len(self._squares) == self._squares.maxlen:
+            rms = math.sqrt(max(0.0, self._sum) / len(self._squares))
+            if rms > self._peak_nm:
+                raise LimitHit(
+                    f"the loop swings by {rms:.0f} N·m rms at the main shaft, more than string and bit could",
+                    where=where, next_step="The shaft was stopped. Are the lags those of the result? Identify again",
+                )

@@ -1,0 +1,61 @@
+"""Standstill, the one definition that the stop and the release use. Pure.
+
+A shaft stands still once all of these have held for long enough:
+
+- the reported speed is zero within its resolution,
+- the position, where the drive reports one, does not move,
+- no report contradicts another, or the contradiction has been refuted (`observer.Observer.believable`); then the torque
+  must be too small to keep the shaft turning,
+- the drive shows a state in which the shaft may stand still: a quick stop or speed mode that reports standstill, or no
+  torque. A statusword that is no state shows nothing.
+
+"Long enough" is the time in which every lag runs out, and in which friction stops what the reports can hide.
+"""
+
+from __future__ import annotations
+
+from drivers import PowerState, Sample
+from tdhil.runner.observer import Observer
+
+NO_TORQUE = (PowerState.OFF, PowerState.READY, PowerState.FAULT)
+"""States without torque on the shaft (CiA 402-2, state machine). Not ready to switch on is none of them: feedback that
+is all zero shows it too."""
+
+
+class Standstill:
+    """Follows the feedback of one stop. ``settle_s``: least duration; ``longest_gap_s``: longest gap in feedback."""
+
+    def __init__(self, observer: Observer, at_rest_rad_s: float, settle_s: float, longest_gap_s: float) -> None:
+        self._observer = observer
+        self._at_rest_rad_s = at_rest_rad_s
+        self._settle_s = settle_s
+        self._longest_gap_s = longest_gap_s
+        self._since_s: float | None = None
+        self._heard_s = 0.0
+
+    @property
+    def settle_s(self) -> float:
+        """How long standstill must be reported, s: a shaft whose motion was never reported gets time to run out."""
+        return max(self._settle_s, self._observer.blind_s, self._observer.unseen_s)
+
+    def quiet(self, sample: Sample) -> bool:
+        """Whether speed and position are zero in this sample, and may be believed."""
+        observer = self._observer
+        return (
+            abs(observer.speed_rad_s(sample)) <= self._at_rest_rad_s
+            and observer.angle_quiet(self._at_rest_rad_s)
+            and observer.believable
+        )
+
+    def see(self, sample: Sample) -> bool:
+        """Take one sample; true once the shaft has been at rest for long enough."""
+        # A single lost frame does not undo what the others showed; a longer gap does.
+        gap_s, self._heard_s = sample.time_s - self._heard_s, sample.time_s
+        if not self.quiet(sample):
+            self._since_s = None
+            return False
+        if self._since_s is None or gap_s > self._longest_gap_s:
+            self._since_s = sample.time_s
+            return False
+        shown = sample.standstill or sample.state in NO_TORQUE
+        return shown and sample.time_s - self._since_s >= self.settle_s

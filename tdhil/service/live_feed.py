@@ -1,0 +1,177 @@
+"""What a page sees of a run as it goes: its log, read as it grows, and its status. Nothing here reaches the run.
+
+One feed a run, however many look. Whoever is too slow to take it is let go, and comes again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+import numpy as np
+
+from tdhil.recording import LogNews, LogTail
+from tdhil.service.run_state import Status
+
+EVERY_S: Final = 0.1
+HEARTBEAT_S: Final = 0.5
+SPACING_S: Final = 0.04                # control time between two samples that are shown
+MOST: Final = 12_000                   # samples kept for who comes late; beyond, every other one goes
+EVENTS: Final = 500
+WAITING: Final = 100                   # messages for one viewer, some ten seconds' worth
+
+Viewer = asyncio.Queue[dict[str, Any] | None]
+
+
+class Picture:
+    """The run so far, thin enough to be drawn. Pure."""
+
+    def __init__(self) -> None:
+        self.samples = np.empty((0, 3))
+        self.events: list[dict[str, Any]] = []
+        self.stages: list[dict[str, Any]] = []
+        self.limits: dict[str, float | None] | None = None
+        self.simulated: bool | None = None
+        self.stepped = False
+        self.epoch_ns = 0
+        self.last_s: float | None = None
+        self.arrived_s: float | None = None      # monotonic
+        self._spacing_s = SPACING_S
+        self._next_s = -math.inf
+
+    def take(self, news: LogNews, at_s: float) -> dict[str, Any]:
+        """Put in what came; what of it a viewer is to be told."""
+        shown: dict[str, Any] = {}
+        if len(news.samples):
+            self.last_s, self.arrived_s = float(news.samples[-1, 0]), at_s
+            self.epoch_ns = self.epoch_ns or news.epoch_ns
+            if len(kept := self._thinned(news.samples)):
+                self.samples = np.concatenate((self.samples, kept))
+                shown["samples"] = columns(kept)
+                if len(self.samples) > MOST:
+                    self.samples, self._spacing_s = self.samples[::2], 2.0 * self._spacing_s
+        if news.events:
+            shown["events"] = [{"time_s": one.time_s, "kind": one.kind, "text": one.text} for one in news.events]
+            self.events = (self.events + shown["events"])[-EVENTS:]
+        if news.stages:
+            shown["stages"] = [asdict(one) for one in news.stages]
+            self.stages += shown["stages"]
+        if news.configuration is not None:
+            run = news.configuration.get("run", {})
+            self.stepped = run.get("stepped") is True
+            limits = (run.get("bench") or {}).get("limits")
+            if isinstance(limits, dict) and limits != self.limits:
+                self.limits = shown["limits"] = limits
+        return shown
+
+    def whole(self) -> dict[str, Any]:
+        """For who comes now."""
+        return {"samples": columns(self.samples), "events": self.events, "stages": self.stages, "limits": self.limits}
+
+    def age_s(self, wall_s: float, mono_s: float) -> float | None:
+        """Of the latest sample; in stepped time, which runs ahead of the clock, since it arrived."""
+        if self.last_s is None or self.arrived_s is None:
+            return None
+        if self.stepped or not self.epoch_ns:
+            return max(0.0, mono_s - self.arrived_s)
+        return max(0.0, wall_s - (self.epoch_ns / 1e9 + self.last_s))
+
+    def _thinned(self, samples: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        kept = []
+        for row, time_s in enumerate(samples[:, 0].tolist()):
+            if time_s >= self._next_s or time_s < self._next_s - 2.0 * self._spacing_s:
+                kept.append(row)
+                self._next_s = time_s + self._spacing_s
+        return samples[kept]
+
+
+def columns(samples: np.ndarray[Any, Any]) -> list[list[float | None]]:
+    """[time], [speed], [torque], rounded to what a picture shows; None for what is no number."""
+    return [
+        [round(value, 5) if math.isfinite(value) else None for value in column] for column in samples.T.tolist()
+    ]
+
+
+class Feed:
+    """Of one run. `watch` gives a queue that begins with everything so far; None in it: come again."""
+
+    def __init__(self, path: Path, status: Callable[[], Status]) -> None:
+        self._tail = LogTail(path)
+        self._read_status = status
+        self.picture = Picture()
+        self.status: Status | None = None
+        self.viewers: set[Viewer] = set()
+        self._task: asyncio.Task[None] | None = None
+        self._stamp: object = None
+
+    def watch(self) -> Viewer:
+        queue: Viewer = asyncio.Queue(WAITING)
+        status = None if self.status is None else self.status.plain()
+        queue.put_nowait(self._dated({"type": "hello", **self.picture.whole(), "status": status}))
+        self.viewers.add(queue)
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._run())
+        return queue
+
+    def leave(self, queue: Viewer) -> None:
+        self.viewers.discard(queue)
+
+    async def _run(self) -> None:
+        told_s = 0.0
+        while self.viewers:
+            news, status = await anyio.to_thread.run_sync(self._look)
+            shown = self.picture.take(news, time.monotonic())
+            if status is not None and status != self.status:
+                self.status = status
+                shown["status"] = status.plain()
+            now_s = time.monotonic()
+            if shown or now_s - told_s >= HEARTBEAT_S:
+                told_s = now_s
+                self._tell(self._dated({"type": "news", **shown}))
+            await asyncio.sleep(0.0 if news.more else EVERY_S)
+
+    def _look(self) -> tuple[LogNews, Status | None]:
+        try:
+            status = self._read_status()
+        except Exception:              # being written, or gone: the next look tells
+            status = None
+        return self._tail.read(), status
+
+    def _dated(self, message: dict[str, Any]) -> dict[str, Any]:
+        age_s = self.picture.age_s(time.time(), time.monotonic())
+        return {**message, "age_s": None if age_s is None else round(age_s, 3), "time_s": self.picture.last_s}
+
+    def _tell(self, message: dict[str, Any]) -> None:
+        for queue in tuple(self.viewers):
+            try:
+                queue.put_nowait(message)
+            except asyncio.QueueFull:
+                self.leave(queue)
+                while not queue.empty():
+                    queue.get_nowait()
+                queue.put_nowait(None)
+
+
+class Feeds:
+    """Those that somebody looks at, and some that somebody has looked at."""
+
+    def __init__(self, most: int = 20) -> None:
+        self._feeds: dict[str, Feed] = {}
+        self._most = most
+
+    def of(self, run: str, make: Callable[[], Feed]) -> Feed:
+        feed = self._feeds.pop(run, None) or make()
+        self._feeds[run] = feed
+        for old in [one for one, feed in self._feeds.items() if not feed.viewers][: -self._most]:
+            del self._feeds[old]
+        return feed
+
+    @property
+    def viewers(self) -> int:
+        return sum(len(feed.viewers) for feed in self._feeds.values())

@@ -1,0 +1,204 @@
+"""What stands between HTTP and the service: who may knock, what was sent, and an error of the tree as an answer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import fields
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from urllib.parse import urlsplit
+
+import anyio
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from drivers import CommunicationLost, DataFileError, PreflightRefused
+from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
+from tdhil.service.access import Access, token_in
+from tdhil.service.run_channel import Refused
+from tdhil.service.run_state import (
+    Conflict,
+    NoRoom,
+    NotAllowed,
+    NotLoggedIn,
+    NotReacting,
+    NotThere,
+    Told,
+    TooManyTries,
+)
+from tdhil.service.schemas import OPTIONS, ErrorView, Route, adapter, plain
+
+if TYPE_CHECKING:
+    from tdhil.service.fleets import Fleets
+    from tdhil.service.store import Store
+    from tdhil.service.supervisor import Supervisor
+
+T = TypeVar("T")
+BODY_LIMIT: Final = 64 * 1024
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
+"""Of every page: nothing from elsewhere, and no script or style in the page itself."""
+_NONE: Final[Mapping[str, str]] = MappingProxyType({})
+_BROKEN_HINT: Final = "The terminal of tdhil serve says more"
+
+
+class Site(Protocol):
+    """What an answer has to do with: the service behind the web, and what the web lends."""
+
+    store: Store
+    supervisor: Supervisor
+    access: Access
+    fleets: Fleets
+    logins: anyio.CapacityLimiter
+
+    async def work(self, what: str, run: str | None, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """A piece of arithmetic, one at a time: its document. Raises Refused."""
+
+    async def file(self, request: Request, name: str, media: str) -> Response:
+        """A file of the run, as a download. Raises NotThere."""
+
+
+Answer = Callable[[Site, Request, Any], Awaitable[Any]]
+
+
+class Guard:
+    """Before everything: a known host, no other site's page, and the headers of every answer."""
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
+        self._app, self._hosts, self._viewers = app, hosts, viewers
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        connection = HTTPConnection(scope)
+        why = self._wrong(connection, changes=scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD"))
+        if why is None:
+            await self._app(scope, receive, partial(_with_headers, send))
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 4403, "reason": why.what[:100]})
+        else:
+            await error_response(why)(scope, receive, partial(_with_headers, send))
+
+    def _wrong(self, connection: HTTPConnection, *, changes: bool) -> NotAllowed | None:
+        host = connection.headers.get("host", "")
+        if _name_of(host) not in self._hosts:
+            return NotAllowed("this name is none of this service's", where=f"host {host[:100]}",
+                              next_step=f"Open it as {', '.join(sorted(self._hosts))}")
+        if connection.scope["type"] == "websocket" and token_in(connection) is not None:
+            return None                # a token comes with no page by itself; without it nothing else counts
+        origin = connection.headers.get("origin")
+        if origin in self._viewers and connection.scope["type"] == "websocket" and "/foxglove/" in connection.url.path:
+            return None
+        elsewhere = origin is not None and (
+            urlsplit(origin).scheme not in ("http", "https") or urlsplit(origin).netloc.lower() != host.lower()
+        )
+        if changes and (elsewhere or connection.headers.get("sec-fetch-site") in ("cross-site", "same-site")):
+            return NotAllowed("a page of another site asked for this", where=f"origin {(origin or '?')[:100]}")
+        return None
+
+
+def _name_of(host: str) -> str:
+    with suppress(ValueError):
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    return ""
+
+
+async def _with_headers(send: Send, message: Message) -> None:
+    if message["type"] == "http.response.start":
+        headers = list(message.get("headers", ()))
+        named = {name.lower() for name, _ in headers}
+        for name, value in (
+            (b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"), (b"x-frame-options", b"DENY"), (b"cache-control", b"no-store"),
+            (b"cross-origin-resource-policy", b"same-origin"), (b"cross-origin-opener-policy", b"same-origin"),
+        ):
+            if name not in named:
+                headers.append((name, value))
+        message = {**message, "headers": headers}
+    await send(message)
+
+
+def status_of(error: BaseException) -> int:
+    """The HTTP status of an error of the tree."""
+    if isinstance(error, HTTPException):
+        return int(error.status_code)
+    for kind, status in (
+        (NotThere, 404), (NotLoggedIn, 401), (TooManyTries, 429), (NotAllowed, 403),
+        (PreflightRefused, 409), (UsageError, 422), (DataFileError, 422), (NotReacting, 504), (CommunicationLost, 503),
+        (NoRoom, 507), (LogError, 503),
+    ):
+        if isinstance(error, kind):
+            return status
+    if isinstance(error, Refused):
+        return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.told.exit_code), 500)
+    return 500
+
+
+def told_of(error: BaseException) -> ErrorView:
+    """The body of an error."""
+    if isinstance(error, Refused):
+        return ErrorView(error.told)
+    if isinstance(error, HTTPException):
+        return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE)))
+    if not isinstance(error, TdhilError):
+        return ErrorView(Told("InternalError", "internal error", "internal error", "", _BROKEN_HINT, 1))
+    return ErrorView(Told.of(error), getattr(error, "holder", None) if isinstance(error, Conflict) else None)
+
+
+def error_response(error: BaseException, status: int | None = None, headers: Mapping[str, str] = _NONE) -> Response:
+    """The whole answer. ``status``: where it is another than the error's own."""
+    headers = {**headers, **({"www-authenticate": "Bearer"} if isinstance(error, NotLoggedIn) else {})}
+    if isinstance(error, TooManyTries):
+        headers["retry-after"] = f"{error.wait_s:.0f}"
+    return JSONResponse(plain(told_of(error), ErrorView), status or status_of(error), headers=headers)
+
+
+async def body_of(request: Request, route: Route) -> Any:
+    """What was sent, checked. Raises UsageError."""
+    if route.method == "GET":
+        return None
+    data = b""
+    async for piece in request.stream():
+        data += piece
+        if len(data) > BODY_LIMIT:
+            raise UsageError(f"more than {BODY_LIMIT} bytes", where="body")
+    media = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
+    if media != "application/json":
+        raise UsageError("must be JSON", where=f"content-type {media[:60]}", next_step="Say application/json")
+    try:
+        sent = json.loads(data or b"{}", parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"no JSON ({str(error)[:100]})", where="body") from None
+    if not isinstance(sent, dict):
+        raise UsageError("must be an object", where="body", next_step='Such as {"seed": 7}')
+    if route.body == OPTIONS:
+        return sent
+    try:
+        return adapter(route.body).validate_json(json.dumps(sent), strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))[:60] or "body"
+        if first["type"] == "unexpected_keyword_argument":
+            known = ", ".join(one.name for one in fields(route.body))
+            raise UsageError("is nothing that is asked for here", where=where, next_step=f"There are {known}") from None
+        raise UsageError(first["msg"], where=where) from None
+
+
+def _no_number(name: str) -> Any:
+    raise ValueError(f"{name} is no number in JSON")
+
+
+async def off(work: Callable[[], T]) -> T:
+    """In a thread: files may be slow."""
+    found: T = await anyio.to_thread.run_sync(work)
+    return found

@@ -1,0 +1,183 @@
+"""Between web and run: a Unix socket in the run's folder, a line of JSON each way; and the lock that says it lives.
+
+The socket belongs to one user (mode 0600). The lock is held by the run's process for as long as it lives: the web took
+it before the process began, and handed it on, so that there is no moment at which a living run looks dead.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from drivers import CommunicationLost
+from tdhil.errors import TdhilError
+from tdhil.service.run_state import Told
+
+SOCKET: Final = "control.sock"
+LOCK: Final = "alive.lock"
+STOP_FILE: Final = "stop.json"
+"""A wish to stop from before the run's process listened."""
+LONGEST: Final = 64 * 1024
+_PATH_LIMIT: Final = 100               # of a socket's path; the system has 108
+Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
+
+
+class Refused(TdhilError):
+    """What the run said no to; ``told`` is its own error."""
+
+    def __init__(self, told: Told) -> None:
+        super().__init__(told.what, where=told.where, next_step=told.next_step)
+        self.told = told
+        self.exit_code = told.exit_code
+
+
+class Listener:
+    """The run's end. Each request is answered in a thread of its own: no slow client holds another up."""
+
+    def __init__(self, folder: Path, answer: Answer) -> None:
+        self._folder, self._answer = folder, answer
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+
+    def __enter__(self) -> Self:
+        (self._folder / SOCKET).unlink(missing_ok=True)
+        mask = os.umask(0o177)
+        try:
+            with _short(self._folder / SOCKET) as name:
+                self._socket.bind(name)
+        finally:
+            os.umask(mask)
+        self._socket.listen(16)
+        threading.Thread(target=self._accept, name="control", daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):
+            self._socket.close()
+        (self._folder / SOCKET).unlink(missing_ok=True)
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                peer, _ = self._socket.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(peer,), daemon=True).start()
+
+    def _serve(self, peer: socket.socket) -> None:
+        with peer, suppress(OSError):
+            peer.settimeout(5.0)
+            try:
+                asked = json.loads(_line(peer))
+                answer: Mapping[str, Any] = self._answer(asked if isinstance(asked, dict) else {})
+            except Exception as error:         # whatever came over the wire: the run goes on
+                answer = {"error": Told.of(error).__dict__}
+            peer.sendall(json.dumps(answer).encode() + b"\n")
+
+
+def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> dict[str, Any]:
+    """What the run answers. Raises Refused with its own error, and CommunicationLost where nobody answers in time."""
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
+            peer.settimeout(timeout_s)
+            with _short(folder / SOCKET) as name:
+                peer.connect(name)
+            peer.sendall(json.dumps(request).encode() + b"\n")
+            found: dict[str, Any] = json.loads(_line(peer))
+    except (OSError, ValueError) as error:
+        raise CommunicationLost(
+            f"the run's process doesn't answer ({error})", where=f"run {folder.name}",
+            next_step="If the shaft turns, use the hard-wired stop",
+        ) from error
+    if found.get("error"):
+        raise Refused(Told(**found["error"]))
+    return found
+
+
+def _line(peer: socket.socket) -> bytes:
+    found = b""
+    while not found.endswith(b"\n") and len(found) < LONGEST and (more := peer.recv(4096)):
+        found += more
+    return found
+
+
+@contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """The path, or where it is too long for a socket, a way through the open folder."""
+    if len(os.fsencode(path)) < _PATH_LIMIT:
+        yield str(path)
+        return
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        yield f"/proc/self/fd/{descriptor}/{path.name}"
+    finally:
+        os.close(descriptor)
+
+
+def take_life(folder: Path) -> int:
+    """A descriptor that holds the run's lock, for its process to inherit; the caller closes its own."""
+    import fcntl
+
+    descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def lives(folder: Path) -> bool:
+    """Does the run's process live? Where that can't be known (no descriptor left, say) it isn't given up for dead."""
+    import fcntl
+
+    try:
+        descriptor = os.open(folder / LOCK, os.O_RDONLY | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def stands_still(pid: int) -> bool:
+    """Was the process stopped, by SIGSTOP or a debugger? False where that can't be known."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][:1] in ("T", "t")
+    except OSError:
+        return False
+
+
+def send_signal(pid: int, folder: Path, number: int) -> bool:
+    """Send it to the run's process, by a descriptor, so that it reaches no other process of that number."""
+    if sys.platform != "linux":
+        return False
+    try:
+        descriptor = os.pidfd_open(pid)
+    except OSError:
+        return False
+    try:
+        if not lives(folder):              # after the descriptor was made: it is this run's process, or none
+            return False
+        signal.pidfd_send_signal(descriptor, number)
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,563 @@
+"""What the service answers, as types, and the document that describes them all (OpenAPI 3.1).
+
+One table of routes: the web serves what stands in it, and the document is made from it. `role` says who may; on
+loopback without accounts, everybody has every role.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, ClassVar, Final, Literal
+
+from pydantic import ConfigDict, TypeAdapter
+
+from tdhil.service.accounts import Role
+from tdhil.service.audit import Broken, Entry
+from tdhil.service.fleets import FleetView
+from tdhil.service.foxglove import PROTOCOLS
+from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
+from tdhil.service.store import Summary
+from tdhil.version import __version__
+
+# mypy takes these for plain dataclasses; pydantic makes the schemas from their annotations.
+
+
+@dataclass(frozen=True)
+class RigView:
+    """A rig. ``state``: may it be asked to move, and if not why; ``holder``: who has it, in words."""
+
+    id: str
+    name: str
+    state: Literal["free", "busy", "held", "blocked", "unusable"]
+    simulated: bool
+    motion: Literal["never", "attended", "watched"]
+    problem: str = ""
+    holder: str | None = None
+    run: str | None = None
+    blocked_by: str | None = None
+    drive: str | None = None
+    profile: str | None = None
+    limits: dict[str, float | None] | None = None
+    last: Summary | None = None
+
+
+@dataclass(frozen=True)
+class RigFileView:
+    """A rig's file as it is; ``editable``: the keys that may be changed over HTTP."""
+
+    rig: str
+    text: str
+    sha256: str
+    editable: list[str]
+
+
+@dataclass(frozen=True)
+class ReplayView:
+    """A replay: what it was asked for, and what came of it."""
+
+    name: str
+    asked: dict[str, Any]
+    at: str
+    by: str
+    state: Literal["waiting", "done", "failed"]
+    result: dict[str, Any] | None = None
+    error: Told | None = None
+
+
+@dataclass(frozen=True)
+class RunView:
+    """A run, with everything but its samples. ``result``: as of `tdhil identify --json`; ``files``: to download."""
+
+    id: str
+    rig: str
+    rig_name: str
+    state: State
+    stage: str | None
+    at: str
+    asked: str
+    asked_by: str
+    simulated: bool
+    options: dict[str, Any]
+    history: list[Entered]
+    expected_s: dict[str, float]
+    preflight: list[Check]
+    identity: str
+    safe_action: str
+    confirmation: Confirmation | None
+    motion: str
+    watch: Watch | None
+    stop: Stop
+    error: Told | None
+    exit_code: int | None
+    verdict: str | None
+    result: dict[str, Any] | None
+    files: list[str]
+    replays: list[ReplayView]
+    signed_off: dict[str, Any] | None
+    alive: bool
+
+
+@dataclass(frozen=True)
+class PlanView:
+    """What is planned, and what to expect of it: the document of `tdhil identify --dry-run --json`."""
+
+    rig: str
+    rig_sha256: str
+    plan: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class TrendView:
+    """A rig's results over time, and whether they changed: the document of `tdhil trend --json`."""
+
+    rig: str
+    trend: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class CompareView:
+    """Runs side by side: the document of `tdhil compare --json`."""
+
+    runs: list[str]
+    comparison: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class PictureView:
+    """A picture of the report; ``caption`` says what it shows."""
+
+    number: int
+    heading: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class FaultView:
+    """A fault to rehearse, written ``NAME@STAGE+2s=VALUE``. ``row`` of docs/faults.md; 0: it has none.
+
+    ``value`` is what it is taken for where none is said; ``takes`` says what it is, '' where there is none.
+    ``from_start``: it has no moment, and goes on for good.
+    """
+
+    name: str
+    summary: str
+    row: int
+    value: str
+    takes: str
+    from_start: bool
+
+
+@dataclass(frozen=True)
+class StoppedView:
+    """A stop of a rig: its runs, and where it has none, what `tdhil stop` saw (exit code 0: at rest)."""
+
+    rig: str
+    runs: list[str]
+    exit_code: int | None = None
+    said: str = ""
+
+
+@dataclass(frozen=True)
+class LeaseView:
+    """Who watches a watched run, for so many seconds more if nothing is heard of his page."""
+
+    run: str
+    watch: Watch
+    lease_s: float
+
+
+@dataclass(frozen=True)
+class AuditView:
+    """The latest lines, the newest first; ``broken``: where the chain of all of them doesn't hold.
+
+    ``head``: the last line as NUMBER:HASH, to be kept on another computer and sent as ``head`` later; None where the
+    chain's end doesn't hold. ``key_made``: when the chain's key was made.
+    """
+
+    entries: list[Entry]
+    broken: Broken | None
+    head: str | None = None
+    key_made: str | None = None
+
+
+@dataclass(frozen=True)
+class HealthView:
+    """Is it there, and what is it doing? ``live``: the runs that have not ended; empty for who is not logged in."""
+
+    status: Literal["ok"]
+    version: str
+    live: list[str]
+    rigs: int
+
+
+@dataclass(frozen=True)
+class MeView:
+    """Who asks, as the service sees him. ``ends``: when a login does."""
+
+    name: str
+    roles: list[Role]
+    login: bool
+    ends: str | None = None
+
+
+@dataclass(frozen=True)
+class AccountView:
+    """A person or a machine. ``since``: when the password was set, or the token made."""
+
+    name: str
+    role: Role
+    since: str
+
+
+@dataclass(frozen=True)
+class AccountsView:
+    """All of them."""
+
+    users: list[AccountView]
+    tokens: list[AccountView]
+
+
+@dataclass(frozen=True)
+class TokenView:
+    """A new token. It is shown this once."""
+
+    name: str
+    role: Role
+    token: str
+
+
+@dataclass(frozen=True)
+class ErrorView:
+    """What went wrong, as the error tree says it."""
+
+    error: Told
+    holder: str | None = None
+
+
+# -- what is sent ---------------------------------------------------------------------------------------------------
+
+
+class Body:
+    """What is sent has no more in it than what is known here: a key that is misspelt is refused, not passed over."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True)
+class ConfirmBody(Body):
+    """The six digits; ``binding`` is the hash that was shown with the plan, if the sender has it.
+
+    ``lease``: where the rig is watched, a random key of 16 to 200 characters, which only its sender knows and renews.
+    """
+
+    code: str
+    binding: str | None = None
+    lease: str | None = None
+
+
+@dataclass(frozen=True)
+class LeaseBody(Body):
+    """The page with this key is seen; or how it goes. ``new_key``: from now on that one, and the old one is void."""
+
+    key: str
+    new_key: str | None = None
+    gone: Literal["hidden", "closed"] | None = None
+
+
+@dataclass(frozen=True)
+class SignOffBody(Body):
+    """Who saw the shaft at rest says so."""
+
+    note: str
+
+
+@dataclass(frozen=True)
+class ReplayBody(Body):
+    """None: as the run had it. A share is a number, or a text such as ``1%``."""
+
+    model: str | None = None
+    tolerance: float | str | None = None
+    confidence: float | str | None = None
+
+
+@dataclass(frozen=True)
+class RigFileBody(Body):
+    """The whole file; ``sha256``: of the one that it is to replace."""
+
+    text: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class LoginBody(Body):
+    """A person's."""
+
+    name: str
+    password: str
+
+
+@dataclass(frozen=True)
+class PasswordBody(Body):
+    """One's own: the old one and the new."""
+
+    old: str
+    new: str
+
+
+@dataclass(frozen=True)
+class UserBody(Body):
+    """Somebody new."""
+
+    name: str
+    role: Role
+    password: str
+
+
+@dataclass(frozen=True)
+class NewPasswordBody(Body):
+    """Somebody else's, by an admin."""
+
+    password: str
+
+
+@dataclass(frozen=True)
+class TokenBody(Body):
+    """A machine's."""
+
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True)
+class FleetBody(Body):
+    """Which logs, and with what; None: as each run had it.
+
+    ``folder`` of `/fleets/folders`, '' for the service's own runs; ``below``: a folder inside of it.
+    """
+
+    folder: str = ""
+    below: str = ""
+    model: str | None = None
+    tolerance: float | str | None = None
+    confidence: float | str | None = None
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """An empty object will do."""
+
+
+OPTIONS: Final = "Options"
+"""The body of a run that is asked for: an object with the command line's options."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """One road into the service. ``answers``: by HTTP status, a type of above, or a media type for a file.
+
+    ``role``: the least that may; None: anybody, also without a login. Who is known may always stop.
+    """
+
+    method: Literal["GET", "POST"]
+    path: str
+    name: str
+    summary: str
+    role: Role | None
+    answers: Mapping[int, Any]
+    body: Any = None
+    errors: tuple[int, ...] = ()
+    query: Mapping[str, str] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+_RANGE: Final = {"Range": "a piece of it, such as bytes=0-99"}
+
+
+def _file(media: str) -> Mapping[int, Any]:
+    return {200: media, 206: (media, "multipart/byteranges"), 400: "text/plain", 416: "text/plain"}
+
+
+ROUTES: Final = (
+    Route("GET", "/rigs", "rigs", "The rigs of this site", "viewer", {200: list[RigView]}),
+    Route("GET", "/rigs/{rig}", "rig", "One rig", "viewer", {200: RigView}, errors=(404,)),
+    Route("GET", "/rigs/{rig}/file", "rig_file", "Its file", "viewer", {200: RigFileView}, errors=(404, 422)),
+    Route("POST", "/rigs/{rig}/file", "edit_rig", "Another text of its file: limits and what else is no way to a drive",
+          "engineer", {200: RigFileView}, RigFileBody, (404, 409, 422, 503)),
+    Route("GET", "/rigs/{rig}/trend", "trend", "J, friction and lags over time, and whether they changed", "viewer",
+          {200: TrendView}, errors=(404, 422)),
+    Route("POST", "/rigs/{rig}/plan", "plan", "Plan a run; nothing is connected to", "viewer", {200: PlanView},
+          OPTIONS, (403, 404, 409, 422)),
+    Route("POST", "/rigs/{rig}/runs", "start", "Ask for a run", "operator", {201: RunView, 200: RunView}, OPTIONS,
+          (403, 404, 409, 422, 429, 503, 507),
+          headers={"Idempotency-Key": "the same key gives the same run, and no second one"}),
+    Route("POST", "/rigs/{rig}/stop", "stop_rig", "Stop the rig's run; without one, tdhil stop on its drive, which"
+          " takes an operator where no tdhil moves it", "viewer", {200: StoppedView}, Nothing, (403, 404, 503, 504)),
+    Route("GET", "/runs", "runs", "The runs, the newest first", "viewer", {200: list[Summary]},
+          query={"rig": "of this rig only", "state": "in this state only", "limit": "at most so many (100)"}),
+    Route("GET", "/runs/compare", "compare", "Runs side by side", "viewer", {200: CompareView}, errors=(404, 422),
+          query={"runs": "two to eight, with commas between"}),
+    Route("GET", "/runs/{run}", "run", "One run", "viewer", {200: RunView}, errors=(404,)),
+    Route("POST", "/runs/{run}/confirm", "confirm", "Let it move, with the code shown at the rig", "operator",
+          {200: RunView}, ConfirmBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/lease", "renew", "Say, once a second, that the page of a watched run is seen",
+          "operator", {200: LeaseView}, LeaseBody, (403, 404, 409, 422, 503)),
+    Route("POST", "/runs/{run}/stop", "stop", "Have it brake. This is no emergency stop", "viewer", {200: RunView},
+          Nothing, (403, 404, 503, 504)),
+    Route("POST", "/runs/{run}/sign-off", "sign_off", "Take a stop that wasn't confirmed upon oneself", "engineer",
+          {200: RunView}, SignOffBody, (403, 404, 409, 422)),
+    Route("POST", "/runs/{run}/replays", "ask_replay", "Identify again; the first result stays", "operator",
+          {202: ReplayView}, ReplayBody, (403, 404, 422)),
+    Route("GET", "/runs/{run}/replays/{replay}", "replay", "One replay", "viewer", {200: ReplayView}, errors=(404,)),
+    Route("GET", "/runs/{run}/log.mcap", "log", "The log; also while it grows (Range)", "viewer",
+          _file("application/octet-stream"), errors=(404,), headers=_RANGE),
+    Route("GET", "/runs/{run}/report.html", "report", "The report", "viewer", _file("text/html"), errors=(404,),
+          headers=_RANGE),
+    Route("GET", "/runs/{run}/report.pdf", "report_pdf", "The report on A4, made when it is first asked for", "viewer",
+          _file("application/pdf"), errors=(404, 422), headers=_RANGE),
+    Route("GET", "/runs/{run}/result.json", "result", "The result", "viewer",
+          _file("application/json"), errors=(404,), headers=_RANGE),
+    Route("GET", "/runs/{run}/samples.csv", "samples", "Every sample with its command; made when first asked for",
+          "viewer", _file("text/csv"), errors=(404, 422), headers=_RANGE),
+    Route("GET", "/runs/{run}/pictures", "pictures", "The report's pictures", "viewer", {200: list[PictureView]},
+          errors=(404,)),
+    Route("GET", "/runs/{run}/pictures/{number}", "picture", "One of them", "viewer", {200: "image/svg+xml"},
+          errors=(404,)),
+    Route("GET", "/rigs/{rig}/faults", "faults", "What can be rehearsed on a simulated rig", "viewer",
+          {200: list[FaultView]}, errors=(403, 404)),
+    Route("GET", "/fleets", "fleets", "Many logs identified again, the latest first", "viewer", {200: list[FleetView]}),
+    Route("GET", "/fleets/folders", "fleet_folders", "Where logs may be", "viewer", {200: list[str]}),
+    Route("POST", "/fleets", "ask_fleet", "Identify many logs again; the same question does what is left of it",
+          "operator", {202: FleetView}, FleetBody, (403, 409, 422)),
+    Route("GET", "/fleets/{fleet}", "fleet", "How far it is, and what came of it", "viewer", {200: FleetView},
+          errors=(404,)),
+    Route("POST", "/fleets/{fleet}/stop", "stop_fleet", "End it; what is done is kept", "operator", {200: FleetView},
+          Nothing, (403, 404)),
+    Route("GET", "/fleets/{fleet}/rows", "fleet_rows", "A row a log; while it goes, those that came since it began",
+          "viewer", {200: list[dict[str, Any]]}, errors=(404, 422),
+          query={"from": "leave out so many (0)", "limit": "at most so many (200)"}),
+    Route("GET", "/fleets/{fleet}/fleet.csv", "fleet_table", "The table", "viewer",
+          _file("text/csv"), errors=(404,), headers=_RANGE),
+    Route("GET", "/audit", "audit", "Who asked, confirmed, stopped, downloaded", "admin", {200: AuditView},
+          query={"limit": "at most so many lines (200)", "head": "NUMBER:HASH of before, which the chain must have"}),
+    Route("POST", "/login", "login", "Name and password for a session, in two cookies", None, {200: MeView}, LoginBody,
+          (401, 403, 422, 429)),
+    Route("POST", "/logout", "logout", "End the session", None, {200: MeView}, Nothing, (403, 422)),
+    Route("GET", "/me", "me", "Who asks?", None, {200: MeView}),
+    Route("POST", "/password", "password", "One's own password; ends all of one's sessions", "viewer", {200: MeView},
+          PasswordBody, (422, 429, 503)),
+    Route("GET", "/accounts", "accounts", "People and machines", "admin", {200: AccountsView}),
+    Route("POST", "/users", "add_user", "Somebody new", "admin", {201: AccountView}, UserBody, (422, 503)),
+    Route("POST", "/users/{user}/password", "set_password", "Another password; ends all of his sessions", "admin",
+          {200: AccountView}, NewPasswordBody, (404, 422, 503)),
+    Route("POST", "/users/{user}/remove", "remove_user", "Somebody less", "admin", {200: AccountsView}, Nothing,
+          (404, 422, 503)),
+    Route("POST", "/tokens", "add_token", "A machine's token, which is shown this once", "admin", {201: TokenView},
+          TokenBody, (422, 503)),
+    Route("POST", "/tokens/{token}/remove", "remove_token", "A token less", "admin", {200: AccountsView}, Nothing,
+          (404, 422, 503)),
+    Route("GET", "/healthz", "health", "Is it there?", None, {200: HealthView}),
+    Route("GET", "/metrics", "metrics", "For Prometheus", "viewer", {200: "text/plain"}),
+    Route("GET", "/openapi.json", "openapi", "This document", None, {200: "application/json"}),
+)
+
+API: Final = "/api/v1"
+CSRF_HEADER: Final = "X-CSRF-Token"
+
+
+@dataclass(frozen=True)
+class Socket:
+    """A WebSocket; ``protocols``: the sub-protocols of which a client must offer one, where there are any."""
+
+    path: str
+    name: str
+    summary: str
+    role: Role
+    protocols: tuple[str, ...] = ()
+
+
+SOCKETS: Final = (
+    Socket("/live/{run}", "watch", "A run from its start and as it goes: hello, then news (JSON)", "viewer"),
+    Socket("/foxglove/{rig}", "foxglove", "The log of the rig's run as it grows, for Foxglove and Lichtblick", "viewer",
+           PROTOCOLS),
+)
+"""They stand at the root, too."""
+
+
+@cache
+def adapter(kind: Any) -> TypeAdapter[Any]:
+    """Pydantic's of a type of above."""
+    return TypeAdapter(kind)
+
+
+def plain(value: Any, kind: Any) -> Any:
+    """For JSON."""
+    return adapter(kind).dump_python(value, mode="json")
+
+
+@cache
+def document() -> dict[str, Any]:
+    """The OpenAPI document."""
+    schemas: dict[str, Any] = {}
+
+    def security(role: Role | None) -> dict[str, Any]:
+        return {"x-role": role or "anybody", "security": [] if role is None else [{"session": []}, {"token": []}]}
+
+    def schema(kind: Any, mode: Literal["validation", "serialization"] = "serialization") -> dict[str, Any]:
+        if kind == OPTIONS:
+            return {"type": "object", "description": "the command line's options, such as "
+                    '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit'}
+        found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
+        schemas.update(found.pop("$defs", {}))
+        if isinstance(kind, type) and found.get("type") == "object":
+            schemas[kind.__name__] = found
+            return {"$ref": f"#/components/schemas/{kind.__name__}"}
+        return found
+
+    error = {"description": "refused", "content": {"application/json": {"schema": schema(ErrorView)}}}
+    paths: dict[str, Any] = {}
+    for route in ROUTES:
+        responses: dict[str, Any] = {}
+        for code, kind in route.answers.items():
+            files = kind if isinstance(kind, tuple) else (kind,) if isinstance(kind, str) else ()
+            content: dict[str, Any] = {media: {} for media in files} or {"application/json": {"schema": schema(kind)}}
+            responses[str(code)] = {"description": route.summary, "content": content}
+        closed = () if route.role is None else (401, 403)
+        responses |= {str(code): error for code in sorted({*route.errors, *closed})}
+        parameters = [
+            {"name": part[1:-1], "in": "path", "required": True, "schema": {"type": "string"}}
+            for part in route.path.split("/") if part.startswith("{")
+        ]
+        changes = {CSRF_HEADER: "with a session: what its second cookie says"} if route.method != "GET" else {}
+        for where, named in (("query", route.query), ("header", {**route.headers, **changes})):
+            parameters += [{"name": name, "in": where, "description": text, "schema": {"type": "string"}}
+                           for name, text in named.items()]
+        described: dict[str, Any] = {
+            "operationId": route.name, "summary": route.summary, "parameters": parameters, "responses": responses,
+            **security(route.role),
+        }
+        if route.body is not None:
+            described["requestBody"] = {"content": {"application/json": {"schema": schema(route.body, "validation")}}}
+        paths.setdefault(f"{API}{route.path}", {})[route.method.lower()] = described
+    for one in SOCKETS:
+        name = one.path.rpartition("{")[2][:-1]
+        paths[f"{API}{one.path}"] = {"get": {
+            "operationId": one.name, "summary": one.summary, "x-websocket": list(one.protocols), **security(one.role),
+            "parameters": [{"name": name, "in": "path", "required": True, "schema": {"type": "string"}},
+                           {"name": "token", "in": "query", "schema": {"type": "string"},
+                            "description": "a machine's, where no header can be sent: browsers"}],
+            "responses": {"101": {"description": "a WebSocket; closed with 4401 for nobody, 4403 for a lesser role"},
+                          **dict.fromkeys(("400", "401", "403", "404", "426"), error)},
+        }}
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "tdhil", "version": __version__,
+                 "description": "Runs that identify a moment of inertia. A stop over HTTP is no emergency stop."},
+        "paths": paths,
+        "components": {"schemas": schemas, "securitySchemes": {
+            "token": {"type": "http", "scheme": "bearer", "description": "a machine's: tdhil serve tokens add"},
+            "session": {"type": "apiKey", "in": "cookie", "name": "__Host-tdhil-8420",
+                        "description": "of POST /login; the number is the port of the address"},
+        }},
+    }

@@ -1,0 +1,129 @@
+"""Arithmetic beside the web: ``python -m tdhil.service.worker plan|replay|…``, a question on stdin.
+
+A process of its own, nicer than everything that moves: neither a page nor a stop waits for it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from tdhil.errors import UsageError
+from tdhil.service.run_state import Told
+
+NICE: Final = {"plan": 5, "trend": 5}      # somebody waits for it
+USUAL_NICE: Final = 19
+
+
+def plan(asked: dict[str, Any]) -> dict[str, Any]:
+    """The plan of a run on a rig as its file is now."""
+    from tdhil.service.start_request import plan_of, read_rig
+
+    return {"document": plan_of(read_rig(Path(asked["rig_file"])), asked["options"])}
+
+
+def replay(asked: dict[str, Any]) -> dict[str, Any]:
+    """The log again, with another model, tolerance or confidence."""
+    from tdhil.api import identify
+    from tdhil.session import read
+
+    os.chdir(asked["folder"])
+    given = {name: asked[name] for name in ("model", "tolerance", "confidence") if asked.get(name) is not None}
+    return {"document": identify(read("run.mcap"), **given).to_dict()}
+
+
+def report(asked: dict[str, Any]) -> dict[str, Any]:
+    """The report of a run that has a result, as the file that is named."""
+    from tdhil.report import require_extra, write_report
+    from tdhil.session import read
+
+    require_extra("report")
+    os.chdir(asked["folder"])
+    wanted = Path(str(asked["name"])).name
+    beside = Path(f".{os.getpid()}-{wanted}")
+    document = json.loads(Path("result.json").read_bytes())
+    try:
+        write_report(document, read("run.mcap").recording, beside).replace(wanted)
+    finally:
+        beside.unlink(missing_ok=True)
+    return {"document": {"file": wanted}}
+
+
+def samples(asked: dict[str, Any]) -> dict[str, Any]:
+    """The run's samples as samples.csv, by `tdhil export`."""
+    os.chdir(asked["folder"])
+    beside = Path(f".{os.getpid()}-samples.csv")
+    command = [sys.executable, "-m", "tdhil", "export", "run.mcap", "--to", "csv", "-o", str(beside)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if not beside.exists():
+            raise UsageError(" ".join(done.stderr.split())[:500] or "can't be exported", where="run.mcap")
+        beside.replace("samples.csv")
+    finally:
+        beside.unlink(missing_ok=True)
+    return {"document": {"file": "samples.csv"}}
+
+
+def recover(asked: dict[str, Any]) -> dict[str, Any]:
+    """A clean copy of what a cut log holds, and what can be identified from it; no document where that is nothing."""
+    from tdhil.errors import LogError
+    from tdhil.recording import examine, write_copy
+
+    os.chdir(asked["folder"])
+    with suppress(LogError, OSError, UsageError):
+        if not Path("recovered.mcap").exists():
+            write_copy(Path("run.mcap"), Path("recovered.mcap"), examine(Path("run.mcap")))
+    with suppress(LogError, UsageError, ValueError):
+        return replay({"folder": asked["folder"]})
+    return {"document": None}
+
+
+def trend(asked: dict[str, Any]) -> dict[str, Any]:
+    """What the rows of a rig's runs say over time."""
+    from tdhil.fleet import FleetRow, trend_document
+
+    return {"document": trend_document([FleetRow(**one) for one in asked["rows"]], asked["rig"])}
+
+
+def compare(asked: dict[str, Any]) -> dict[str, Any]:
+    """Some runs side by side, each identified from its log."""
+    from tdhil.fleet import Settings, compare_document, identified
+
+    os.chdir(asked["runs_folder"])
+    return {"document": compare_document([identified(Path(run) / "run.mcap", Settings()) for run in asked["runs"]])}
+
+
+WORK: Final = {
+    "plan": plan, "replay": replay, "report": report, "samples": samples, "recover": recover, "trend": trend,
+    "compare": compare,
+}
+
+
+def main(arguments: list[str]) -> int:
+    """0; what went wrong is in the answer."""
+    with suppress(OSError, AttributeError):
+        os.nice(NICE.get(arguments[0], USUAL_NICE))
+    with suppress(OSError):                    # where memory runs out, this goes before the web and before any run
+        Path("/proc/self/oom_score_adj").write_text("500")
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)                          # what libraries print is no part of the answer
+    try:
+        answer = WORK[arguments[0]](json.load(sys.stdin))
+    except Exception as error:
+        if not hasattr(error, "next_step"):
+            import traceback
+
+            traceback.print_exception(error)
+        answer = {"error": Told.of(error).__dict__}
+    json.dump(answer, out)
+    out.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,171 @@
+"""The plan of a run that has not begun: on the rig as it is assumed. Connects to nothing, moves nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from drivers import Identity, PreflightRefused
+from tdhil.config import Rig, RunOptions, simulated_default_rig
+from tdhil.session.task import bench_of, excitation_request, lag_prior, machine_limits
+from tdhil.version import __version__
+
+if TYPE_CHECKING:
+
+    from tdhil.runner import Knowledge, MachineLimits, Planned, excitation
+    from tdhil.runner.excitation import RigGuess
+    from tdhil.soft_torque import EvaluationCase, Program
+
+
+SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
+VISCOUS_SHARE = 0.2         # assumed friction at the highest speed, of the torque limit, …
+COULOMB_SHARE = 0.15        # … and at standstill
+BEFORE_ACQUIRE_S = 90.0     # stages 1 to 4, about
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One thing that the plan rests on. ``source``: assumed, or where it stands in rig.yaml."""
+
+    name: str
+    value: float
+    unit: str
+    source: str
+
+    @property
+    def text(self) -> str:
+        return f"{self.value:.4g} {self.unit}"
+
+
+def plan_dry(
+    options: RunOptions, rig: Rig | None, simulated: bool, can_torque: bool = True, lets_go: bool = False
+) -> tuple[Planned, tuple[Figure, ...], MachineLimits]:
+    """The plan, what it rests on, and the machine's limits."""
+    from tdhil.runner import plan_acquisition, refuse_by_plan
+    from tdhil.runner.excitation import PlanRefused
+
+    bench = bench_of(Identity(0, 0, 0, 0, "", simulated), rig)
+    limits = machine_limits(bench)
+    refuse_by_plan(limits, excitation_request(options), lets_go)
+    guess, known, figures = _assumed(bench, limits)
+    left_s = limits.time_s - BEFORE_ACQUIRE_S
+    try:
+        planned = plan_acquisition(
+            excitation_request(options), _mode(options, can_torque), _room(options, limits), guess, known, left_s
+        )
+    except PlanRefused as error:
+        raise PreflightRefused(
+            str(error), where="plan of stage 5", next_step=error.next_step
+        ) from error
+    return planned, figures, limits
+
+
+def plan_course(
+    case: EvaluationCase, rig: Rig | None, simulated: bool, rate_hz: float
+) -> tuple[Program, MachineLimits]:
+    """A virtual string's course, and the machine's limits. Raises what keeps it from being turned."""
+    from tdhil.runner import ControlAssumptions, Guard, course_of
+
+    limits = machine_limits(bench_of(Identity(0, 0, 0, 0, "", simulated), rig))
+    assumptions = ControlAssumptions().at_period(1.0 / rate_hz)
+    return course_of(case, limits, 1.0 / rate_hz, Guard.foresight_s(assumptions)), limits
+
+
+def plan_document(planned: Planned, figures: tuple[Figure, ...], limits: MachineLimits) -> dict[str, Any]:
+    """The plan as plain data."""
+    plan, stopping = planned.plan, planned.stopping
+    return {
+        "dry_run": True,
+        "excitation": plan.kind,
+        "mode": plan.mode,
+        **plan.plain(),
+        "duration_s": planned.duration_s,
+        "speed_rad_s": {"min": plan.speed_min_rad_s, "max": plan.speed_max_rad_s},
+        "torque_nm": {"min": plan.torque_min_nm, "max": plan.torque_max_nm},
+        "limits": {
+            "speed_min_rad_s": limits.speed_min_rad_s,
+            "speed_max_rad_s": limits.speed_max_rad_s,
+            "torque_nm": limits.torque_nm,
+        },
+        "rests_on": [asdict(figure) for figure in figures],
+        "expected_half_width": planned.half_width if math.isfinite(planned.half_width) else None,
+        "stopping": None if stopping is None else stopping.plain(),
+        "tdhil": __version__,
+    }
+
+
+def refuse_hopeless(options: RunOptions, rig: Rig | None, can_torque: bool) -> None:
+    """Before a run touches its drive: PreflightRefused for what no shaft could do within the limits.
+
+    Nothing is known of the shaft yet, nor whether it is a simulated one, whose limits need not be given.
+    """
+    from tdhil.runner import refuse_hopeless as refuse_hopeless_plan
+    from tdhil.runner.excitation import PlanRefused
+
+    bench = simulated_default_rig(rig)
+    limits = machine_limits(bench)
+    modes = (options.mode,) if options.mode else ("torque", "speed") if can_torque else ("speed",)
+    guess, known, _ = _assumed(bench, limits)
+    try:
+        refuse_hopeless_plan(excitation_request(options), modes, _room(options, limits), guess, known)
+    except PlanRefused as error:
+        raise PreflightRefused(str(error), where="plan of stage 5", next_step=error.next_step) from error
+
+
+def _mode(options: RunOptions, can_torque: bool) -> str:
+    wanted: str | None = options.mode
+    if wanted == "torque" and not can_torque:
+        raise PreflightRefused(
+            "torque mode was asked for, but this drive has none that can be entered while it turns",
+            where=f"profile {options.profile}",
+            next_step="Use --mode speed",
+        )
+    return wanted or ("torque" if can_torque else "speed")
+
+
+def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits:
+    """What a plan may use of the limits at the rate that was asked for."""
+    from tdhil.runner import ControlAssumptions, Guard
+
+    assumptions = ControlAssumptions()
+    if options.rate_hz:
+        assumptions = assumptions.at_period(1.0 / options.rate_hz)
+    return Guard.room(limits, assumptions)
+
+
+def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tuple[Figure, ...]]:
+    """The rig, its noise and its lags, and what each of them rests on."""
+    from tdhil.runner import Knowledge, assumed_noise
+
+    guess, figures = _guess(bench, limits)
+    stated = bench.expected.load_noise_nm
+    noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
+    known = Knowledge(noise, lag_prior(bench), limits.winds_up)
+    return guess, known, (
+        *figures,
+        Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),
+        Figure("lag of reported speed", known.speed_lag_s, "s", _source(bench, "drive_data.speed_lag_s")),
+        Figure("lag of reported torque", known.torque_lag_s, "s", _source(bench, "drive_data.torque_lag_s")),
+    )
+
+
+def _guess(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, tuple[Figure, ...]]:
+    """What rig.yaml expects of the shaft; for the rest, a shaft that suits its drive."""
+    from tdhil.runner.excitation import RigGuess
+
+    expected = bench.expected
+    window = limits.speed_max_rad_s - limits.speed_min_rad_s
+    inertia = expected.inertia_kg_m2 or SPIN_UP_S * limits.torque_nm / window
+    viscous, coulomb = expected.viscous_nm_s_rad, expected.coulomb_nm
+    viscous = VISCOUS_SHARE * limits.torque_nm / limits.speed_max_rad_s if viscous is None else viscous
+    coulomb = COULOMB_SHARE * limits.torque_nm if coulomb is None else coulomb
+    return RigGuess(inertia, viscous, coulomb), (
+        Figure("moment of inertia", inertia, "kg·m²", _source(bench, "expected.inertia_kg_m2")),
+        Figure("viscous friction", viscous, "N·m·s/rad", _source(bench, "expected.viscous_nm_s_rad")),
+        Figure("Coulomb friction", coulomb, "N·m", _source(bench, "expected.coulomb_nm")),
+    )
+
+
+def _source(bench: Rig, at: str) -> str:
+    return "assumed" if bench.get(at) is None else bench.source(at) or "rig.yaml"

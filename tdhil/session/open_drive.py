@@ -1,0 +1,68 @@
+"""The other end: a drive on its bus or line, or the embedded simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
+from tdhil.config import DriveData, RunOptions
+from tdhil.errors import UsageError
+from tdhil.session.connection import Connection, PeerPlan, bus_kind
+from tdhil.session.drive_lock import address_of, hold
+
+
+def plan_peer(options: RunOptions, connection: Connection) -> PeerPlan:
+    """The embedded simulator with --simulate, or when nobody says where a drive is. UsageError for stepped Modbus."""
+    embedded = options.simulate or not connection.configured
+    if not embedded:
+        if options.stepped and not connection.kind.steps_over_a_wire:
+            raise UsageError(
+                f"a {connection.kind.title} line has no SYNC to step by: over a wire it runs in real time",
+                where=options.source("stepped"),
+                next_step="Leave --stepped out, or use --simulate, which is stepped",
+            )
+        return PeerPlan(False, options.stepped, None, None)
+    from sim_bus import RigParams
+
+    plant = RigParams()
+    if options.plant is not None:
+        from profiles import load_model
+
+        plant = load_model(Path(options.plant), RigParams)
+    seed = options.seed
+    if seed is None:
+        import secrets
+
+        seed = secrets.randbelow(2**31)
+    return PeerPlan(True, not options.real_time, seed, plant)
+
+
+@contextmanager
+def opened_drive(
+    plan: PeerPlan, options: RunOptions, connection: Connection, data: DriveData | None, tap: FrameTap,
+    trace: Path | None,
+) -> Iterator[Drive]:
+    """The drive, held against others, closed with its bus and simulator afterwards.
+
+    ``data``: what the bench knows and the drive doesn't. Raises DriveHeld where another process has it.
+    """
+    clock: Clock = SteppedClock() if plan.stepped else MonotonicClock()
+    data = data or DriveData()
+    address = None if plan.embedded else address_of(connection, options)
+    with hold(address), connection.kind.open(plan, options, connection, data, clock, tap, trace) as drive:
+        yield drive
+
+
+def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> PeerPlan:
+    """The plan with these faults. UsageError where the peer isn't ours to spoil."""
+    if not texts:
+        return plan
+    if not plan.embedded:
+        raise UsageError(
+            "faults can be scripted in the embedded simulator only", where="--fault",
+            next_step="Add --simulate, or give --fault to tdhil simulate",
+        )
+    return replace(plan, faults=bus_kind(drive).parse_faults(texts))

@@ -1,0 +1,130 @@
+"""Differences and histories against what is worked out another way: by simulation, and by the densities themselves."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from benchmarks.trend_power import draw
+from tdhil.fleet import change_detection
+from tdhil.fleet.change_detection import Measured, difference, history
+
+
+def one(value, rel_sd=0.004, drive="a", scale=0.03, time=0.0):
+    wide = math.exp(1.959963985 * rel_sd)
+    return Measured(value, value / wide, value * wide, 0.95, scale, drive, time)
+
+
+def test_on_one_drive_the_torque_scale_cancels():
+    told = difference(one(104.0), one(106.08))
+    assert told.shared_scale
+    assert told.change == pytest.approx(0.02)
+    half = 1.96 * 0.004 * math.sqrt(2)
+    assert (told.low, told.high) == pytest.approx((1.02 * math.exp(-half) - 1, 1.02 * math.exp(half) - 1), rel=1e-3)
+    assert told.differs
+    for drive in ("b", None):
+        other = difference(one(104.0, drive=drive), one(106.08))
+        assert not other.shared_scale
+        assert not other.differs
+        assert other.high - other.low > 4.0 * (told.high - told.low)
+
+
+def test_the_interval_of_a_difference_covers():
+    rng = np.random.default_rng(1)
+    hits = {True: 0, False: 0}
+    for _ in range(2000):
+        for same in hits:
+            scales = np.exp(0.03 * rng.standard_normal(2))
+            values = 104.0 * np.array([1.0, 1.02]) * (scales[0] if same else scales)
+            told = difference(*(one(float(value * np.exp(0.004 * rng.standard_normal())), drive=drive)
+                                for value, drive in zip(values, ("a", "a" if same else "b"), strict=True)))
+            hits[same] += told.low <= 0.02 <= told.high
+    assert all(0.935 < hit / 2000 < 0.965 for hit in hits.values())
+
+
+def test_what_may_be_zero_is_compared_without_a_logarithm():
+    told = difference(Measured(-0.001, -0.003, 0.001), Measured(0.005, 0.003, 0.007))
+    assert not told.relative
+    assert told.change == pytest.approx(0.006)
+    assert told.high - told.low == pytest.approx(0.004 * math.sqrt(2))
+
+
+def test_the_evidence_is_that_of_the_densities(monkeypatch):
+    """One κ and one τ: against multivariate normal densities with a mean that is as good as flat."""
+    monkeypatch.setattr(change_detection, "_SPREAD", ((1.4, 1.0),))
+    monkeypatch.setattr(change_detection, "_SIZES", (8.0,))
+    rng = np.random.default_rng(3)
+    n = 7
+    sd, time = rng.uniform(0.003, 0.008, n), np.sort(rng.uniform(0, 100, n))
+    shared = 0.03**2 * (np.arange(n)[:, None] // 4 == np.arange(n) // 4)
+    x = 4.6 + sd * rng.standard_normal(n) + 0.01 * (np.arange(n) >= 3)
+    flat = 10.0**2 * np.ones((n, n))
+    covariance = 1.96 * np.diag(sd**2) + shared + flat
+    shapes = [np.arange(n) >= c for c in range(1, n)] + [(time - time[0]) / (time[-1] - time[0])]
+    size = 8.0 * np.median(sd)
+    none = multivariate_normal.logpdf(x, np.full(n, 4.6), covariance)
+    each = [math.exp(multivariate_normal.logpdf(x, np.full(n, 4.6), covariance + size**2 * np.outer(h, h)) - none)
+            for h in shapes]
+    weights = [0.5, 0.25 * np.mean(each[:-1]), 0.25 * each[-1]]
+    found = change_detection._evidence(x, sd, shared, time)
+    assert [found.none, found.step, found.drift] == pytest.approx(np.array(weights) / sum(weights), rel=1e-3)
+    assert found.places == pytest.approx(np.array(each[:-1]) / sum(each[:-1]), rel=1e-3)
+    inverse = np.linalg.inv(covariance)
+    design = np.column_stack((np.ones(n), shapes[2]))
+    fit = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ x)
+    assert found.step_size[2] == pytest.approx(fit[1], rel=1e-3)
+
+
+@pytest.mark.parametrize(("kind", "least", "most"), [
+    ("none", 0, 2), ("step 2 %", 38, 40), ("step 5 %", 40, 40), ("drift 5 %", 40, 40),
+])
+def test_a_scale_of_3_percent_neither_hides_a_step_nor_makes_one(kind, least, most):
+    rng = np.random.default_rng(11)
+    found = [history(draw(rng, kind, 24)[0]) for _ in range(40)]
+    assert least <= sum(one.changed for one in found) <= most
+    for one_history in found:
+        assert one_history.none + one_history.step + one_history.drift == pytest.approx(1.0)
+
+
+def test_where_and_how_large_a_step_is():
+    rng = np.random.default_rng(2)
+    results, at = draw(rng, "step 5 %", 24)
+    found = history(results)
+    (change,) = found.changes
+    assert change.at == at
+    assert change.change.low < 0.05 < change.change.high
+    assert change.probability > 0.999
+    assert found.drift_change is None
+
+
+def test_two_steps_are_two():
+    rng = np.random.default_rng(4)
+    levels = [104.0] * 10 + [100.0] * 10 + [102.0] * 10
+    found = history([one(level * float(np.exp(0.004 * rng.standard_normal())), time=k)
+                     for k, level in enumerate(levels)])
+    assert [change.at for change in found.changes] == [10, 20]
+
+
+def test_a_drive_that_was_replaced_explains_a_step_of_its_scale():
+    rng = np.random.default_rng(4)
+
+    def told(second):
+        return history([one((104.0 if k < 12 else 106.5) * float(np.exp(0.004 * rng.standard_normal())), time=k,
+                            drive="a" if k < 12 else second) for k in range(24)])
+
+    assert told("a").changed
+    assert not told("b").changed
+
+
+def test_units_and_order_don_t_matter_and_too_few_are_refused():
+    rng = np.random.default_rng(6)
+    results, _ = draw(rng, "step 1 %", 12)
+    scaled = [Measured(3 * r.value, 3 * r.low, 3 * r.high, r.confidence, r.scale_rel_sd, r.drive, r.time)
+              for r in results]
+    assert history(scaled).none == pytest.approx(history(results).none, rel=1e-9)
+    for wrong in (results[:3], results[::-1]):
+        with pytest.raises(ValueError, match="results"):
+            history(wrong)
+    with pytest.raises(ValueError, match="no interval"):
+        difference(results[0], Measured(1.0, 2.0, 1.0))

@@ -1,9 +1,0 @@
-import pytest
-
-
-@pytest.fixture
-def world():
-    """Makes a fake drive with a guard, a log, a stop request and a bench over it."""
-    from tests.run.fake_drive import World
-
-    return World

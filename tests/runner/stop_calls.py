@@ -1,0 +1,13 @@
+"""What a stop asks of the fake drive, and the times that it keeps to there."""
+
+from tdhil.runner.settings import ControlAssumptions
+from tdhil.runner.stop import SILENT_CYCLES, SILENT_S
+from tests.runner.fake_drive import PERIOD_S
+
+SILENT = max(SILENT_CYCLES, round(SILENT_S / PERIOD_S))
+LAG_S = ControlAssumptions().largest_speed_lag_s
+
+
+def asked(drive):
+    """What was asked of the drive, without the exchanges."""
+    return [call for call in drive.calls if call != "exchange" and not call.startswith("enable")]

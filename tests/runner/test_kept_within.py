@@ -1,0 +1,120 @@
+"""What the stages keep to by themselves, before the guard would have to: the torque limit, and an end to coasting.
+
+A setpoint that the guard rejects is a mistake of this program, and ends the run; so no stage may make one.
+"""
+
+import math
+
+import pytest
+
+from drivers.drive import Mode
+from drivers.errors import CommandRejected
+from tdhil.runner.excitation import MotionLimits, RigGuess, SwingPlan
+from tdhil.runner.excitation.pulses import CALM_S, Way
+from tdhil.runner.guard import kept_within
+from tdhil.runner.settings import ControlAssumptions
+from tdhil.runner.stages.acquire import Follower, run_swings
+from tdhil.runner.stages.hold import MeanSpeedControl, run_hold
+from tests.runner.fake_drive import LIMITS, NAN, FakeDrive
+
+ROOM = MotionLimits(LIMITS.speed_min_rad_s, LIMITS.speed_max_rad_s, LIMITS.torque_nm)
+
+
+class Seen(Exception):
+    """Enough cycles."""
+
+
+def turning(world, drive=None, speed=5.0, cycles=50):
+    """In torque mode, at a speed; the display ends it after so many cycles more."""
+    here = world(drive or FakeDrive())
+    here.turn(speed, Mode.TORQUE)
+    here.drive.commands.clear()
+    here.display.seen = 0
+
+    def on_cycle(_stage, seen):
+        if seen >= cycles:
+            raise Seen
+
+    here.display.on_cycle = on_cycle
+    return here
+
+
+def torques(here):
+    return [command.torque_nm for command in here.drive.commands]
+
+
+@pytest.mark.parametrize(("start_rad_s", "target_rad_s", "friction_nm", "end_nm"), [
+    (5.0, 8.0, 500.0, 400.0), (0.5, 1.0, 0.0, -400.0),
+])
+def test_hold_keeps_to_the_torque_limit(world, start_rad_s, target_rad_s, friction_nm, end_nm):
+    """A model with too much friction, or a shaft that is much faster than it was taken for."""
+    model = RigGuess(200.0, 0.0, friction_nm)
+    here = turning(world, FakeDrive(inertia=1e4), speed=9.0 if end_nm < 0.0 else start_rad_s)
+    control = MeanSpeedControl(model, 1000.0, ControlAssumptions())
+    with pytest.raises(Seen):
+        run_hold(here.bench, LIMITS, model, control, target_rad_s, start_rad_s, 0.01)
+    asked = torques(here)
+    assert end_nm in asked
+    assert max(map(abs, asked)) == LIMITS.torque_nm
+
+
+@pytest.mark.parametrize("asked_nm", [900.0, -900.0])
+def test_acquire_keeps_to_the_torque_limit(world, asked_nm):
+    here = turning(world, FakeDrive(inertia=1e4), cycles=20)
+    follower = Follower(here.bench, LIMITS, Mode.TORQUE, None)
+    with pytest.raises(Seen):
+        follower.follow(lambda _: (5.0, asked_nm), 10.0)
+    assert set(torques(here)) == {LIMITS.torque_nm if asked_nm > 0.0 else -LIMITS.torque_nm}
+
+
+def test_acquire_keeps_to_it_with_what_the_slow_loop_adds(world):
+    here = turning(world, FakeDrive(inertia=1e4), cycles=20)
+    control = MeanSpeedControl(RigGuess(200.0, 8.0, 60.0), 1000.0, ControlAssumptions())
+    follower = Follower(here.bench, LIMITS, Mode.TORQUE, control)
+    with pytest.raises(Seen):
+        follower.follow(lambda _: (9.0, 300.0), 10.0)
+    assert max(torques(here)) == LIMITS.torque_nm
+
+
+@pytest.mark.parametrize(("mode", "speed_rad_s", "torque_nm"), [
+    (Mode.TORQUE, 5.0, NAN), (Mode.TORQUE, NAN, 50.0), (Mode.SPEED, NAN, 0.0),
+])
+@pytest.mark.parametrize("slow_loop", [False, True])
+def test_a_reference_that_is_no_number_becomes_no_limit(world, mode, speed_rad_s, torque_nm, slow_loop):
+    """Held to a limit it would be that limit: full torque, or the highest speed."""
+    here = turning(world)
+    control = MeanSpeedControl(RigGuess(200.0, 8.0, 60.0), 1000.0, ControlAssumptions()) if slow_loop else None
+    with pytest.raises(CommandRejected, match="not finite"):
+        Follower(here.bench, LIMITS, mode, control).follow(lambda _: (speed_rad_s, torque_nm), 10.0)
+    assert here.drive.commands == []
+
+
+def test_nor_does_the_seed_of_torque_mode():
+    assert math.isnan(kept_within(NAN, 0.0, 400.0))
+
+
+def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):
+    """It would, of a shaft that is faster than it should be; the guard would end the run on it."""
+    model = RigGuess(200.0, 0.0, 50.0)
+    for stage in ("hold", "acquire"):
+        here = turning(world, FakeDrive(inertia=1e4), speed=9.0)
+        here.guard.no_braking = "the string would hide its answer"
+        control = MeanSpeedControl(model, 1000.0, ControlAssumptions())
+        with pytest.raises(Seen):
+            if stage == "hold":
+                run_hold(here.bench, LIMITS, model, control, 1.0, 0.5, 0.01)
+            Follower(here.bench, LIMITS, Mode.TORQUE, control).follow(lambda _: (1.0, 50.0), 5.0)
+        assert min(torques(here)) == 0.0
+
+
+def test_coasting_ends_where_nothing_slows_the_shaft(world):
+    """Friction was taken too high by far: after twice the planned time it is held again."""
+    guess = RigGuess(100.0, 2.0, 20.0)
+    way = Way(6.0, 2.0, 5.0, guess, coasting=True)
+    plan = SwingPlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)
+    drive = FakeDrive(coulomb=0.0, viscous=0.0)
+    longest = 2.0 * CALM_S + 2.0 * way.duration_s
+    here = turning(world, drive, speed=6.0, cycles=round((longest + 2.0) / drive.period_s))
+    run_swings(here.bench, LIMITS, plan, None, ControlAssumptions(), lambda _: None)
+    coasted = sum(command.torque_nm == 0.0 for command in here.drive.commands)
+    assert coasted * drive.period_s == pytest.approx(2.0 * way.duration_s, abs=0.1)

@@ -1,0 +1,490 @@
+"""The observer alone: a shaft that does what it is reported to do is believed, and a report that lies is found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from drivers import Command, Mode, PowerState
+from tdhil.runner.observer import Signal
+from tests.runner.reporting_rig import LIMITS, Bench, Reports, Rig
+
+COUNT_RAD = 2.0 * math.pi / 8192
+PLAIN, WITH_POSITION = Rig(), Rig(position_count=COUNT_RAD)
+STIFF = Rig(coulomb=80.0, viscous=15.0)
+"""Friction takes a third of the torque limit: enough for a torque report to be held against it."""
+LAGS = (0.0, 0.1, 0.5)
+SPEED_AND_TORQUE = frozenset({Signal.SPEED, Signal.TORQUE})
+SPEED_AND_ANGLE = frozenset({Signal.SPEED, Signal.ANGLE})
+
+
+def frozen(bench, *signals):
+    """A lie: these reports keep the value that they have now."""
+    kept = bench.samples[-1]
+    values = {"speed_rad_s": kept.speed_rad_s, "torque_nm": kept.torque_nm, "position_rad": kept.position_rad}
+    stuck = {name: values[name] for name in signals or values}
+    return lambda reports: reports._replace(**stuck)
+
+
+def changed(signal, scale=1.0, offset=0.0):
+    """A lie: this report has another scale or another zero."""
+    def lie(reports: Reports):
+        return reports._replace(**{signal: scale * getattr(reports, signal) + offset})
+    return lie
+
+
+def ramps(bench):
+    """Between 4 and 6 rad/s, with a second of each."""
+    for speed in (6.0, 4.0):
+        bench.ramp(speed)
+        bench.hold(1.0, speed)
+
+
+# -- healthy ----------------------------------------
+
+
+@st.composite
+def rigs(draw):
+    """A rig that can do what is asked of it, with reports of any plausible lag and resolution."""
+    top = draw(st.sampled_from([2.0, 10.0, 150.0]))
+    acceleration = draw(st.floats(0.1, 1.0)) * top            # of its torque limit without friction, rad/s²
+    inertia = 10.0 ** draw(st.floats(-3.0, 3.5))
+    limit = inertia * acceleration
+    limits = replace(
+        LIMITS, speed_min_rad_s=0.05 * top, speed_max_rad_s=top, torque_nm=limit, probe_torque_nm=0.5 * limit,
+        quick_stop_rad_s2=max(0.05 * top, draw(st.floats(0.05, 0.4)) * acceleration),
+    )
+    rate = draw(st.sampled_from([10.0, 20.0, 50.0, 100.0, 250.0]))
+    return Rig(
+        inertia=inertia, coulomb=draw(st.floats(0.02, 0.2)) * limit, viscous=draw(st.floats(0.0, 0.2)) * limit / top,
+        limits=limits, rate_hz=rate, speed_lag_s=draw(st.floats(0.0, 0.5)), torque_lag_s=draw(st.floats(0.0, 0.5)),
+        noise_rad_s=draw(st.floats(0.0, 0.003)) * top, speed_count=draw(st.floats(0.0005, 0.01)) * top,
+        torque_count=draw(st.floats(0.0005, 0.01)) * limit,
+        position_count=draw(st.sampled_from([0.0, COUNT_RAD])), demand=draw(st.booleans()),
+    )
+
+
+@settings(phases=[Phase.explicit, Phase.reuse, Phase.generate])      # a smaller rig is no simpler one
+@given(rigs(), st.floats(-1.0, 1.0), st.floats(0.05, 0.3), st.floats(0.05, 1.0), st.integers(0, 1000))
+def test_a_healthy_run_raises_no_doubt(rig, wrong, rel_error, frequency_hz, seed):
+    """Standstill, sign probe, levels, torque mode about a mean speed, ramps under speed control, and the stop."""
+    bench, top = Bench(rig, seed), rig.limits.speed_max_rad_s
+    bench.first_levels()
+    assert bench.observer.doubt is None, bench.observer.doubt
+    bench.know(wrong * rel_error, rel_error)
+    bench.ramp(0.5 * top)
+    bench.hold(2.0, 0.5 * top)
+    swing = 0.1 * top
+    fastest_hz = 0.4 * rig.limits.torque_nm / (2.0 * math.pi * rig.inertia * swing)
+    bench.excite(8.0, 0.5 * top, swing, min(frequency_hz, fastest_hz))
+    for share in (0.7, 0.3):
+        bench.ramp(share * top)
+        bench.hold(1.5, share * top)
+    assert bench.observer.doubt is None, bench.observer.doubt
+    assert bench.quick_stop(2.0 * top / rig.limits.quick_stop_rad_s2 / 3.0 + 4.0) == ""
+    assert bench.observer.doubt is None, bench.observer.doubt
+    assert bench.observer.believable
+    assert bench.observer.moved and bench.observer.unseen_s == 0.0
+
+
+@pytest.mark.parametrize("speed_lag_s", [0.1, 0.3, 0.45, 0.5])
+@pytest.mark.parametrize("coulomb", [100.0, 371.0, 500.0])
+@pytest.mark.parametrize("quick_stop_rad_s2", [1.0, 1.8, 2.2, 3.0])
+def test_a_late_speed_goes_on_falling_once_friction_has_stopped_the_shaft(speed_lag_s, coulomb, quick_stop_rad_s2):
+    """At true standstill static friction takes any torque, while the reported speed is still on its way to zero."""
+    limits = replace(LIMITS, torque_nm=1856.0, quick_stop_rad_s2=quick_stop_rad_s2)
+    rig = Rig(inertia=300.0, viscous=37.0, coulomb=coulomb, limits=limits, speed_lag_s=speed_lag_s, torque_lag_s=0.3)
+    bench = Bench(rig).begun(3.0)
+    assert bench.quick_stop(8.0) == ""
+    assert bench.observer.doubt is None, bench.observer.doubt
+    assert bench.observer.believable
+
+
+def test_nothing_is_doubted_of_a_shaft_that_never_moves():
+    bench = Bench(replace(PLAIN, coulomb=1e6))
+    bench.probe()
+    assert bench.observer.doubt is None
+    assert not bench.observer.moved
+
+
+# -- lies about a shaft whose J is known ----------------------------------------
+
+JUMPS = {
+    "lost": changed("speed_rad_s", 0.0), "half": changed("speed_rad_s", 0.5), "twice": changed("speed_rad_s", 2.0),
+    "sign": changed("speed_rad_s", -1.0), "more": changed("speed_rad_s", offset=3.0),
+    "less": changed("speed_rad_s", offset=-2.0),
+}
+
+
+@pytest.mark.parametrize("lag_s", LAGS)
+@pytest.mark.parametrize("name", JUMPS)
+@pytest.mark.parametrize("mode", ["speed", "torque"])
+def test_a_speed_that_jumps_is_found_at_once(name, lag_s, mode):
+    """No torque changes the speed so fast; a few points are enough, whatever the lag."""
+    bench = Bench(replace(PLAIN, speed_lag_s=lag_s, torque_lag_s=0.5 * lag_s)).begun()
+    if mode == "torque":
+        bench.excite(4.0, 5.0, 1.0)
+    bench.lie = JUMPS[name]
+    start_s = bench.time_s
+    for _ in range(10):
+        bench.hold(0.02, 5.0) if mode == "speed" else bench.cycle(Command(Mode.TORQUE, 0.0, 60.0))
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.time_s - start_s <= 0.2
+    assert bench.observer.doubt.signals in (SPEED_AND_TORQUE, frozenset({Signal.TORQUE}))   # beyond its limit: it alone
+    assert not bench.observer.believable
+
+
+@pytest.mark.parametrize("lag_s", LAGS)
+def test_a_lost_encoder_is_found_before_the_shaft_is_fast(lag_s):
+    """The drive's speed control accelerates with all its torque: within the time in which that reaches the limit."""
+    bench = Bench(replace(PLAIN, speed_lag_s=lag_s)).begun()
+    bench.sensor = lambda _: 0.0
+    assert bench.found_after(3.0, lambda: bench.hold(0.02, 5.0)) is not None
+    assert bench.observer.doubt.signals in (SPEED_AND_TORQUE, frozenset({Signal.TORQUE}))   # beyond its limit: it alone
+    assert bench.fastest <= 6.0
+
+
+@pytest.mark.parametrize("lag_s", LAGS)
+@pytest.mark.parametrize("how", ["ramps", "torque mode"])
+def test_a_speed_that_freezes_is_found_once_the_shaft_turns_otherwise(lag_s, how):
+    """Torque goes on and speed does not: within 4 s, the longest window."""
+    bench = Bench(replace(PLAIN, speed_lag_s=lag_s)).begun()
+    if how == "torque mode":
+        bench.excite(4.0, 5.0, 1.0)
+    bench.lie = frozen(bench, "speed_rad_s")
+    start_s = bench.time_s
+    ramps(bench) if how == "ramps" else bench.excite(5.0, 5.0, 1.0)
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.time_s - start_s <= 4.0
+    assert Signal.SPEED in bench.observer.doubt.signals
+
+
+TORQUES = {"sign": (-1.0, 2.5), "lost": (0.0, 6.0), "tenth": (0.1, 6.0), "twice": (2.0, 6.0)}
+
+
+@pytest.mark.parametrize("lag_s", LAGS)
+@pytest.mark.parametrize("name", TORQUES)
+def test_a_torque_that_lies_is_found_in_torque_mode(name, lag_s):
+    """Friction and inertia take 155 ± 160 N·m here."""
+    scale, within_s = TORQUES[name]
+    bench = Bench(replace(STIFF, speed_lag_s=lag_s, torque_lag_s=0.5 * lag_s)).begun()
+    bench.excite(5.0, 5.0, 1.0)
+    assert bench.observer.doubt is None
+    bench.lie = changed("torque_nm", scale)
+    start_s = bench.time_s
+    bench.excite(10.0, 5.0, 1.0)
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.time_s - start_s <= within_s
+    assert Signal.TORQUE in bench.observer.doubt.signals
+
+
+@pytest.mark.parametrize("lag_s", LAGS)
+def test_half_a_torque_is_found_where_it_is_nearly_steady(lag_s):
+    """155 N·m are commanded in the mean of 4 s, and half of it is reported."""
+    bench = Bench(replace(STIFF, speed_lag_s=lag_s, torque_lag_s=0.5 * lag_s)).begun()
+    bench.excite(5.0, 5.0, 0.1)
+    bench.lie = changed("torque_nm", 0.5)
+    start_s = bench.time_s
+    bench.excite(10.0, 5.0, 0.1)
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.time_s - start_s <= 6.0
+    assert Signal.TORQUE in bench.observer.doubt.signals
+
+
+@pytest.mark.parametrize("name", TORQUES)
+def test_a_torque_that_lies_is_found_under_speed_control(name):
+    """Nothing is commanded there: friction and inertia alone contradict it, and half of it may be true."""
+    scale, within_s = TORQUES[name]
+    bench = Bench(STIFF).begun()
+    bench.lie = changed("torque_nm", scale)
+    found_s = bench.found_after(10.0, lambda: ramps(bench))
+    assert found_s is not None and found_s <= within_s
+    assert bench.observer.doubt.signals in (SPEED_AND_TORQUE, frozenset({Signal.TORQUE}))   # beyond its limit: it alone
+
+
+def test_torque_alone_is_doubted_where_it_contradicts_its_command():
+    """From the start, as a wrong unit in the profile: the speed is still believed, and so is standstill."""
+    bench = Bench(STIFF, lie=changed("torque_nm", 0.5))
+    bench.first_levels()
+    assert bench.observer.doubt is None             # J and friction are learned from the same report
+    bench.excite(8.0, 4.0, 0.2)
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.signals == frozenset({Signal.TORQUE})
+    assert bench.observer.believable
+
+
+@pytest.mark.parametrize(("name", "moved_rad_s"), [("dead", 5.0), ("half", 5.0), ("sign", 5.0), ("double", 5.0)])
+def test_a_position_that_does_not_go_as_far_as_the_speed_says(name, moved_rad_s):
+    """Half of the way, and more, is missing within a second."""
+    bench = Bench(WITH_POSITION).begun()
+    here = bench.angle
+    bench.lie = {
+        "dead": frozen(bench, "position_rad"),
+        "half": lambda one: one._replace(position_rad=here + 0.5 * (one.position_rad - here)),
+        "sign": lambda one: one._replace(position_rad=2.0 * here - one.position_rad),
+        "double": lambda one: one._replace(position_rad=here + 2.0 * (one.position_rad - here)),
+    }[name]
+    found_s = bench.found_after(5.0, lambda: bench.hold(0.02, moved_rad_s))
+    assert found_s is not None and found_s <= 3.0
+    assert bench.observer.doubt.signals == SPEED_AND_ANGLE
+
+
+def test_the_position_finds_a_frozen_speed_however_little_torque_it_takes():
+    bench = Bench(WITH_POSITION).begun()
+    bench.lie = frozen(bench, "speed_rad_s")
+    bench.ramp(3.0, 0.2)                             # so slow that torque hardly changes
+    bench.hold(2.0, 3.0)
+    assert bench.observer.doubt is not None
+    assert Signal.SPEED in bench.observer.doubt.signals
+
+
+@pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
+def test_feedback_that_repeats_as_a_whole_is_found_once_the_setpoint_has_moved(rig):
+    bench = Bench(rig).begun()
+    bench.lie = frozen(bench)
+    start_s = bench.time_s
+    bench.ramp(7.0)
+    bench.hold(1.0, 7.0)
+    assert bench.observer.doubt is not None
+    assert bench.observer.doubt.signals == frozenset({Signal.ALL})
+    assert bench.observer.doubt.time_s - start_s <= 2.5
+
+
+# -- before J is known ----------------------------------------
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_after_the_first_level_a_jump_is_found_although_j_is_not_known(name):
+    bench = Bench(PLAIN)
+    bench.first_levels()
+    bench.lie = JUMPS[name]
+    found_s = bench.found_after(1.0, lambda: bench.hold(0.02, 4.0))
+    assert found_s is not None and found_s <= 0.2
+    assert bench.observer.doubt.signals in (SPEED_AND_TORQUE, frozenset({Signal.TORQUE}))   # beyond its limit: it alone
+
+
+def test_during_the_first_ramp_an_encoder_that_dies_is_found_by_the_torque_at_its_limit():
+    bench = Bench(PLAIN)
+    bench.probe()
+    bench.ramp(2.0)
+    bench.sensor = lambda _: 0.0
+    found_s = bench.found_after(5.0, lambda: bench.hold(0.02, 4.0))
+    assert found_s is not None and found_s <= 3.0
+    assert Signal.SPEED in bench.observer.doubt.signals
+
+
+def test_of_a_shaft_that_was_never_seen_to_move_nothing_can_be_said_but_how_long_it_may_turn():
+    """The encoder is dead from the start: a locked shaft reports the same. So it gets time to run out."""
+    bench = Bench(PLAIN, sensor=lambda _: 0.0)
+    bench.probe()
+    assert bench.observer.doubt is None and not bench.observer.moved
+    assert bench.speed > 5.0
+    wait_s = bench.observer.unseen_s
+    assert 0.0 < wait_s <= 60.0
+    bench.state = PowerState.OFF
+    bench.hold(wait_s, 0.0)
+    assert bench.speed == 0.0
+
+
+def test_a_motion_that_was_seen_needs_no_time_to_run_out():
+    bench = Bench(PLAIN)
+    assert bench.observer.unseen_s == 0.0            # no torque was applied either
+    bench.probe()
+    assert bench.observer.moved and bench.observer.unseen_s == 0.0
+
+
+def test_a_position_that_moves_is_a_motion_too():
+    bench = Bench(replace(WITH_POSITION, speed_lag_s=0.0), lie=changed("speed_rad_s", 0.0))
+    bench.probe()
+    assert bench.observer.moved and bench.observer.unseen_s == 0.0
+
+
+def test_blind_s_is_long_enough_for_friction_to_stop_what_lags_hide():
+    bench = Bench(PLAIN)
+    assert bench.observer.blind_s == 0.0             # nothing is known
+    bench = Bench(PLAIN).begun()
+    hidden = 0.5 * PLAIN.friction(0.5) / PLAIN.inertia       # half a second of lag, rad/s
+    assert 0.0 < bench.observer.blind_s <= 5.0
+    bench.state, bench.speed = PowerState.OFF, hidden
+    bench.hold(bench.observer.blind_s, 0.0)
+    assert bench.speed == 0.0
+
+
+# -- the first contradiction, and what becomes of it ----------------------------------------
+
+
+def test_the_first_contradiction_stays():
+    bench = Bench(PLAIN).begun()
+    bench.lie = JUMPS["lost"]
+    bench.hold(0.5, 5.0)
+    first = bench.observer.doubt
+    assert first is not None
+    bench.lie = None
+    bench.hold(1.0, 5.0)
+    bench.lie = changed("torque_nm", -1.0)
+    bench.hold(5.0, 5.0)
+    assert bench.observer.doubt is first
+
+
+def test_a_contradiction_says_what_why_and_what_next():
+    bench = Bench(PLAIN).begun()
+    bench.lie = JUMPS["lost"]
+    bench.hold(0.5, 5.0)
+    doubt = bench.observer.doubt
+    assert "rad/s" in doubt.what and "N·m" in doubt.what and "kg·m²" in doubt.what
+    assert "encoder" in doubt.helps
+
+
+def test_a_speed_that_was_lost_is_not_believed_again():
+    bench = Bench(PLAIN).begun()
+    bench.sensor = lambda _: 0.0
+    bench.found_after(3.0, lambda: bench.hold(0.02, 5.0))
+    bench.quick_stop(20.0)
+    assert not bench.observer.believable
+
+
+@pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
+def test_a_speed_that_stays_frozen_is_not_believed_again(rig):
+    bench = Bench(rig).begun()
+    bench.lie = frozen(bench, "speed_rad_s")
+    bench.ramp(2.0)
+    bench.hold(2.0, 2.0)
+    assert bench.observer.doubt is not None
+    bench.lie = lambda one: one._replace(speed_rad_s=0.0)    # as a gateway that notices it late
+    bench.quick_stop(0.1)
+    if not rig.position_count:
+        bench.quick_stop(10.0)
+        assert not bench.observer.believable
+
+
+def test_a_position_that_lives_stands_in_for_a_lost_speed():
+    bench = Bench(WITH_POSITION).begun()
+    bench.lie = JUMPS["lost"]
+    bench.hold(0.5, 5.0)
+    assert not bench.observer.believable
+    assert bench.quick_stop(8.0) == ""
+    assert bench.observer.believable
+    sample = bench.samples[-1]
+    assert abs(bench.observer.speed_rad_s(sample)) < 0.05 and bench.observer.angle_quiet(0.05)
+
+
+def test_a_position_that_goes_on_is_no_standstill():
+    bench = Bench(WITH_POSITION).begun()
+    bench.lie = JUMPS["lost"]
+    bench.hold(2.0, 5.0)
+    assert not bench.observer.angle_quiet(0.05)
+
+
+@pytest.mark.parametrize("left", [0.1, 0.4])
+def test_a_lost_load_is_a_lighter_shaft_and_its_speed_lives(left):
+    bench = Bench(PLAIN).begun()
+    bench.excite(4.0, 5.0, 1.0)
+    bench.rig = replace(PLAIN, inertia=left * PLAIN.inertia, coulomb=left * PLAIN.coulomb, viscous=left * PLAIN.viscous)
+    for _ in range(round(4.0 / PLAIN.period_s)):
+        bench.cycle(Command(Mode.TORQUE, 0.0, 100.0))
+        if bench.observer.doubt is not None:
+            break
+    assert bench.observer.doubt is not None
+    assert bench.fastest < 1.5 * LIMITS.speed_max_rad_s
+    assert bench.quick_stop(12.0) == ""
+    assert bench.observer.believable                 # it came down as a shaft does
+    assert bench.observer.doubt.lighter
+    assert "load" in bench.observer.doubt.helps
+
+
+# -- what is no feedback ----------------------------------------
+
+
+@pytest.mark.parametrize("gap_s", [0.6, 3.0])
+@pytest.mark.parametrize("seen", ["nothing", "stale samples"])
+def test_a_gap_in_the_feedback_begins_anew(gap_s, seen):
+    """The shaft did something else meanwhile; what comes after the gap is compared with itself alone."""
+    bench = Bench(WITH_POSITION).begun()
+    see = bench.observer.see
+    last = bench.samples[-1]
+    if seen == "nothing":
+        bench.observer.see = lambda *_: None
+    else:
+        bench.observer.see = lambda command, sample: see(command, last._replace(time_s=sample.time_s, fresh=False))
+    before = bench.speed
+    bench.hold(gap_s, 8.0)
+    assert abs(bench.speed - before) > 0.5
+    bench.observer.see = see
+    bench.hold(5.0, bench.speed)
+    assert bench.observer.doubt is None
+    bench.lie = JUMPS["lost"]
+    assert bench.found_after(1.0, lambda: bench.hold(0.02, 8.0)) is not None
+
+
+@pytest.mark.parametrize("signal", ["speed_rad_s", "torque_nm"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_value_that_is_no_number_is_left_out(signal, value):
+    bench = Bench(PLAIN).begun()
+    for cycle in range(300):
+        bench.lie = changed(signal, 0.0, value) if cycle % 7 == 0 else None
+        bench.hold(bench.rig.period_s, 5.0 + 0.002 * cycle)
+    assert bench.observer.doubt is None
+    bench.lie = JUMPS["lost"]
+    assert bench.found_after(1.0, lambda: bench.hold(0.02, 5.0)) is not None
+
+
+# -- against a quick stop ----------------------------------------
+
+FAULTS = {
+    "polarity": {"polarity": -1.0}, "stuck": {"stuck_nm": 200.0}, "inverted": {"inverted_stop": True},
+}
+
+
+@pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_shaft_that_accelerates_against_the_quick_stop_is_seen_in_two_ways(name, rig):
+    """Before it is faster than the limit and what the torque does within 2 s more."""
+    bench = Bench(rig).begun()
+    for what, value in FAULTS[name].items():
+        setattr(bench, what, value)
+    how = bench.quick_stop(12.0)
+    assert len(how.split("; ")) >= 2, how
+    assert bench.fastest <= 1.2 * LIMITS.speed_max_rad_s
+
+
+@pytest.mark.parametrize("rig", [PLAIN, WITH_POSITION])
+@pytest.mark.parametrize("value", [0.0, 5.0])
+def test_a_sensor_that_is_dead_in_the_stop_is_seen_in_two_ways(value, rig):
+    bench = Bench(rig).begun()
+    bench.sensor = lambda _: value
+    bench.hold(0.3, 5.0)
+    how = bench.quick_stop(20.0)
+    assert len(how.split("; ")) >= 2, how
+    assert bench.fastest <= 1.2 * LIMITS.speed_max_rad_s
+
+
+def test_one_way_is_not_enough():
+    """A reported speed that rises and nothing else: the shaft itself comes to rest."""
+    bench = Bench(PLAIN).begun()
+    bench.state = PowerState.QUICK_STOP
+    bench.lie = lambda one: one._replace(speed_rad_s=max(5.0, 10.0 - one.speed_rad_s))
+    assert bench.quick_stop(6.0) == "" or bench.observer.doubt is not None
+
+
+def test_nothing_runs_away_before_a_quick_stop_was_asked_for():
+    bench = Bench(PLAIN, stuck_nm=None).begun()
+    bench.stuck_nm = 200.0
+    bench.hold(3.0, 5.0)
+    assert bench.observer.runs_away(bench.samples[-1]) == ""
+
+
+@pytest.mark.parametrize("name", ["stuck", "inverted"])
+def test_above_a_drill_string_the_torque_is_left_on_below_the_speed_limit(name):
+    """A string that is let go turns back: only a shaft that is beyond its limit is let go."""
+    rig = replace(WITH_POSITION, limits=replace(LIMITS, load="string", torque_ramp_nm_s=40.0))
+    bench = Bench(rig).begun()
+    for what, value in FAULTS[name].items():
+        setattr(bench, what, value)
+    how = bench.quick_stop(12.0)
+    assert how
+    assert bench.speed > LIMITS.speed_max_rad_s
+    assert len(how.split("; ")) >= 2

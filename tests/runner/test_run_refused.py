@@ -1,0 +1,164 @@
+"""What is refused before anything moves, and what the sign probe finds out at walking pace."""
+
+import signal
+from dataclasses import replace
+
+import pytest
+
+from drivers.drive import PowerState
+from drivers.errors import LimitHit, PreflightRefused
+from tdhil.errors import ExitCode, Interrupted, exit_code
+from tdhil.runner.settings import ExcitationRequest
+from tests.runner.fake_drive import LIMITS, FakeDrive, refused_check
+from tests.runner.run_outcomes import assert_at_rest, outcomes
+
+
+def assert_nothing_moved(here, result):
+    assert result.stop is None
+    assert outcomes(result) == [("setup", "aborted")]
+    assert not [call for call in here.drive.calls if call.startswith("enable")]
+    assert here.drive.state is PowerState.OFF
+    assert here.drive.speed == 0.0
+    assert here.drive.closed
+
+
+def test_a_refused_confirmation_moves_nothing(world):
+    here = world()
+
+    def refuse(task, preflight, idle):
+        assert task.limits is LIMITS
+        assert preflight.watchdog_s == 0.5
+        for _ in range(50):
+            idle()                                  # feeds the watchdog while somebody thinks
+        raise PreflightRefused("not confirmed")
+
+    result = here.runner(confirm=refuse).run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert here.drive.cycles == 100                 # a second of standstill, and the idle cycles
+    assert {(command.speed_rad_s, command.torque_nm) for command in here.drive.commands} == {(0.0, 0.0)}
+    assert_nothing_moved(here, result)
+
+
+def test_a_stop_request_at_the_prompt_moves_nothing(world):
+    here = world()
+
+    def think(task, preflight, idle):
+        idle()
+        here.stop_request.ask(signal.SIGINT)
+        idle()
+        raise AssertionError("the stop request was not seen")
+
+    result = here.runner(confirm=think).run()
+    assert isinstance(result.cause, Interrupted)
+    assert_nothing_moved(here, result)
+
+
+def test_a_refused_preflight_moves_nothing_and_says_how_to_mend_it(world):
+    here = world(FakeDrive(refused=(refused_check(), refused_check())))
+    asked = []
+    result = here.runner(confirm=lambda *_: asked.append(1)).run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert "watchdog: wanted armed, found not armed (and 1 more" in str(result.cause)
+    assert result.cause.next_step == "arm it"
+    assert asked == []
+    assert here.drive.cycles == 0
+    assert_nothing_moved(here, result)
+
+
+def test_a_shaft_that_already_turns_is_left_alone(world):
+    here = world(FakeDrive(speed=1.0, coulomb=0.0, viscous=0.0))
+    result = here.runner().run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert "already turns" in str(result.cause)
+    assert result.stop is None
+    assert not [call for call in here.drive.calls if call.startswith("enable")]
+
+
+def test_a_fault_is_reset_on_the_operator_s_word_only(world):
+    for word in (False, True):
+        here = world(FakeDrive(state=PowerState.FAULT, wish=PowerState.FAULT))
+        result = here.runner(reset_fault=word).run()
+        assert ("reset_fault" in here.drive.calls) is word
+        assert (result.cause is None) is word
+
+
+@pytest.mark.parametrize("mode", ["torque", "speed"])
+def test_an_inverted_sign_is_found_at_walking_pace(world, mode):
+    here = world(FakeDrive(direction=-1.0))
+    fastest = []
+    here.display.on_cycle = lambda *_: fastest.append(abs(here.drive.speed))
+    result = here.runner(ExcitationRequest(mode=mode)).run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert exit_code(result.cause) is ExitCode.REFUSED
+    assert "turned backwards" in str(result.cause)
+    assert max(fastest) < 0.1 * LIMITS.speed_max_rad_s
+    assert_at_rest(here, result)
+
+
+def test_a_locked_shaft_ends_the_probe(world):
+    here = world(FakeDrive(shaft_locked=True))
+    result = here.runner().run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert "did not move up to 200 N·m" in str(result.cause)
+    assert max(command.torque_nm for command in here.drive.commands) == 200.0
+    assert result.stop.confirmed
+
+
+def test_the_probe_goes_no_farther_than_it_may(world):
+    """Reported speed is noise about zero while the shaft creeps."""
+    here = world()
+    here.limits = replace(LIMITS, probe_travel_rad=0.02)
+    here.drive.misbehave = lambda drive, sample: sample._replace(speed_rad_s=min(0.09, sample.speed_rad_s))
+    result = here.runner().run()
+    assert "without a clear direction" in str(result.cause)
+    assert here.drive.speed == 0.0
+
+
+class TightDrive(FakeDrive):
+    """Its own limits were tighter than the rig's, and stayed."""
+
+    kept = (None, None)
+
+    def preflight(self, limits):
+        torque_nm, speed_rad_s = self.kept
+        return replace(super().preflight(limits), kept_torque_nm=torque_nm, kept_speed_rad_s=speed_rad_s)
+
+
+@pytest.mark.parametrize(("kept", "flag"), [
+    ((0.0, None), "--accept-wider-limit torque"),
+    ((None, 0.4), "--accept-wider-limit speed"),              # the window begins at 0.5
+])
+def test_limits_of_the_drive_that_leave_no_room(world, kept, flag):
+    here = world(TightDrive())
+    here.drive.kept = kept
+    result = here.runner().run()
+    assert int(exit_code(result.cause)) == 4
+    assert flag in result.cause.next_step
+    assert_nothing_moved(here, result)
+
+
+def test_the_run_keeps_within_the_drive_s_own_limits(world):
+    here = world(TightDrive())
+    here.drive.kept = (150.0, 4.0)
+    seen = []
+
+    def confirm(task, preflight, idle):
+        seen.append(task.limits)
+        raise PreflightRefused("seen enough")
+
+    here.runner(confirm=confirm).run()
+    (limits,) = seen
+    assert (limits.torque_nm, limits.probe_torque_nm, limits.speed_max_rad_s) == (150.0, 150.0, 4.0)
+
+
+def test_a_plan_that_this_shaft_is_too_heavy_for_ends_in_its_own_words(world):
+    """It has moved by then: a limit leaves no room, and the shaft was stopped."""
+    here = world()
+    request = ExcitationRequest(kind="sine", frequency_hz=2.0, amplitude_rad_s=2.0, offset_rad_s=5.0, periods=3)
+    outcome = here.runner(request).run()
+    assert isinstance(outcome.cause, LimitHit)
+    assert exit_code(outcome.cause) == 7
+    assert "as stages 2 and 3 have shown it" in outcome.cause.what
+    assert "The shaft was stopped" in outcome.cause.next_step
+    assert "--amplitude" in outcome.cause.next_step
+    assert outcome.stop.confirmed

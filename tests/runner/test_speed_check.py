@@ -1,0 +1,41 @@
+"""The angle that a drive counts against the speed that it reports, as far as no drive is needed for it."""
+
+import math
+
+import pytest
+
+from drivers.drive import Mode, PositionReading, PowerState, Sample
+from tdhil.runner.speed_check import Angles
+
+SPEED_RAD_S, PERIOD_S, COUNT_RAD = 5.0, 0.04, 2.0 * math.pi / 8192
+
+
+def sample(time_s):
+    return Sample(time_s, 0.0, 0.0, True, SPEED_RAD_S, 0.0, None, Mode.SPEED, PowerState.ENABLED, False, False, 0)
+
+
+def compared(late_s, *, factor=1.0, half_width_s=0.001, seconds=4.0):
+    """What is known after so long; ``late_s(cycle)``: how long after its sample the angle of a cycle is read."""
+    angles = Angles()
+    for cycle in range(round(seconds / PERIOD_S)):
+        time_s = cycle * PERIOD_S
+        angles.saw(sample(time_s))
+        read_s = time_s + late_s(cycle)
+        angle = COUNT_RAD * math.floor(factor * SPEED_RAD_S * read_s / COUNT_RAD)
+        angles.read(PositionReading(read_s, half_width_s, angle, None, "6064h"), SPEED_RAD_S)
+    return angles.ratio()
+
+
+@pytest.mark.parametrize("late", [
+    lambda cycle: 0.0, lambda cycle: 0.02, lambda cycle: 0.3 if cycle > 95 else 0.0, lambda cycle: 0.004 * cycle,
+], ids=["never", "always", "at the end", "more and more"])
+@pytest.mark.parametrize("factor", [1.0, 2.0, 0.5])
+def test_a_host_that_was_late_sees_the_same_ratio(late, factor):
+    """The shaft turned on between a sample and the reading behind it."""
+    assert compared(late, factor=factor).value == pytest.approx(factor, rel=0.005)
+
+
+def test_what_is_not_known_of_time_is_not_known_of_the_ratio():
+    sharp, dull = compared(lambda cycle: 0.0), compared(lambda cycle: 0.0, half_width_s=0.01)
+    assert dull.half_width > sharp.half_width + 0.004
+    assert compared(lambda cycle: 0.0, half_width_s=0.2) is None

@@ -1,0 +1,121 @@
+"""Each condition of standstill by itself: all others hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from drivers import Mode, PowerState, Sample
+from tdhil.runner.standstill import Standstill
+
+AT_REST, SETTLE_S, GAP_S, PERIOD_S = 0.05, 1.5, 0.2, 0.02
+
+
+@dataclass
+class Told:
+    """What the observer says of the reports."""
+
+    believable: bool = True
+    position_quiet: bool = True
+    blind_s: float = 0.0
+    unseen_s: float = 0.0
+    by_position: float | None = None
+
+    def speed_rad_s(self, sample):
+        return sample.speed_rad_s if self.by_position is None else self.by_position
+
+    def angle_quiet(self, at_rest_rad_s):
+        assert at_rest_rad_s == AT_REST
+        return self.position_quiet
+
+
+def sample(time_s, speed=0.0, state=PowerState.QUICK_STOP, standstill=True):
+    return Sample(time_s, 0.0, 0.0, True, speed, 0.0, None, Mode.SPEED, state, standstill, False, 0x27)
+
+
+def rested_after(told, seconds=20.0, **report):
+    """How long it takes until standstill is seen, s; None within ``seconds``."""
+    rest = Standstill(told, AT_REST, SETTLE_S, GAP_S)
+    for cycle in range(1, round(seconds / PERIOD_S)):
+        if rest.see(sample(cycle * PERIOD_S, **report)):
+            return (cycle - 1) * PERIOD_S
+    return None
+
+
+@pytest.mark.parametrize("report", [
+    {}, {"speed": 0.9 * AT_REST}, {"speed": -0.9 * AT_REST},
+    *({"state": state, "standstill": False} for state in (PowerState.OFF, PowerState.READY, PowerState.FAULT)),
+    {"state": PowerState.ENABLED},
+])
+def test_all_conditions_hold(report):
+    assert rested_after(Told(), **report) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
+
+
+@pytest.mark.parametrize("report", [
+    {"speed": 1.1 * AT_REST}, {"speed": -1.1 * AT_REST}, {"speed": float("nan")}, {"speed": float("inf")},
+    *({"state": state, "standstill": False}
+      for state in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)),
+])
+def test_a_report_that_shows_none(report):
+    assert rested_after(Told(), **report) is None
+
+
+@pytest.mark.parametrize("told", [Told(believable=False), Told(position_quiet=False), Told(by_position=1.0)])
+def test_an_observer_that_shows_none(told):
+    assert rested_after(told) is None
+
+
+def test_a_position_that_stands_in_for_a_speed_in_doubt():
+    assert rested_after(Told(by_position=0.0), speed=4.0) is not None
+
+
+@pytest.mark.parametrize("told", [Told(blind_s=4.0), Told(unseen_s=4.0), Told(blind_s=3.0, unseen_s=4.0)])
+def test_it_lasts_as_long_as_the_observer_asks_for(told):
+    assert rested_after(told) == pytest.approx(4.0, abs=2.0 * PERIOD_S)
+
+
+def test_an_observer_that_asks_for_less_shortens_nothing():
+    assert rested_after(Told(blind_s=0.1, unseen_s=0.1)) == pytest.approx(SETTLE_S, abs=2.0 * PERIOD_S)
+
+
+def at_seconds(seconds, *reports):
+    """Standstill over so long, with other samples in between: `(time, sample)`; when it is seen."""
+    rest, others = Standstill(Told(), AT_REST, SETTLE_S, GAP_S), dict(reports)
+    for cycle in range(1, round(seconds / PERIOD_S)):
+        one = others.get(cycle, sample(cycle * PERIOD_S))
+        if one is not None and rest.see(one):
+            return cycle * PERIOD_S
+    return None
+
+
+def test_one_sample_that_turns_begins_anew():
+    assert at_seconds(4.0, (50, sample(1.0, speed=0.2))) == pytest.approx(1.0 + SETTLE_S, abs=3.0 * PERIOD_S)
+
+
+def test_a_single_lost_frame_does_not():
+    assert at_seconds(4.0, (50, None)) == pytest.approx(SETTLE_S, abs=3.0 * PERIOD_S)
+
+
+def test_a_longer_gap_shows_nothing():
+    lost = [(cycle, None) for cycle in range(50, 65)]
+    assert at_seconds(4.0, *lost) == pytest.approx(65 * PERIOD_S + SETTLE_S, abs=3.0 * PERIOD_S)
+
+
+def test_a_state_that_shows_none_at_the_end_waits_for_one_that_does():
+    """The time at rest counts; the state must show it in the sample that ends it."""
+    shown = {"state": PowerState.UNKNOWN, "standstill": False}
+    unknown = [(cycle, sample(cycle * PERIOD_S, **shown)) for cycle in range(60, 100)]
+    assert at_seconds(4.0, *unknown) == pytest.approx(100 * PERIOD_S, abs=2.0 * PERIOD_S)
+
+
+def test_doubt_that_comes_while_it_rests_undoes_it():
+    told = Told()
+    rest = Standstill(told, AT_REST, SETTLE_S, GAP_S)
+    for cycle in range(1, 60):
+        assert not rest.see(sample(cycle * PERIOD_S))
+    told.believable = False
+    assert not rest.see(sample(60 * PERIOD_S))
+    told.believable = True
+    seen = [cycle for cycle in range(61, 200) if rest.see(sample(cycle * PERIOD_S))]
+    assert seen[0] * PERIOD_S == pytest.approx(61 * PERIOD_S + SETTLE_S, abs=3.0 * PERIOD_S)

@@ -1,0 +1,217 @@
+"""The stop sequence: its order, and that a turning shaft is never disabled."""
+
+import pytest
+
+from drivers.drive import Command, Mode, PowerState
+from drivers.errors import CommunicationLost, StopNotConfirmed
+from tdhil.errors import ExitCode, exit_code
+from tdhil.runner.stop import StopReport, not_confirmed
+from tests.runner.fake_drive import FakeDrive
+from tests.runner.stop_calls import LAG_S, asked
+
+MODES = pytest.mark.parametrize("mode", Mode)
+
+
+@MODES
+def test_quick_stop_then_standstill_then_disable_then_confirmed(world, mode):
+    here = world()
+    here.turn(5.0, mode)
+    start_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert report.disabled
+    assert report.trouble == ()
+    assert asked(here.drive) == ["quick_stop", "disable"]
+    assert here.drive.disabled_at == [0.0]
+    # 5 rad/s at 2 rad/s² and the wait for the lags
+    assert report.at_rest_s - start_s == pytest.approx(5.0 / 2.0 + 3.0 * LAG_S, abs=0.3)
+
+
+@MODES
+def test_the_reported_speed_must_be_zero_for_longer_than_the_largest_lag(world, mode):
+    """Status word and reported speed say standstill from the first cycle on: the shaft may still turn."""
+    here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(speed_rad_s=0.0, standstill=True)))
+    here.turn(2.0, mode)
+    start_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.at_rest_s - start_s >= 3.0 * LAG_S
+    assert here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize("what", ["status", "speed"])
+def test_one_witness_of_standstill_is_not_enough(world, what):
+    change = {"standstill": False} if what == "status" else {"speed_rad_s": 0.3}
+    here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(**change)))
+    here.turn(5.0)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert not report.disabled
+    assert "not seen at rest" in report.trouble[-1]
+    assert "disable" not in here.drive.calls
+    assert here.drive.disabled_at == []
+
+
+@MODES
+def test_a_turning_shaft_is_never_disabled(world, mode):
+    here = world(FakeDrive(brakes=False))
+    here.turn(5.0, mode)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert report.at_rest_s is None
+    assert "disable" not in here.drive.calls
+    assert here.drive.disabled_at == []
+    error = not_confirmed(report)
+    assert isinstance(error, StopNotConfirmed)
+    assert exit_code(error) is ExitCode.STOP_NOT_CONFIRMED
+    assert "hard-wired emergency stop" in error.next_step
+
+
+@MODES
+def test_speed_mode_comes_first_where_a_quick_stop_does_not_brake_in_torque_mode(world, mode):
+    here = world(FakeDrive(quick_stop_in_torque_mode=False))
+    here.turn(5.0, mode)
+    modes = []
+    quick_stop = here.drive.quick_stop
+
+    def noted():
+        modes.append(here.drive.mode)
+        quick_stop()
+
+    here.drive.quick_stop = noted
+    assert here.stop_sequence().run().confirmed
+    assert modes == [Mode.SPEED]
+    assert here.drive.disabled_at == [0.0]
+
+
+def test_a_mode_that_never_comes_does_not_keep_the_quick_stop_from_being_sent(world):
+    here = world(FakeDrive(quick_stop_in_torque_mode=False, misbehave=lambda drive, s: s._replace(mode=None)))
+    here.drive.state = here.drive.wish = PowerState.ENABLED
+    here.drive.speed = 3.0
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.drive.calls.index("quick_stop") == pytest.approx(0.5 / here.bench.period_s, abs=1)
+
+
+def test_a_drive_that_never_confirms_that_it_is_disabled(world):
+    here = world()
+    here.turn(5.0)
+    here.drive.disable = lambda: None
+    report = here.stop_sequence().run()
+    assert report.at_rest_s is not None
+    assert not report.confirmed
+    assert "did not confirm that it is disabled" in report.trouble[-1]
+
+
+@pytest.mark.parametrize("method", ["quick_stop", "disable"])
+@pytest.mark.parametrize("times", [1, 10])
+def test_a_request_that_the_drive_does_not_take_at_first_is_made_again(world, method, times):
+    """The contract lets every method of a drive raise."""
+    here = world()
+    here.turn(5.0)
+    plain, left = getattr(here.drive, method), [times]
+
+    def reluctant():
+        if left[0]:
+            left[0] -= 1
+            raise CommunicationLost("busy")
+        plain()
+
+    setattr(here.drive, method, reluctant)
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert "busy" in report.trouble[0]
+    assert here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize("method", ["quick_stop", "disable"])
+def test_a_request_that_is_never_taken_ends_in_a_report_all_the_same(world, method):
+    here = world()
+    here.turn(5.0)
+
+    def never():
+        raise RuntimeError("no")
+
+    setattr(here.drive, method, never)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert here.drive.disabled_at == []
+
+
+@pytest.mark.parametrize("part", ["log", "display"])
+def test_a_broken_log_or_display_does_not_stop_the_stop(world, part):
+    here = world()
+    here.turn(5.0)
+
+    def broken(*_):
+        raise OSError("disk full")
+
+    getattr(here, part).on_cycle = broken
+    assert here.stop_sequence().run().confirmed
+    assert here.bench.stop_side_troubles
+
+
+def test_it_runs_once_and_a_second_call_gives_the_first_report(world):
+    here = world()
+    here.turn(5.0)
+    sequence = here.stop_sequence()
+    report = sequence.run()
+    calls = list(here.drive.calls)
+    assert sequence.run() is report
+    assert here.drive.calls == calls
+
+
+def test_a_stop_request_does_not_disturb_it(world):
+    here = world()
+    here.turn(5.0)
+    here.stop_request.ask(2)
+    here.stop_request.ask(2)
+    assert here.stop_sequence().run().confirmed
+
+
+def test_a_guard_that_has_tripped_does_not_disturb_it(world):
+    here = world()
+    here.turn(5.0)
+    here.drive.speed = 14.0
+    assert here.stop_sequence().run().confirmed
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0])
+def test_a_drive_in_fault_is_at_rest_when_its_shaft_is(world, speed):
+    here = world()
+    here.turn(5.0)
+    here.drive.speed = speed
+    here.drive.fault()
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.drive.disabled_at == []
+    assert here.drive.state is PowerState.FAULT
+    assert here.drive.speed == 0.0
+
+
+def test_a_faulted_drive_whose_shaft_goes_on_turning_is_not_confirmed(world):
+    here = world(FakeDrive(brakes=False, coulomb=0.0, viscous=0.0))
+    here.turn(5.0)
+    here.drive.fault()
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+
+
+def test_a_shaft_that_never_moved_is_disabled_after_the_wait(world):
+    here = world()
+    here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.state is PowerState.OFF
+
+
+def test_no_state_is_expected_any_more(world):
+    here = world()
+    here.turn(5.0)
+    assert here.guard.expected is PowerState.ENABLED
+    here.stop_sequence().run()
+    assert here.guard.expected is None
+
+
+def test_without_any_trouble_to_name_it_is_as_loud():
+    assert "no standstill seen" in str(not_confirmed(StopReport(False, None, False)))

@@ -1,0 +1,279 @@
+"""The stop where the drive's reports contradict each other, show no state, or show a shaft that accelerates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+
+from drivers import Mode, PowerState
+from drivers.drive import Command
+from drivers.errors import PreflightRefused
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.stages.setup import probe_sign
+from tests.runner.fake_drive import LIMITS, PERIOD_S, SPEED_RESOLUTION, FakeDrive
+from tests.runner.string_drive import StringWorld
+
+STRING = replace(LIMITS, load="string", torque_ramp_nm_s=40.0)
+
+
+@dataclass
+class Reporting(FakeDrive):
+    """Reports its position, answers polls and can be told to remove its torque; each of the reports may lie.
+
+    ``sees``: the speed that the drive reports instead of its own. ``pushes_nm``: the torque that acts in its quick
+    stop. ``polled``: the speed that a single request shows.
+    """
+
+    sees: float | None = None
+    scale: float = 1.0
+    pushes_nm: float | None = None
+    polled: float | None = None
+    no_state: bool = False
+    with_position: bool = False
+    angle: float = 0.0
+    polls: int = 0
+
+    def report(self):
+        sample = super().report()
+        if self.sees is not None or self.scale != 1.0:
+            speed = self.scale * self.speed if self.sees is None else self.sees
+            rests = self.state is PowerState.QUICK_STOP and abs(speed) < 1e-9
+            sample = sample._replace(speed_rad_s=speed, standstill=rests)
+        if self.no_state:
+            sample = sample._replace(speed_rad_s=0.0, torque_nm=0.0, state=PowerState.UNKNOWN, standstill=False)
+        angle = 0.0 if self.no_state else self.angle
+        return sample._replace(position_rad=angle) if self.with_position else sample
+
+    def poll(self):
+        self.polls += 1
+        sample = self.report()
+        return sample if self.polled is None else sample._replace(speed_rad_s=self.polled, standstill=False)
+
+    def _move(self, command):
+        if self.pushes_nm is not None and self.state is PowerState.QUICK_STOP:
+            self.torque = self.pushes_nm
+            self._push(self.torque)
+        else:
+            super()._move(command)
+        self.angle += self.speed * self.period_s
+
+
+class Removing(Reporting):
+    """Its torque can be taken away, too."""
+
+    def remove_torque(self):
+        self.calls.append("remove_torque")
+        self.wish = PowerState.OFF
+
+
+def known(world, speed=5.0, limits=LIMITS, kind=Removing, **options):
+    """Turning, with J and friction as stage 2 found them."""
+    here = world(kind(**options), limits)
+    here.turn(speed)
+    drive = here.drive
+    here.guard.know(RigGuess(drive.inertia, drive.viscous, drive.coulomb, 0.2))
+    if drive.with_position:
+        here.guard.observer.position(1e-3, math.inf)
+        here.guard.observer.compare_position(1.0)
+    here.bench.hold(Command(Mode.SPEED, speed, 0.0), 3.0)
+    return here
+
+
+def doubted(here, speed=5.0):
+    """Turn on until there is a doubt; the guard raises it."""
+    with pytest.raises(Exception, match=r"contradict|lighter|faster"):
+        here.bench.hold(Command(Mode.SPEED, speed, 0.0), 5.0)
+    assert here.guard.observer.doubt is not None
+
+
+def never_disabled(drive):
+    return "disable" not in drive.calls and "remove_torque" not in drive.calls and drive.disabled_at == []
+
+
+# -- a speed in doubt ----------------------------------------
+
+
+def test_a_speed_that_is_lost_disables_nothing(world):
+    """The shaft does come to standstill, but nothing that tdhil believes shows it."""
+    here = known(world)
+    here.drive.sees = 0.0
+    doubted(here)
+    report = here.stop_sequence().run()
+    assert not report.confirmed and not report.disabled and report.at_rest_s is None
+    assert never_disabled(here.drive)
+    assert "standstill cannot be confirmed" in report.trouble[-1] and "not disabled" in report.trouble[-1]
+
+
+def test_with_a_position_that_lives_standstill_is_confirmed(world):
+    here = known(world, with_position=True)
+    here.drive.sees = 0.0
+    doubted(here)
+    report = here.stop_sequence().run()
+    assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
+def test_with_a_position_that_goes_on_it_is_not(world):
+    """Zero is reported; the shaft, by its position, turns on."""
+    here = known(world, with_position=True)
+    here.drive.sees = 0.0
+    doubted(here)
+    here.drive.pushes_nm = here.drive.coulomb + 5.0 * here.drive.viscous
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+
+
+def test_in_torque_mode_zero_torque_comes_before_the_quick_stop(world):
+    here = known(world)
+    here.turn(5.0, Mode.TORQUE)
+    here.drive.sees = 3.0
+    with pytest.raises(Exception, match="contradict"):
+        here.bench.hold(Command(Mode.TORQUE, 0.0, 100.0), 5.0)
+    begun = len(here.drive.commands)
+    here.stop_sequence().run()
+    first = here.drive.commands[begun:begun + 5]
+    assert all(one.mode is Mode.TORQUE and one.torque_nm == 0.0 for one in first)
+    assert "quick_stop" in here.drive.calls and "disable" not in here.drive.calls
+
+
+def test_a_doubt_keeps_the_watchdog_fed(world):
+    """The drive's watchdog brakes under speed control, too."""
+    here = known(world)
+    unfed = []
+    here.drive.stop_feeding = lambda: unfed.append(True)
+    here.drive.sees = 3.0
+    doubted(here)
+    here.stop_sequence().run()
+    assert unfed == []
+
+
+# -- no valid state ----------------------------------------
+
+
+@pytest.mark.parametrize("with_position", [False, True])
+def test_a_drive_that_shows_no_state_gets_its_quick_stop_again_and_again(world, with_position):
+    """All feedback is zero. A position that jumps to zero is no motion."""
+    here = known(world, with_position=with_position)
+    here.drive.no_state = True
+    here.drive.calls.clear()
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed and not report.disabled
+    assert never_disabled(here.drive)
+    assert here.drive.calls.count("quick_stop") >= 0.5 * (here.bench.now_s - begun_s)
+
+
+def test_a_state_that_comes_back_is_enough(world):
+    here = known(world)
+    here.drive.no_state = True
+    cycles = here.drive.cycles
+
+    def back(drive, sample):
+        drive.no_state = drive.cycles < cycles + round(4.0 / PERIOD_S)
+        return sample
+
+    here.drive.misbehave = back
+    report = here.stop_sequence().run()
+    assert report.confirmed and here.drive.disabled_at == [0.0]
+
+
+# -- polls ----------------------------------------
+
+
+def test_a_poll_that_contradicts_the_cycle_prevents_disabling(world):
+    here = known(world)
+    here.drive.polled = 2.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed and never_disabled(here.drive)
+    assert here.drive.polls > 0
+    assert any("a single request 2.000 rad/s" in line for line in report.trouble)
+
+
+def test_a_poll_that_agrees_is_asked_before_disabling(world):
+    here = known(world)
+    report = here.stop_sequence().run()
+    assert report.confirmed and here.drive.polls >= 1
+
+
+# -- a shaft that accelerates ----------------------------------------
+
+
+@pytest.mark.parametrize("with_position", [False, True])
+def test_a_runaway_loses_its_torque_and_nothing_is_confirmed(world, with_position):
+    here = known(world, with_position=with_position)
+    here.drive.pushes_nm = 400.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None
+    assert here.drive.calls.count("remove_torque") == 1
+    assert here.drive.disabled_at[0] <= 1.2 * LIMITS.speed_max_rad_s
+    assert any("accelerates against the quick stop" in line for line in report.trouble)
+
+
+def test_a_drive_that_only_knows_disable_is_disabled(world):
+    here = known(world, kind=Reporting)
+    here.drive.pushes_nm = 400.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed and len(here.drive.disabled_at) == 1
+
+
+@pytest.mark.parametrize("more", ["position", "demand"])
+def test_a_torque_report_that_lies_is_no_runaway(world, more):
+    """300 N·m too much in the stop, and a shaft that gets slower: position or demand shows which report is wrong."""
+    here = known(world, with_position=more == "position")
+
+    def too_much(drive, one):
+        demand = one.torque_nm if more == "demand" else None
+        return one._replace(torque_nm=one.torque_nm + 300.0 * (drive.state is PowerState.QUICK_STOP),
+                            torque_demand_nm=demand)
+
+    here.drive.misbehave = too_much
+    report = here.stop_sequence().run()
+    assert "remove_torque" not in here.drive.calls, report.trouble
+    assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
+
+
+def test_above_a_string_the_torque_stays_on_below_the_limit(world):
+    """It turns at a third of its limit and is pushed on, but no faster: the string must not be let go."""
+    here = known(world, speed=3.0, limits=STRING, with_position=True)
+    here.drive.pushes_nm = here.drive.coulomb + 6.0 * here.drive.viscous       # up to 6 rad/s of 10
+    report = here.stop_sequence().run()
+    assert not report.confirmed and not report.disabled
+    assert here.drive.speed > 3.0
+    assert never_disabled(here.drive)
+
+
+def test_above_a_string_it_is_removed_beyond_the_limit(world):
+    here = known(world, limits=STRING, with_position=True)
+    here.drive.pushes_nm = 400.0
+    follow = here.drive.follow_s
+    here.drive.follow_s = 1e9              # nothing brakes it under speed control either
+    report = here.stop_sequence().run()
+    here.drive.follow_s = follow
+    assert not report.confirmed
+    assert here.drive.calls.count("remove_torque") == 1
+    assert here.drive.disabled_at[0] > STRING.speed_max_rad_s
+
+
+# -- a motion that was never seen ----------------------------------------
+
+
+def test_a_sign_probe_that_saw_no_motion_waits_until_the_shaft_has_run_out(world):
+    """The encoder is dead, so the probe's torque has turned the shaft, and only friction stops it."""
+    here = world(Reporting(sees=0.0, brakes=False, viscous=4.0))
+    here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
+    with pytest.raises(PreflightRefused, match="did not move"):
+        probe_sign(here.bench, LIMITS, Mode.TORQUE, SPEED_RESOLUTION)
+    assert here.drive.speed > 1.0 and not here.guard.observer.moved
+    wait_s, begun_s = here.guard.observer.unseen_s, here.bench.now_s
+    here.drive.pushes_nm = 0.0             # a quick stop that sees zero brakes nothing
+    report = here.stop_sequence().run()
+    assert wait_s > 3.0 and here.bench.now_s - begun_s >= wait_s
+    assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at), report
+
+
+def test_a_release_whose_speed_follows_is_not():
+    here = StringWorld(replace(STRING, quick_stop_rad_s2=2.0), twist_nm=300.0, stiffness=30.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed and here.guard.observer.doubt is None

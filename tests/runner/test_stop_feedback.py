@@ -1,0 +1,83 @@
+"""The stop sequence where feedback fails for a while, for good, or says nothing that is a speed."""
+
+import pytest
+
+from drivers.drive import PowerState
+from drivers.errors import CommunicationLost
+from tdhil.runner.stop import LONGEST_GAP_CYCLES, LONGEST_GAP_S
+from tests.runner.fake_drive import PERIOD_S, FakeDrive, lost
+from tests.runner.stop_calls import LAG_S, SILENT, asked
+
+
+@pytest.mark.parametrize("first", [0, 1, 60, 200])
+@pytest.mark.parametrize("error", [CommunicationLost("a frame is missing"), RuntimeError("what?"), ValueError("no")])
+def test_exchanges_that_fail_for_a_while_are_survived(world, first, error):
+    here = world()
+    here.turn(5.0)
+    begun = here.drive.cycles
+
+    def stumble(drive, sample):
+        if first <= drive.cycles - begun - 1 < first + SILENT - 1:
+            raise error
+        return sample
+
+    here.drive.misbehave = stumble
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert str(error) in report.trouble
+    assert here.drive.disabled_at == [0.0]
+
+
+@pytest.mark.parametrize("misbehave", [lost, lambda drive, sample: sample._replace(fresh=False)], ids=["dead", "stale"])
+def test_a_drive_that_can_not_be_reached_is_given_up_and_left_to_its_watchdog(world, misbehave):
+    here = world()
+    here.turn(5.0)
+    begun = here.drive.cycles
+    here.drive.misbehave = misbehave
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert not report.disabled
+    assert here.drive.cycles - begun == SILENT
+    assert asked(here.drive) == ["quick_stop"]
+    assert here.drive.disabled_at == []
+
+
+@pytest.mark.parametrize(("missing_s", "anew"), [(0.5 * LONGEST_GAP_S, False), (1.5 * LONGEST_GAP_S, True)])
+def test_a_longer_gap_in_the_feedback_begins_the_wait_anew(world, missing_s, anew):
+    here = world()
+    here.turn(5.0)
+    begun, missing = here.drive.cycles, round(missing_s / PERIOD_S)
+
+    def stumble(drive, sample):
+        return sample._replace(fresh=False) if 150 <= drive.cycles - begun < 150 + missing else sample
+
+    here.drive.misbehave = stumble
+    start_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    begins_s = (150 + missing) * PERIOD_S if anew else 5.0 / 2.0
+    assert report.at_rest_s - start_s == pytest.approx(begins_s + 3.0 * LAG_S, abs=0.15)
+
+
+@pytest.mark.parametrize(("missing", "confirmed"), [(LONGEST_GAP_CYCLES - 1, True), (LONGEST_GAP_CYCLES, False)])
+def test_on_a_slow_line_the_gap_is_counted_in_cycles(world, missing, confirmed):
+    """At 10 Hz, again and again: some frames are lost for each that comes."""
+    here = world(FakeDrive(period_s=0.1))
+    here.turn(1.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % (missing + 1) == 0)
+    assert here.stop_sequence().run().confirmed is confirmed
+
+
+def test_speed_feedback_that_is_no_number_is_no_standstill(world):
+    here = world(FakeDrive(misbehave=lambda drive, sample: sample._replace(speed_rad_s=float("nan"))))
+    here.drive.state = here.drive.wish = PowerState.ENABLED
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+
+
+def test_silence_is_told(world):
+    here = world()
+    here.turn(5.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=False)
+    assert here.stop_sequence().run().trouble == ("no feedback from the drive any more",)

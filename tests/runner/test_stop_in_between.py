@@ -1,0 +1,160 @@
+"""A stop in which things come and go: speed, feedback, torque, the drive's state."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from drivers.drive import Mode, PowerState
+from drivers.errors import CommunicationLost
+from tdhil.runner.settings import ControlAssumptions
+from tests.runner.fake_drive import PERIOD_S, FakeDrive
+from tests.runner.string_drive import StringDrive, StringWorld
+
+SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
+
+
+def cycle_feedback(drive, sample):
+    """As the drive's ``gone`` says; what comes may tell of another torque or speed."""
+    if drive.gone(drive.cycles):
+        return sample._replace(fresh=False)
+    return sample._replace(**drive.told)
+
+
+@dataclass
+class Seen(FakeDrive):
+    """Can be looked at, and a look tells the truth."""
+
+    def __post_init__(self):
+        self.misbehave, self.gone, self.told = cycle_feedback, lambda cycle: False, {}
+
+    def poll(self):
+        return self.report()
+
+
+@dataclass
+class SeenString(StringDrive):
+    """The same with a string on it."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.misbehave, self.gone, self.told = cycle_feedback, lambda cycle: False, {}
+
+    def poll(self):
+        return self.report()
+
+
+def test_a_shaft_that_turns_once_more_is_waited_for_anew(world):
+    here = world()
+    here.turn(2.0)
+    begun = here.drive.cycles
+    again = range(begun + 120, begun + 125)            # at rest for more than a second by then
+
+    def turns(drive, sample):
+        return sample._replace(speed_rad_s=0.5, standstill=False) if drive.cycles in again else sample
+
+    here.drive.misbehave = turns
+    begin_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert report.at_rest_s - begin_s >= 125 * PERIOD_S + SETTLE_S - 0.05
+
+
+def test_feedback_that_comes_back_gives_the_shaft_time_anew(world):
+    """Gone twice for less than looks wait for a shaft that gets no slower."""
+    here = world(Seen(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    begun = here.drive.cycles
+
+    def gone(cycle):
+        here.drive.brakes = cycle > begun + 100
+        return cycle < begun + 100 and not begun + 50 <= cycle < begun + 55
+
+    here.drive.gone = gone
+    assert here.stop_sequence().run().confirmed
+
+
+@pytest.mark.parametrize("told", [{"torque_nm": 300.0}, {"torque_nm": 300.0, "speed_rad_s": 5.0}],
+                         ids=["gone", "not believed"])
+def test_torque_of_feedback_that_is_gone_or_not_believed_is_not_held(told):
+    """A look shows the string at ease: so it may be disabled."""
+    here = StringWorld()
+    here.drive = here.bench.drive = SeenString()
+    here.drive.state = here.drive.wish = PowerState.QUICK_STOP
+    here.drive.told = told
+    if "speed_rad_s" not in told:
+        here.drive.gone = lambda cycle: cycle > 30
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert report.disabled
+
+
+def test_time_without_feedback_counts_where_speed_mode_is_not_followed():
+    here = StringWorld(speed=4.0)
+    plain = here.drive._move
+
+    def deaf(command):
+        if here.drive.state is not PowerState.ENABLED:
+            here.drive.angle = 0.0
+            plain(command)
+
+    here.drive._move = deaf
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % 10 == 0)
+    report = here.stop_sequence().run()
+    assert "did not follow speed mode" in report.trouble[0]
+    assert here.bench.now_s < 60.0
+
+
+def test_without_feedback_nothing_is_let_go():
+    here = StringWorld(twist_nm=300.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=not 150 <= drive.cycles < 160)
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.commands[148].speed_rad_s != 0.0, "it yields by then"
+    assert [command.speed_rad_s for command in here.drive.commands[150:160]] == [0.0] * 10
+    assert here.drive.commands[165].speed_rad_s != 0.0
+
+
+def test_a_fault_while_torque_is_let_go_ends_that_and_is_told_once():
+    here = StringWorld(twist_nm=300.0)
+
+    def faults(drive, sample):
+        if drive.cycles == 150:
+            drive.fault()
+        return sample
+
+    here.drive.misbehave = faults
+    report = here.stop_sequence().run()
+    assert sum("while trapped torque is let go" in line for line in report.trouble) == 1
+
+
+@pytest.mark.parametrize(("follows", "most"), [(True, 2), (False, 0.5 / PERIOD_S + 1)])
+def test_quick_stop_comes_as_soon_as_speed_mode_is_there(world, follows, most):
+    here = world(FakeDrive(quick_stop_in_torque_mode=False))
+    here.turn(5.0, Mode.TORQUE)
+    if not follows:
+        here.drive.misbehave = lambda drive, sample: sample._replace(mode=Mode.TORQUE)
+    before = len(here.drive.calls)
+    here.stop_sequence().run()
+    calls = here.drive.calls[before:]
+    assert calls.index("quick_stop") <= most
+    assert follows or calls.index("quick_stop") > 10
+
+
+@pytest.mark.parametrize("gone", ["missing", "frozen"])
+def test_a_look_that_fails_is_told_and_the_stop_goes_on(world, gone):
+    @dataclass
+    class Unseen(Seen):
+        def poll(self):
+            raise CommunicationLost("6041h does not answer")
+
+    here = world(Unseen())
+    here.turn(5.0)
+    if gone == "missing":
+        here.drive.gone = lambda cycle: True
+    else:
+        here.drive.told = {"speed_rad_s": 5.0, "standstill": False}
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert any("6041h does not answer" in line for line in report.trouble)
+    assert here.drive.calls.count("quick_stop") == 1
+    assert "disable" not in here.drive.calls

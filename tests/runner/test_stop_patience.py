@@ -1,0 +1,40 @@
+"""How long the stop sequence waits for a shaft to come to rest."""
+
+import pytest
+
+from tests.runner.fake_drive import PERIOD_S, FakeDrive
+from tests.runner.stop_calls import LAG_S
+
+
+def test_a_heavy_shaft_at_its_torque_limit_is_waited_for(world):
+    """Ten times as long as the ramp: it gets slower all the while."""
+    here = world(FakeDrive(brakes=False, coulomb=0.0, viscous=0.0))
+    here.turn(5.0)
+    here.drive.misbehave = lambda drive, sample: setattr(drive, "speed", max(0.0, drive.speed - 0.1 * PERIOD_S)) or (
+        sample._replace(standstill=drive.speed == 0.0))
+    start_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert report.at_rest_s - start_s == pytest.approx(5.0 / 0.1 + 3.0 * LAG_S, abs=1.0)
+
+
+def test_how_long_it_was_waited_for_is_said(world):
+    here = world(FakeDrive(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    waited_s = here.bench.now_s - begun_s
+    # 3·ω_max/a + 2·3·lag + 1
+    assert waited_s == pytest.approx(3.0 * 10.0 / 2.0 + 6.0 * LAG_S + 1.0, abs=0.1)
+    assert f"within {waited_s:.1f} s" in report.trouble[-1]
+
+
+def test_cycles_without_feedback_count_as_time(world):
+    here = world(FakeDrive(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    begun, begun_s = here.drive.cycles, here.bench.now_s
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=(drive.cycles - begun) % 3 == 0)
+    here.stop_sequence().run()
+    assert here.bench.now_s - begun_s == pytest.approx(19.0, abs=0.2)

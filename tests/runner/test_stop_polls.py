@@ -1,0 +1,296 @@
+"""A stop without the cycle's feedback: single looks tell of rest, and never lead to a turning shaft being let go."""
+
+from dataclasses import dataclass, replace
+
+import pytest
+
+from drivers.drive import Mode, PowerState
+from drivers.errors import CommandRejected, CommunicationLost
+from tdhil.runner.settings import ControlAssumptions
+from tdhil.runner.stop import AFTER_S, EVERY_S, REST_AFTER_S, SILENT_S, SLOWING_S, UNMOVED_S, FeedbackPolls, Slowing
+from tests.runner.fake_drive import LIMITS, PERIOD_S, FakeDrive
+
+SETTLE_S = 3.0 * ControlAssumptions().largest_speed_lag_s
+
+
+@dataclass
+class LookedAt(FakeDrive):
+    """Can be looked at; ``gone``: what became of the cycle's feedback."""
+
+    looks: int = 0
+    answers: bool = True
+    raises: BaseException | None = None
+    gone: str = ""
+
+    def __post_init__(self):
+        self.misbehave = self._report
+        self._frozen = None
+
+    def _report(self, drive, sample):
+        if self.gone == "missing":
+            return sample._replace(fresh=False)
+        if self.gone == "error":
+            raise CommunicationLost("no statusword")
+        if self.gone == "frozen":
+            self._frozen = self._frozen or sample
+            return self._frozen._replace(time_s=sample.time_s)
+        return sample
+
+    def poll(self):
+        self.looks += 1
+        if self.raises is not None:
+            raise self.raises
+        return self.report() if self.answers else None
+
+
+def stopped(world, gone, speed=5.0, **options):
+    here = world(LookedAt(**options))
+    here.turn(speed)
+    here.drive.gone = gone
+    return here, here.stop_sequence().run()
+
+
+@pytest.mark.parametrize("gone", ["missing", "error"])
+@pytest.mark.parametrize("speed", [0.0, 5.0])
+def test_without_feedback_looks_confirm_it(world, gone, speed):
+    here, report = stopped(world, gone, speed)
+    assert report.confirmed and report.disabled
+    assert here.drive.disabled_at == [0.0]
+    assert any("one question at a time" in line for line in report.trouble)
+    # Ramp, settling, disabling and settling again, and the looks no closer together than said.
+    took_s = speed / 2.0 + 2.0 * SETTLE_S
+    assert here.drive.looks <= took_s / EVERY_S + 10
+
+
+def test_what_is_heard_of_the_cycle_is_enough(world):
+    here = world(LookedAt(misbehave=None))
+    here.turn(5.0)
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.looks == 1       # one, before the drive is disabled
+
+
+@pytest.mark.parametrize("options", [
+    {"answers": False}, {"raises": CommunicationLost("gone")}, {"raises": RuntimeError("what?")},
+    {"raises": KeyboardInterrupt()},
+])
+@pytest.mark.parametrize("gone", ["missing", "error"])
+def test_looks_that_bring_nothing_take_no_longer_than_none(world, gone, options):
+    here = world(LookedAt(**options))
+    here.turn(5.0)
+    here.drive.gone = gone
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None
+    assert "disable" not in here.drive.calls
+    assert here.bench.now_s - begun_s <= SILENT_S + 2 * PERIOD_S
+    assert 1 <= here.drive.looks <= 5
+
+
+def test_a_shaft_that_looks_show_turning_is_left_to_the_watchdog_soon(world):
+    here = world(LookedAt(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "missing"
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "own watchdog" in report.trouble[-1]
+    assert "disable" not in here.drive.calls and here.drive.disabled_at == []
+    assert here.bench.now_s - begun_s <= AFTER_S + SLOWING_S + 3.0 * EVERY_S
+
+
+def test_without_a_watchdog_that_would_act_the_host_goes_on_asking(world):
+    """The drive takes the quick stop only after a while; nobody else would stop the shaft."""
+
+    class Late(LookedAt):
+        def poll(self):
+            self.brakes = self.looks > 20
+            return super().poll()
+
+    here = world(Late(brakes=False))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "missing"
+    report = here.stop_sequence(watched=False).run()
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+
+
+def test_one_that_coasts_to_rest_is_waited_for(world):
+    here = world(LookedAt(brakes=False))
+    here.turn(5.0)
+    here.drive.gone = "missing"
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+
+
+def test_frozen_feedback_is_not_believed_against_a_look(world):
+    here, report = stopped(world, "frozen")
+    assert report.confirmed
+    assert here.drive.disabled_at == [0.0]
+    assert any("not believed any more" in line for line in report.trouble)
+
+
+@pytest.mark.parametrize("options", [{"brakes": False}, {"answers": False}, {"raises": CommunicationLost("gone")}])
+def test_frozen_feedback_that_no_look_contradicts_is_never_rest(world, options):
+    here = world(LookedAt(**options))
+    here.turn(5.0)
+    here.drive.coulomb = here.drive.viscous = 0.0
+    here.drive.gone = "frozen"
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+
+
+def test_feedback_that_goes_after_rest_was_seen(world):
+    """Disabling, and staying at rest, are told by looks alone."""
+    here = world(LookedAt())
+    here.turn(2.0)
+    disable = here.drive.disable
+
+    def gone_by_now():
+        here.drive.gone = "missing"
+        disable()
+
+    here.drive.disable = gone_by_now
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert here.bench.now_s - begun_s < 1.0 + SETTLE_S + REST_AFTER_S
+    assert here.drive.looks >= SETTLE_S / EVERY_S - 2
+
+
+@pytest.mark.parametrize("period_s", [0.004, 0.02, 0.2])
+def test_looks_are_due_by_time(period_s):
+    drive = LookedAt()
+    drive.mode = Mode.SPEED
+    looks = FeedbackPolls(drive, period_s)
+    for _ in range(round(2.0 / period_s)):
+        looks.missed()
+    assert drive.looks <= (2.0 - AFTER_S) / max(EVERY_S, period_s) + 2
+    assert drive.looks >= (2.0 - AFTER_S) / max(EVERY_S, period_s) - 2
+    looks.heard()
+    assert not looks.standing
+    assert looks.missed() is None or period_s >= AFTER_S
+
+
+@dataclass
+class Starved(FakeDrive):
+    """Is driven on by somebody else at ``driven`` rad/s, until its watchdog has heard nothing for a while."""
+
+    driven: float | None = 5.0
+    watchdog_s: float = 0.5
+    unfed_since_s: float | None = None
+    refuses: int = 0
+    rejects: bool = False
+
+    def stop_feeding(self):
+        self.calls.append("stop_feeding")
+        if self.rejects:
+            raise CommandRejected("somebody else feeds it, too")
+        if self.refuses:
+            self.refuses -= 1
+            raise CommunicationLost("busy")
+        self.unfed_since_s = self.clock.now_s()
+
+    def _move(self, command):
+        unfed = self.unfed_since_s is not None and self.clock.now_s() - self.unfed_since_s > self.watchdog_s
+        if unfed and self.state is not PowerState.FAULT:
+            self.fault()
+        super()._move(command)
+        if self.driven is not None and self.state is not PowerState.FAULT:
+            self.speed = self.driven
+
+
+@pytest.mark.parametrize("refuses", [0, 3])
+def test_a_shaft_that_somebody_drives_on_is_left_to_the_watchdog_and_watched(world, refuses):
+    here = world(Starved(driven=None, refuses=refuses))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    begun_s = here.bench.now_s
+    report = here.stop_sequence().run()
+    assert here.drive.calls.count("stop_feeding") == 1 + refuses
+    assert here.drive.unfed_since_s - begun_s == pytest.approx(UNMOVED_S, abs=0.2)
+    assert report.confirmed and here.drive.speed == 0.0 and here.drive.disabled_at in ([], [0.0])
+    assert any("sign of life was ended" in line for line in report.trouble)
+    assert report.trouble.count("busy") == refuses
+
+
+def test_a_watchdog_that_takes_its_time_is_waited_for(world):
+    """As long again as for a quick stop of the host's."""
+    here = world(Starved(driven=None, watchdog_s=14.0))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    assert here.stop_sequence().run().confirmed
+
+
+def test_a_drive_that_somebody_else_feeds_too_is_asked_once(world):
+    here = world(Starved(driven=None, rejects=True))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert here.drive.calls.count("stop_feeding") == 1
+    assert report.trouble[0] == "somebody else feeds it, too"
+    assert not any("sign of life was ended" in line for line in report.trouble)
+
+
+@pytest.mark.parametrize("options", [{"watched": False}, {}])
+def test_a_drive_without_a_watchdog_or_one_that_can_not_is_fed_on(world, options):
+    drive = Starved(driven=None) if options else FakeDrive(brakes=False)
+    here = world(drive)
+    here.turn(5.0)
+    drive.driven, drive.coulomb, drive.viscous = 5.0, 0.0, 0.0
+    report = here.stop_sequence(**options).run()
+    assert not report.confirmed and "stop_feeding" not in drive.calls
+
+
+def test_a_watchdog_that_does_not_act_either_is_said(world):
+    here = world(Starved(driven=None, watchdog_s=1e9))
+    here.turn(5.0)
+    here.drive.driven = 5.0
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None
+    assert here.drive.calls.count("stop_feeding") == 1 and "disable" not in here.drive.calls
+
+
+@pytest.mark.parametrize("inertia", [100.0, 1500.0])
+def test_a_shaft_that_brakes_as_well_as_it_can_is_fed_to_the_end(world, inertia):
+    """Down the drive's ramp, and a heavy one by its friction alone, for more than a minute."""
+    here = world(Starved(driven=None, inertia=inertia, brakes=inertia < 1000.0))
+    here.turn(9.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed and "stop_feeding" not in here.drive.calls
+
+
+def test_a_swinging_string_or_a_long_ramp_is_no_shaft_that_goes_on_turning(world):
+    for limits in (replace(LIMITS, load="string", torque_ramp_nm_s=20.0), replace(LIMITS, quick_stop_rad_s2=0.1)):
+        here = world(Starved(driven=None), limits)
+        here.turn(5.0)
+        here.drive.driven = 5.0
+        sequence, unfed = here.stop_sequence(), []
+        here.drive.stop_feeding = lambda unfed=unfed, here=here: unfed.append(here.bench.now_s)
+        quick_stop, begun = here.drive.quick_stop, []
+        here.drive.quick_stop = lambda begun=begun, here=here, ask=quick_stop: (begun.append(here.bench.now_s), ask())
+        sequence.run()
+        assert unfed[0] - begun[0] == pytest.approx(10.0, abs=0.3)
+
+
+def test_slowing():
+    slowing = Slowing(0.05)
+    assert all(slowing.see(0.1 * k, 5.0 * 0.97 ** (0.1 * k)) for k in range(100))
+    assert all(slowing.see(10.0 + 0.1 * k, 0.04 * (-1) ** k) for k in range(100))
+    assert not all(slowing.see(30.0 + 0.1 * k, 2.0) for k in range(12))
+    slowing.reset()
+    assert not all(slowing.see(32.0 + 0.1 * k, -2.0) for k in range(12))
+    slowing.reset()
+    assert slowing.see(40.0, 9.0)
+    assert not slowing.see(41.0, float("nan"))
+
+
+def test_a_drive_that_can_not_be_looked_at_is_not():
+    looks = FeedbackPolls(FakeDrive(), PERIOD_S)
+    assert looks.ask() is None
+    assert all(looks.missed() is None for _ in range(round(3.0 / PERIOD_S)))
+    assert (looks.answered, looks.standing) == (0, True)

@@ -1,0 +1,426 @@
+"""Stopping with a drill string: its trapped torque comes down on the ramp, and nobody lets go of a wound-up string."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.drive import Check, Command, Identity, Mode, Outcome, PowerState
+from drivers.errors import DriveFault, LimitHit, PreflightRefused
+from tdhil.runner.preconditions import refuse_with_string
+from tdhil.runner.settings import ExcitationRequest
+from tdhil.runner.stop import BLOCK_S, LONGEST_S, MODE_S, StopTimeout
+from tdhil.runner.string_release import (
+    FASTEST_SWING_S,
+    QUIET_S,
+    STIFFEST,
+    TRAVEL_RAD,
+    StringRelease,
+    StringReleaseLimits,
+)
+from tests.runner.fake_drive import NAN, PERIOD_S, FakeDrive, lost, refused_check
+from tests.runner.string_drive import RESIDUAL_NM, STRING, StringWorld
+
+LIMITS = StringReleaseLimits(torque_nm=400.0, speed_rad_s=10.0, ramp_nm_s=20.0, torque_resolution_nm=1.0)
+
+
+def torques(here):
+    """Every torque that was reported, from the beginning of the stop."""
+    seen = []
+    here.drive.misbehave = lambda drive, sample: (seen.append(sample.torque_nm), sample)[1]
+    return seen
+
+
+@pytest.mark.parametrize("twist_nm", [300.0, -300.0, 100.0])
+def test_trapped_torque_comes_down_on_the_ramp_before_anything_is_disabled(twist_nm):
+    here = StringWorld(twist_nm=twist_nm)
+    seen = torques(here)
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert report.trouble == ()
+    assert report.trapped_nm == pytest.approx(twist_nm, rel=0.05)
+    assert abs(here.drive.string_nm) < 2.0 * RESIDUAL_NM
+    assert here.drive.disabled_at == [0.0]
+    assert here.drive.calls.index("quick_stop") > 0.9 * abs(twist_nm) / 20.0 / PERIOD_S   # on the ramp, and not before
+    calls = [call for call in here.drive.calls if call != "exchange"]
+    assert calls == ["quick_stop", "disable"]
+    # Never faster than the ramp, seen over a second; friction's sign is all that jumps.
+    second = round(1.0 / PERIOD_S)
+    falls = [abs(a) - abs(b) for a, b in zip(seen, seen[second:], strict=False)]
+    assert max(falls) < 20.0 * 1.5 + 2.0 * here.drive.coulomb
+    # Never through zero to the other side.
+    sign = math.copysign(1.0, twist_nm)
+    assert min(sign * torque for torque in seen) > -RESIDUAL_NM
+    assert here.drive.work_j <= 1e-9   # the motor gave nothing to the string
+
+
+def test_reverse_rotation_is_no_more_than_the_twist_asks_for():
+    here = StringWorld(twist_nm=300.0)
+    assert not STRING.allow_reverse
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.lowest_speed >= -1.0 - 1e-9          # a tenth of the speed limit
+    assert here.drive.angle == pytest.approx(0.0, abs=0.15)
+    assert here.drive.angle > -0.01
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_from_a_turning_shaft_in_either_mode(mode):
+    here = StringWorld(speed=4.0, mode=mode, stiffness=10.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert report.trapped_nm > 20.0                        # what it was wound up by on the way to rest
+    assert abs(here.drive.string_nm) < 2.0 * RESIDUAL_NM
+    assert "quick_stop" in here.drive.calls
+
+
+def test_a_string_that_swings_is_waited_for():
+    here = StringWorld(swing_nm=200.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert here.bench.now_s > 10.0 * math.log(200.0 / RESIDUAL_NM) / 2.0
+    assert abs(here.drive.string_nm) < RESIDUAL_NM
+
+
+def test_an_untwisted_string_takes_the_wait_for_half_a_swing_only():
+    here = StringWorld()
+    assert here.stop_sequence().run().confirmed
+    assert here.bench.now_s == pytest.approx(QUIET_S + 2 * 1.5, abs=0.5)
+
+
+def test_the_torque_s_offset_is_nothing_trapped():
+    here = StringWorld()
+    here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=sample.torque_nm + 30.0)
+    assert here.stop_sequence(torque_offset_nm=30.0).run().confirmed
+
+
+def test_a_drive_that_leaves_speed_mode_gets_the_quick_stop_and_is_left_holding():
+    here = StringWorld(twist_nm=300.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(mode=None)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert not report.disabled
+    assert "still holds 300 N·m" in report.trouble[-1]
+    assert "disable" not in here.drive.calls
+    assert here.drive.calls.index("quick_stop") == pytest.approx(MODE_S / PERIOD_S, abs=2)
+    assert here.drive.disabled_at == []
+
+
+def test_a_drive_that_falls_out_while_it_lets_go():
+    here = StringWorld(twist_nm=300.0)
+
+    def fault(drive, sample):
+        if drive.cycles == 100:
+            drive.state = drive.wish = PowerState.QUICK_STOP
+        return sample
+
+    here.drive.misbehave = fault
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert any("while trapped torque is let go" in line for line in report.trouble)
+    assert "still holds" in report.trouble[-1]
+    assert "disable" not in here.drive.calls
+
+
+def test_a_drive_without_torque_holds_nothing():
+    """In fault the string has turned back by itself already."""
+    here = StringWorld(twist_nm=0.0)
+    here.drive.fault()
+    report = here.stop_sequence().run()
+    assert report.confirmed
+    assert report.trapped_nm == 0.0
+
+
+def test_torque_that_is_still_reported_by_a_drive_without_any_is_not_held():
+    here = StringWorld()
+    here.drive.fault()
+    here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=300.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+
+
+def test_torque_that_does_not_come_down_is_given_up_and_held():
+    here = StringWorld(twist_nm=300.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=300.0)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert any("did not come down: 300 N·m at first" in line for line in report.trouble)
+    assert "disable" not in here.drive.calls
+    assert here.bench.now_s < 2 * 300.0 / 20.0 + 90.0 + 30.0
+
+
+def test_torque_that_is_no_number_is_given_up_and_held():
+    here = StringWorld(twist_nm=300.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(torque_nm=NAN)
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+    assert here.bench.now_s < 150.0
+
+
+@pytest.mark.parametrize("begin", [1, 50])
+@pytest.mark.parametrize("dead", [lost, lambda drive, sample: sample._replace(fresh=False)], ids=["dead", "stale"])
+def test_a_drive_that_falls_silent_is_left_to_its_watchdog(begin, dead):
+    here = StringWorld(twist_nm=300.0, speed=0.0)
+    here.drive.misbehave = lambda drive, sample: dead(drive, sample) if drive.cycles >= begin else sample
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "disable" not in here.drive.calls
+    assert here.drive.cycles < begin + 150
+
+
+@pytest.mark.parametrize("begin", [2, 60])
+def test_single_lost_frames_are_survived(begin):
+    here = StringWorld(twist_nm=60.0, speed=1.0, stiffness=50.0)
+    here.drive.misbehave = lambda drive, sample: sample._replace(fresh=drive.cycles % 10 >= 3 or drive.cycles < begin)
+    assert here.stop_sequence().run().confirmed
+
+
+def test_a_shaft_that_does_not_follow_speed_mode_gets_the_quick_stop():
+    here = StringWorld(speed=4.0)
+    plain = here.drive._move
+
+    def deaf(command):
+        if here.drive.state is PowerState.ENABLED:
+            here.drive.torque = 0.0                       # goes on turning as before
+        else:
+            here.drive.angle = 0.0
+            plain(command)
+
+    here.drive._move = deaf
+    report = here.stop_sequence().run()
+    assert "did not follow speed mode" in report.trouble[0]
+    assert here.drive.speed == 0.0
+    assert report.at_rest_s is not None
+
+
+@pytest.mark.parametrize("last", ["none", "nan"])
+def test_it_begins_from_a_speed_of_zero_where_none_is_known(last):
+    here = StringWorld()
+    here.bench.last = None if last == "none" else here.bench.last._replace(speed_rad_s=NAN)
+    assert here.stop_sequence().run().confirmed
+    assert here.drive.commands[0].speed_rad_s == 0.0
+
+
+@pytest.mark.parametrize("told", [40.0, -40.0, 1e12, NAN])
+def test_one_wrong_report_is_not_followed(told):
+    """What tripped the run is the last report; a ramp from there would drive the shaft up to it."""
+    here = StringWorld(speed=4.0, stiffness=10.0)
+    here.drive.wish = PowerState.ENABLED
+    here.drive.misbehave = lambda drive, sample: sample._replace(speed_rad_s=told) if drive.cycles == 3 else sample
+    with pytest.raises((DriveFault, LimitHit)):
+        here.bench.hold(Command(Mode.SPEED, 4.0, 0.0), 1.0)
+    begun = len(here.drive.commands)
+    assert here.stop_sequence().run().confirmed
+    assert 3.9 < here.drive.commands[begun].speed_rad_s <= 4.0
+    assert max(abs(command.speed_rad_s) for command in here.drive.commands) <= 4.0
+
+
+def test_a_speed_beyond_the_limit_is_braked_from_the_limit():
+    here = StringWorld(speed=1e12, stiffness=0.1)
+    here.stop_sequence().run()
+    assert here.drive.commands[0].speed_rad_s == pytest.approx(10.0 - 2.0 * PERIOD_S)
+
+
+def test_backwards_too_it_comes_to_rest_first():
+    here = StringWorld(replace(STRING, allow_reverse=True), speed=-3.0, stiffness=5.0)
+    report = here.stop_sequence().run()
+    assert report.confirmed, report.trouble
+    assert here.drive.commands[0].speed_rad_s == pytest.approx(-3.0 + 2.0 * PERIOD_S)
+    assert report.trapped_nm < 0.0
+
+
+# -- letting go, pure ----------------------------------------------------------------------------------------------
+
+
+def letting_go(limits=LIMITS, period_s=0.02):
+    return StringRelease(limits, 0.05, period_s)
+
+
+@settings(max_examples=60)
+@given(rows=st.lists(st.tuples(st.floats(-500.0, 500.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60))
+def test_it_only_ever_yields(rows):
+    going = letting_go()
+    for torque, speed in rows:
+        wanted = going.step(torque, speed)
+        assert wanted * torque <= 0.0
+        assert abs(wanted) <= 1.0
+
+
+@pytest.mark.parametrize("wrong", [(NAN, 0.0), (0.0, NAN), (math.inf, 0.0), (0.0, -math.inf)])
+def test_what_is_no_number_holds_the_shaft(wrong):
+    going = letting_go()
+    assert going.torque_nm == 0.0
+    for _ in range(200):
+        going.step(0.0, 0.0)
+    assert going.step(*wrong) == 0.0
+    for _ in range(299):
+        going.step(0.0, 0.0)
+    assert not going.done              # the quiet began anew
+    for _ in range(2):
+        going.step(0.0, 0.0)
+    assert going.done
+
+
+def test_torque_about_zero_has_no_side_that_it_could_change():
+    """Ripple below what counts as none: what comes after it is yielded to as if there had been no ripple."""
+    calm, rippled = letting_go(), letting_go()
+    for k in range(600):
+        calm.step(0.0, 0.0)
+        rippled.step(0.6 * RESIDUAL_NM * (-1.0) ** (k // 30), 0.0)
+    assert rippled.step(300.0, 0.0) == pytest.approx(calm.step(300.0, 0.0)) != 0.0
+
+
+@settings(max_examples=25, deadline=None)
+@given(stiffness=st.floats(20.0, 20_000.0), lag_s=st.sampled_from([0.0, 0.15, 0.4]), trapped=st.floats(-380.0, 380.0))
+def test_any_string_is_let_go_behind_any_plausible_lag(stiffness, lag_s, trapped):
+    """From 20 to 20 000 N·m/rad, the torque seen through a lag and the speed followed through another."""
+    going, angle, seen, speed = letting_go(), trapped / stiffness, trapped, 0.0
+    for _ in range(round(going.longest_s / 0.02) + 4000):
+        wanted = going.step(seen, speed)
+        speed += (wanted - speed) * min(1.0, 0.02 / 0.05)
+        angle += speed * 0.02
+        seen += (stiffness * angle - seen) * (min(1.0, 0.02 / lag_s) if lag_s else 1.0)
+        if going.done:
+            break
+    assert going.done
+    assert not going.failed
+    assert abs(stiffness * angle) < 2.0 * LIMITS.residual_nm
+
+
+def test_an_oscillation_faster_than_any_string_makes_it_stiffer():
+    def yields_after(swing_s):
+        going = letting_go()
+        for step in range(1000):
+            going.step(200.0 * math.sin(2.0 * math.pi * 0.02 * step / swing_s), 0.0)
+        for _ in range(40):
+            last = going.step(-40.0, 0.0)
+        return last
+
+    assert yields_after(2.5 * FASTEST_SWING_S) == pytest.approx(40.0 / 80.0)
+    assert yields_after(1.5) == pytest.approx(40.0 / 80.0 / STIFFEST, rel=1e-6)
+
+
+def test_its_bounds_in_time_and_travel():
+    going = letting_go()
+    going.step(100.0, 0.0)
+    assert going.longest_s == pytest.approx(2.0 * 100.0 / 20.0 + 90.0)
+    steps = 0
+    while not going.failed:
+        going.step(100.0, 0.0)
+        steps += 1
+    assert steps * 0.02 == pytest.approx(100.0, abs=0.05)
+    slow = letting_go(replace(LIMITS, ramp_nm_s=0.1))
+    steps = 0
+    while not slow.failed:
+        slow.step(-5000.0 if steps else -100.0, 0.0)
+        steps += 1
+    assert slow.travel_rad == pytest.approx(TRAVEL_RAD, abs=0.05)
+
+
+@pytest.mark.parametrize(("limit", "resolution", "residual"), [(400.0, 1.0, 8.0), (400.0, 10.0, 50.0)])
+def test_what_counts_as_nothing(limit, resolution, residual):
+    limits = replace(LIMITS, torque_nm=limit, torque_resolution_nm=resolution)
+    assert limits.residual_nm == residual
+
+
+# -- patience ------------------------------------------------------------------------------------------------------
+
+
+def waited(speeds, enough_s=19.0, period_s=0.5):
+    patience = StopTimeout(enough_s, 0.05)
+    for speed in speeds:
+        if patience.over:
+            break
+        if speed is None:
+            patience.wait(period_s)
+        else:
+            patience.see(speed, period_s)
+    return patience.waited_s
+
+
+def endless(first, factor):
+    speed = first
+    while True:
+        yield speed
+        speed *= factor
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_shaft_that_gets_slower_is_waited_for_and_one_that_does_not_is_not(sign):
+    assert waited(endless(sign * 10.0, 1.0)) == pytest.approx(19.5)
+    assert waited([*[sign * (10.0 - 0.05 * k) for k in range(100)], *[5.0] * 1000]) == pytest.approx(50.0 + 15.5, abs=6)
+    assert waited(endless(sign * 10.0, 0.998)) == pytest.approx(LONGEST_S + 0.5, abs=0.6)
+    assert waited(endless(sign * 10.0, 0.9995)) == pytest.approx(19.5)     # half a percent in a block is nothing
+
+
+def test_noise_at_rest_is_no_getting_slower():
+    assert waited(endless(0.04, 0.99)) == pytest.approx(19.5)
+    assert waited([None] * 1000) == pytest.approx(19.5)
+
+
+def test_a_long_ramp_is_waited_for_in_any_case():
+    assert waited(endless(10.0, 1.0), enough_s=60.0) == pytest.approx(60.5)
+    assert BLOCK_S == 5.0
+
+
+# -- what a string forbids -----------------------------------------------------------------------------------------
+
+
+REAL = Identity(1, 2, 3, 4, "real", simulated=False)
+
+
+def preflight_of(**change):
+    from drivers.drive import DriveLimits
+
+    found = FakeDrive().preflight(DriveLimits(10.0, 400.0, 2.0, 0.5))
+    return replace(found, **change)
+
+
+@pytest.mark.parametrize(
+    ("limits", "request_", "preflight", "what"),
+    [
+        (STRING, ExcitationRequest(kind="coast-down"), {}, "coast-down"),
+        (replace(STRING, torque_ramp_nm_s=0.0), ExcitationRequest(), {}, "how fast"),
+        (STRING, ExcitationRequest(), {"safe_action": "coast"}, "watchdog reaction is 'coast'"),
+        (STRING, ExcitationRequest(), {"safe_action": "none"}, "watchdog reaction"),
+        (STRING, ExcitationRequest(), {"safe_action": "none", "watchdog_s": 0.0}, "no watchdog is armed"),
+        (replace(STRING, accept_no_watchdog=True), ExcitationRequest(), {"watchdog_s": 0.0}, "--accept-no-watchdog"),
+        (STRING, ExcitationRequest(), {"safe_action": "fault_reaction"}, "watchdog reaction is 'fault_reaction'"),
+        (STRING, ExcitationRequest(), {"quick_stop_holds": False}, "lets go of it"),
+        (STRING, ExcitationRequest(), {"fed_by_any_client": True, "identity": REAL}, "any client feeds"),
+        (STRING, ExcitationRequest(), {"quick_stop_holds": None}, "nobody knows"),
+    ],
+)
+def test_what_a_string_forbids(limits, request_, preflight, what):
+    with pytest.raises(PreflightRefused, match=what) as caught:
+        refuse_with_string(limits, request_, preflight_of(**preflight))
+    assert caught.value.where
+    assert caught.value.next_step
+    refuse_with_string(replace(limits, load="none"), request_, preflight_of(**preflight))
+
+
+@pytest.mark.parametrize("limits", [STRING, replace(STRING, load="none")])
+def test_an_echo_is_not_looked_for_without_a_pipe(limits):
+    with pytest.raises(PreflightRefused, match="whose pipe is known") as caught:
+        refuse_with_string(limits, ExcitationRequest(kind="prbs"), preflight_of())
+    assert "length_m" in caught.value.next_step
+    piped = replace(STRING, wave_impedance_nm_s_rad=300.0, echo_s=1.4)
+    refuse_with_string(piped, ExcitationRequest(kind="prbs"), preflight_of())
+    with pytest.raises(PreflightRefused, match=r"after 0\.30 s"):
+        refuse_with_string(replace(piped, echo_s=0.3), ExcitationRequest(kind="prbs"), preflight_of())
+
+
+@pytest.mark.parametrize("title", ["quick-stop option", "something else"])
+@pytest.mark.parametrize("found", ["0", "6", "?"])
+def test_what_a_string_allows_hangs_on_no_row_of_the_table(title, found):
+    row = Check(title, "6", found, Outcome.OK, "605Ah")
+    refuse_with_string(STRING, ExcitationRequest(), preflight_of(checks=(row, refused_check())))
+
+
+def test_a_run_with_a_string_is_refused_before_anything_moves(world):
+    here = world(limits=STRING)
+    result = here.runner(ExcitationRequest(kind="coast-down")).run()
+    assert isinstance(result.cause, PreflightRefused)
+    assert "exchange" not in here.drive.calls

@@ -1,0 +1,309 @@
+"""A string that rings behind a stiff speed loop: damped before anything is read off it; no reason to doubt a sign."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drivers.drive import Command, Mode, PowerState, Sample
+from drivers.errors import LimitHit, PreflightRefused
+from tdhil.recording import LagPrior
+from tdhil.recording.builder import RecordingBuilder
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
+from tdhil.runner.stage_planner import StagePlanner
+from tdhil.runner.stages.braking_probe import (
+    Answer,
+    Before,
+    Listener,
+    NoPulse,
+    Pulse,
+    plan_pulse,
+    slow_down,
+    slow_speed,
+)
+from tdhil.runner.stages.speed import SpeedResult
+from tdhil.runner.stages.steady import Swing, calm_string, swing_of, widest
+from tdhil.runner.string_release import SwingDamper
+from tdhil.runner.task import Task
+from tests.runner.fake_drive import PERIOD_S, FakeDrive, FakeLog, World
+
+LIMITS = MachineLimits(
+    speed_min_rad_s=0.5, speed_max_rad_s=10.0, torque_nm=4000.0, time_s=1800.0, quick_stop_rad_s2=1.0,
+    probe_torque_nm=2000.0, load="string", torque_ramp_nm_s=100.0,
+)
+STEPS = 10
+
+
+@dataclass
+class RingingDrive(FakeDrive):
+    """Two masses on a spring under a stiff PI loop; the demand that it shows is that of the cycle before.
+
+    ``unsigned``: a torque setpoint below zero is taken for full torque forward. ``bit_nm`` and ``bit_s``: a swing at
+    the bottom that nothing takes away.
+    """
+
+    inertia: float = 1500.0
+    viscous: float = 8.0
+    coulomb: float = 60.0
+    load: float = 500.0
+    stiffness: float = 473.0
+    damping: float = 1.0
+    gain: float = 12000.0
+    integral_gain: float = 12000.0
+    unsigned: bool = False
+    bit_nm: float = 0.0
+    bit_s: float = 5.3
+    bottom: float = 0.0
+    twist: float = 0.0
+    wound_nm: float = 0.0
+    demand: float = 0.0
+    shown: float = 0.0
+
+    def _move(self, command: Command) -> None:
+        self.shown = self.demand
+        for _ in range(STEPS):
+            self._step(command, PERIOD_S / STEPS)
+
+    def _step(self, command: Command, dt: float) -> None:
+        if self.state is PowerState.OFF:
+            self.demand = 0.0
+        elif self.mode is Mode.SPEED or self.state is PowerState.QUICK_STOP:
+            asked = command.speed_rad_s if self.state is PowerState.ENABLED else 0.0
+            error = asked - self.speed
+            self.wound_nm = max(-4000.0, min(4000.0, self.wound_nm + self.integral_gain * error * dt))
+            self.demand = max(-4000.0, min(4000.0, self.gain * error + self.wound_nm))
+        else:
+            self.demand = 4000.0 if self.unsigned and command.torque_nm < 0.0 else command.torque_nm
+            self.wound_nm = self.demand
+        self.torque = self.demand
+        spring = self.stiffness * self.twist + self.damping * (self.speed - self.bottom)
+        push = self.torque - spring - self.viscous * self.speed
+        if self.speed != 0.0 or abs(push) > self.coulomb:
+            push -= math.copysign(min(self.coulomb, abs(push) if self.speed == 0.0 else self.coulomb),
+                                  self.speed or push)
+            self.speed += push / self.inertia * dt
+        bit = self.bit_nm * math.sin(2.0 * math.pi * self.clock.now_s() / self.bit_s) if self.speed > 1.0 else 0.0
+        self.bottom += (spring + bit - 4.0 * self.bottom) / self.load * dt
+        self.twist += (self.speed - self.bottom) * dt
+
+    def report(self) -> Sample:
+        resting = self.state is PowerState.QUICK_STOP and abs(self.speed) < 1e-3
+        return Sample(
+            self.clock.now_s(), 0.0, 0.0, True, self.speed, self.torque, self.shown, self.mode, self.state, resting,
+            False, 0x27,
+        )
+
+
+def ringing(**drive):
+    """A bench whose shaft turns at 3 rad/s, over a string that rings by about 1 kN·m."""
+    here = World(RingingDrive(**drive), LIMITS)
+    here.bench.enable(Mode.SPEED, Command(Mode.SPEED, 0.0, 0.0))
+    here.bench.hold(Command(Mode.SPEED, 3.0, 0.0), 8.0)
+    return here
+
+
+def test_a_top_that_yields_damps_what_a_stiff_one_holds_on_to():
+    stiff = ringing()
+    held = stiff.bench.hold(Command(Mode.SPEED, 3.0, 0.0), 20.0)
+    left_stiff = swing_of(held[-300:], PERIOD_S).torque_nm
+    here = ringing()
+    calmed = calm_string(here.bench, LIMITS, 3.0, 0.1)
+    assert left_stiff > 400.0
+    assert calmed.swing.torque_nm < 80.0
+    assert len(calmed.samples) * PERIOD_S < 40.0
+    assert len(calmed.setpoints_rad_s) == len(calmed.samples)
+    assert max(abs(speed - 3.0) for speed in calmed.setpoints_rad_s) <= 1.0 + 1e-9
+
+
+def test_a_sound_drive_over_a_ringing_string_is_not_called_wrong_signed():
+    here = World(RingingDrive(), LIMITS)
+    run = here.runner(ExcitationRequest(periods=2)).run()
+    assert run.cause is None, run.cause
+    assert any("the shaft slowed down" in text for _, text in here.log.events)
+    assert run.stop.confirmed
+    assert "torque_answer" not in here.log.facts
+
+
+def test_a_wrong_sign_over_a_ringing_string_is_still_refused():
+    here = World(RingingDrive(unsigned=True), LIMITS)
+    run = here.runner(ExcitationRequest(periods=2)).run()
+    assert isinstance(run.cause, PreflightRefused), run.cause
+    assert "takes a negative torque for a positive one" in str(run.cause)
+    assert run.stop.confirmed
+    assert all(abs(speed) < 0.05 for speed in here.drive.disabled_at)
+
+
+def test_a_string_that_sticks_and_slips_is_named_with_its_period_and_amplitude():
+    here = ringing(bit_nm=1500.0)
+    with pytest.raises(LimitHit, match=r"sticks and slips at 3\.00 rad/s: .* every 5\.[1-5] s") as hit:
+        calm_string(here.bench, LIMITS, 3.0, 0.5)
+    assert "speed loop" not in str(hit.value)
+    assert "Lift the bit off bottom" in str(hit.value)
+
+
+def test_a_swing_that_noise_keeps_going_is_none_of_a_bit_that_sticks():
+    """As regular, but the bit turns all the while: by ζ and the mean speed it would swing by 3 kN·m if it stuck."""
+    limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
+    here = ringing(bit_nm=400.0)
+    calmed = calm_string(here.bench, limits, 3.0, 0.5)
+    assert calmed.swing.regular > 0.6
+    assert 80.0 < calmed.swing.torque_nm < 1800.0
+    assert any(kind == "string" and "gets no calmer" in text for kind, text in here.log.events)
+
+
+def seen(torque_nm=200.0, demand_nm=None, speed=3.0, time_s=0.0):
+    return Sample(time_s, 0.0, 0.0, True, speed, torque_nm, demand_nm, Mode.TORQUE, PowerState.ENABLED, False, False, 0)
+
+
+PULSE = Pulse(200.0, -600.0, 20, 0, 0.3, 6.0)
+CALM = [seen(200.0 + 5.0 * (-1) ** n) for n in range(50)]
+
+
+def test_the_speed_loops_demand_at_the_switch_is_no_answer():
+    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    assert listener.hear(seen(demand_nm=500.0)) is None
+    assert listener.hear(seen(demand_nm=-600.0)) is None
+    assert listener.hear(seen(demand_nm=500.0)) is Answer.FASTER
+
+
+def test_a_demand_that_stays_up_is_an_answer_once_it_would_have_had_to_follow():
+    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    assert [listener.hear(seen(demand_nm=4000.0)) for _ in range(5)] == [None] * 4 + [Answer.FASTER]
+
+
+def test_a_demand_that_had_followed_the_switch_is_an_answer_at_once():
+    assert Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=210.0).hear(seen(demand_nm=4000.0)) is Answer.FASTER
+
+
+def test_the_torque_itself_is_an_answer_whatever_the_demand():
+    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    assert Answer.FASTER in [listener.hear(seen(3000.0, demand_nm=None)) for _ in range(3)]
+
+
+def test_there_is_no_pulse_where_the_string_hides_its_answer():
+    guess = RigGuess(2000.0, 20.0, 90.0)
+    calm = plan_pulse(LIMITS, guess, ControlAssumptions(), Before(2.9, 200.0, 0.03, 60.0), PERIOD_S)
+    swings = plan_pulse(LIMITS, guess, ControlAssumptions(), Before(2.9, 200.0, 0.03, 500.0), PERIOD_S)
+    assert isinstance(calm, Pulse)
+    assert isinstance(swings, NoPulse)
+    assert "swings by ±500 N·m" in swings.why
+    assert isinstance(plan_pulse(replace(LIMITS, load="none"), guess, ControlAssumptions(),
+                                 Before(2.9, 200.0, 0.03), PERIOD_S), Pulse)
+
+
+@pytest.mark.parametrize("period_s", [2.5, 5.3, 9.0])
+def test_the_period_of_a_swing_is_found(period_s):
+    time_s = np.arange(0.0, 24.0, PERIOD_S)
+    swing = swing_of([seen(200.0 + 500.0 * math.sin(2.0 * math.pi * t / period_s), time_s=t) for t in time_s], PERIOD_S)
+    assert swing.torque_nm == pytest.approx(500.0, rel=0.05)
+    assert swing.period_s == pytest.approx(period_s, abs=0.3)
+    assert swing.regular > 0.9
+
+
+def test_noise_repeats_nowhere():
+    noise = np.random.default_rng(1).normal(0.0, 300.0, 24 * 50)
+    swing = swing_of([seen(200.0 + one, time_s=n * PERIOD_S) for n, one in enumerate(noise)], PERIOD_S)
+    assert swing.regular < 0.6
+    assert swing_of([], PERIOD_S) == Swing(0.0, 0.0, 0.0, 0.0)
+
+
+def test_yielding_stays_within_its_bounds_and_forward():
+    damper = SwingDamper(4000.0, 10.0, 0.4, PERIOD_S)
+    rng = np.random.default_rng(2)
+    speeds = [damper.step(float(torque)) for torque in rng.normal(0.0, 4000.0, 2000)]
+    assert min(speeds) >= 0.0
+    assert max(speeds) <= 1.4 + 1e-9
+    assert damper.step(math.nan) == 0.4
+
+
+def test_a_window_that_a_restless_string_fills_leaves_no_room_to_plan_in():
+    here = World(FakeDrive(), LIMITS)
+    here.guard.disturbed = Swing(1200.0, 3.2, 5.3, 0.9).told
+    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(1200.0, 3.2, 5.3, 0.9))
+    planner = StagePlanner(here.bench, here.log, here.display, print)
+    with pytest.raises(LimitHit, match=r"±1200 N·m every 5\.3 s, the top by ±3\.20 rad/s") as hit:
+        planner.plan(Task(LIMITS, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior())
+    assert "off bottom" in hit.value.next_step
+    assert "speed loop" not in str(hit.value)
+
+
+@pytest.mark.parametrize("bit_nm", [0.0, 400.0])
+def test_a_string_that_was_calm_before_is_seen_to_swing_where_the_probe_is_tried(bit_nm):
+    limits = replace(LIMITS, wave_impedance_nm_s_rad=1000.0)
+    here = ringing(bit_nm=bit_nm)
+    before = SpeedResult(None, SimpleNamespace(speed_rad_s=3.0), RigGuess(1500.0, 8.0, 60.0), None, None, ())
+    slow, found = slow_down(here.bench, limits, before, ControlAssumptions(), 0.01)
+    mean = float(np.mean([sample.speed_rad_s for sample in slow]))
+    if bit_nm == 0.0:
+        assert found is before
+        assert (mean, here.guard.disturbed) == (pytest.approx(slow_speed(limits), abs=0.05), "")
+    else:
+        assert found.wander_rad_s > 0.1
+        assert mean == pytest.approx(slow_speed(limits, found.wander_rad_s), abs=0.4)      # it swings, and yields
+        assert mean > slow_speed(limits) + 0.5
+        assert "the string below swings by ±" in here.guard.disturbed
+
+
+def test_whichever_swing_takes_the_shaft_further_counts():
+    near, far = Swing(900.0, 0.2, 0.0, 0.0), Swing(300.0, 0.5, 0.0, 0.0)
+    assert widest(near, far) is far is widest(far, near) is widest(None, far)
+    assert widest(None, None) is None
+
+
+def test_a_plan_that_ends_where_no_braking_torque_is_needed_needs_none():
+    """What is left below zero is the arithmetic's."""
+    limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, torque_nm=15000.0)
+    for coulomb_nm in (3000.0, 3330.0, 3340.0, 3401.7):
+        here = World(FakeDrive(), limits)
+        here.guard.no_braking = "no pulse was safe"
+        speed = SpeedResult(None, None, RigGuess(1500.0, 0.0, coulomb_nm), None, None, (),
+                            swing=Swing(300.0, 0.5, 5.3, 0.9))
+        planned = StagePlanner(here.bench, here.log, here.display, print).plan(
+            Task(limits, ExcitationRequest(), {}), speed, Mode.TORQUE, LagPrior()
+        )
+        assert planned.plan.torque_min_nm >= -1e-6 * limits.torque_nm
+
+
+@pytest.mark.parametrize(("echo_s", "kind", "told"), [(1.4, "multisine", 1), (1.4, "prbs", 0), (0.0, "multisine", 0)])
+def test_above_a_restless_string_it_is_said_before_stage_5_what_would_tell_more(echo_s, kind, told):
+    limits = replace(LIMITS, speed_min_rad_s=15.0, speed_max_rad_s=26.0, echo_s=echo_s)
+    here = World(FakeDrive(), limits)
+    speed = SpeedResult(None, None, RigGuess(1500.0, 8.0, 60.0), None, None, (), swing=Swing(300.0, 0.5, 5.3, 0.9))
+    said = []
+    planner = StagePlanner(here.bench, here.log, here.display, said.append)
+    planner.plan(Task(limits, ExcitationRequest(kind=kind), {}), speed, Mode.TORQUE, LagPrior())
+    assert sum("--excitation prbs asks only for the time before an echo" in one for one in said) == told
+
+
+class KeepingLog(FakeLog):
+    """Keeps what a recording is made of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.builder, self.commanded = RecordingBuilder(), []
+
+    def cycle(self, command, sample) -> None:
+        super().cycle(command, sample)
+        self.builder.add(sample)
+        self.commanded.append(command.torque_nm)
+
+    @property
+    def commanded_nm(self):
+        return np.array(self.commanded)
+
+    def recording(self, *, complete):
+        self.builder.excitation(*self.motions[-1])
+        return self.builder.recording(complete=complete)
+
+
+def test_a_run_that_is_told_before_an_echo_learns_how_its_torque_answered():
+    here = World(RingingDrive(), replace(LIMITS, wave_impedance_nm_s_rad=486.0, echo_s=2.0))
+    here.log = KeepingLog()
+    run = here.runner(ExcitationRequest(kind="prbs", periods=3)).run()
+    assert run.cause is None, run.cause
+    assert here.log.facts["torque_answer"].lag_s < 0.01

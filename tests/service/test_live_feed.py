@@ -1,0 +1,109 @@
+"""What a page is sent of a growing log: thin enough, from its start, and with its age."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from tdhil.recording import LogNews
+from tdhil.service.live_feed import MOST, SPACING_S, Picture
+from tdhil.service.schemas import API
+from tests.recording.test_log_tail import write
+from tests.service.conftest import URL
+
+LIVE = f"{URL.replace('http', 'ws')}{API}/live"
+
+
+def news(first_s: float, count: int, every_s: float = 0.004, **more: object) -> LogNews:
+    time_s = first_s + every_s * np.arange(count)
+    return LogNews(np.column_stack((time_s, 0.1 * time_s, -time_s)), **more)
+
+
+def test_it_is_thin_whatever_pieces_it_comes_in():
+    whole, pieces = Picture(), Picture()
+    all_of_it = news(0.0, 1000)
+    whole.take(all_of_it, 0.0)
+    for k in range(0, 1000, 7):
+        pieces.take(LogNews(all_of_it.samples[k:k + 7]), 0.0)
+    assert np.array_equal(whole.samples, pieces.samples)
+    assert np.diff(whole.samples[:, 0]).min() >= SPACING_S - 1e-9
+    assert 90 <= len(whole.samples) <= 101
+
+
+def test_a_long_run_stays_small_and_whole():
+    picture = Picture()
+    for k in range(60):
+        picture.take(news(100.0 * k, 1000, 0.1), 0.0)
+    assert len(picture.samples) <= MOST
+    assert picture.samples[-1, 0] - picture.samples[0, 0] > 5900.0
+
+
+def test_its_age_is_the_clock_s_or_in_stepped_time_that_of_its_arrival():
+    real, stepped = Picture(), Picture()
+    assert real.age_s(0.0, 0.0) is None
+    real.take(news(0.0, 2, 1.0, epoch_ns=10**18), 5.0)
+    assert real.age_s(10**9 + 3.5, 99.0) == pytest.approx(2.5)
+    stepped.take(news(0.0, 2, 1.0, epoch_ns=10**18, configuration={"run": {"stepped": True}}), 5.0)
+    assert stepped.age_s(10**9 + 3.5, 7.0) == pytest.approx(2.0)
+
+
+def test_what_is_no_number_is_none_in_json():
+    picture = Picture()
+    shown = picture.take(LogNews(np.array([[0.0, np.nan, np.inf]])), 0.0)
+    assert json.dumps(shown, allow_nan=False)
+    assert shown["samples"] == [[0.0], [None], [None]]
+
+
+def test_a_viewer_gets_all_of_it_from_the_start(service):
+    with TestClient(service.web.asgi, base_url=URL) as client:
+        run = client.post(f"{API}/rigs/a/runs", json={"note": "hold"}).json()["id"]
+        service.wait(run, "moving")
+        (service.store.place(run) / "run.mcap").unlink(missing_ok=True)
+        write(service.store.place(run) / "run.mcap")
+        seen, events, states = [], [], []
+        with client.websocket_connect(f"{LIVE}/{run}") as socket:
+            end_s = time.monotonic() + 30.0
+            while ("stopped" not in states or not events) and time.monotonic() < end_s:
+                message = socket.receive_json()
+                seen += message.get("samples", [[]])[0]
+                events += [one["text"] for one in message.get("events", [])]
+                if message.get("status"):
+                    states.append(message["status"]["state"])
+                if events and states[-1:] == ["moving"]:
+                    client.post(f"{API}/runs/{run}/stop", json={})
+                socket.send_text("nobody hears this")
+        with client.websocket_connect(f"{LIVE}/{run}") as socket:
+            assert socket.receive_json()["samples"][0] == seen
+    assert events == ["half of it"]
+    assert seen[0] == 0.0
+    assert len(seen) >= 40
+
+
+class Gone:
+    """A WebSocket whose other end goes while it is written to."""
+
+    def __init__(self, **names: str) -> None:
+        self.path_params, self.scope = names, {"subprotocols": ["foxglove.sdk.v1"]}
+
+    async def accept(self, protocol: str | None = None) -> None: ...
+
+    async def receive(self) -> None:
+        await asyncio.sleep(3600.0)
+
+    async def send_text(self, text: str) -> None:
+        raise WebSocketDisconnect(1006)
+
+    send_bytes = send_text
+
+
+@pytest.mark.parametrize("road", ["watch", "foxglove"])
+def test_a_viewer_that_goes_in_mid_word_is_no_mistake_of_ours(service, road):
+    run = service.supervisor.start_run("a", {}, "test").request.id
+    asyncio.run(getattr(service.web, f"_{road}")(Gone(run=run, rig="a")))
+    assert service.web.feeds.viewers == 0

@@ -1,0 +1,159 @@
+"""What the API says of runs that are over: pictures, samples, many logs again; and what can be rehearsed."""
+
+from __future__ import annotations
+
+import csv
+import os
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from profiles import STAGE_NUMBERS
+from tdhil.service import worker
+from tdhil.service.fleets import Fleets
+from tdhil.service.run_state import Conflict
+from tdhil.service.start_request import Rigs
+from tdhil.session import bus_kinds, hold
+from tests.recording.test_log_tail import write
+from tests.service.conftest import wait_for
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+def test_a_run_has_the_pictures_of_its_report(call, service):
+    run = call.start()["id"]
+    service.wait(run, "done")
+    assert call("GET", f"/runs/{run}/pictures", 200) == []
+    (service.store.place(run) / "report.html").write_text(
+        "<section><h2>A &amp; B</h2>\n<figure><svg id='x'></svg><figcaption>one &lt;b&gt;</figcaption></figure>\n"
+        "<figure><svg id='y'></svg>\n<figcaption>two</figcaption></figure></section>")
+    assert call("GET", f"/runs/{run}/pictures", 200) == [
+        {"number": 0, "heading": "A & B", "caption": "one <b>"}, {"number": 1, "heading": "A & B", "caption": "two"}]
+    picture = call("GET", f"/runs/{run}/pictures/1", 200)
+    assert picture.text == "<svg id='y'></svg>"
+    assert "sandbox" in picture.headers["content-security-policy"]
+    for number in ("2", "-1", "x"):
+        call("GET", f"/runs/{run}/pictures/{number}", 404)
+
+
+def test_samples_are_a_table(call, service, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "run.mcap")
+    worker.samples({"folder": str(tmp_path)})
+    first, *rows = csv.reader((tmp_path / "samples.csv").open())
+    assert first[:3] == ["time_s", "speed_rad_s", "torque_nm"]
+    assert len(rows) > 10
+    run = call.start(what="hold")["id"]
+    service.wait(run, "moving")
+    call("GET", f"/runs/{run}/samples.csv", 422)
+    call("POST", f"/runs/{run}/stop", 200, json={})
+    service.wait(run, "stopped")
+    (tmp_path / "samples.csv").replace(service.store.place(run) / "samples.csv")
+    assert call("GET", f"/runs/{run}/samples.csv", 200).text.startswith("time_s,")
+
+
+def test_what_can_be_rehearsed_is_taken_at_every_stage(call):
+    for kind in bus_kinds():
+        faults = kind.faults()
+        assert len({one.name for one in faults}) == len(faults) > 20
+        for one in faults:
+            for stage in STAGE_NUMBERS:
+                value = f"={one.value}" if one.takes and one.value else ""
+                text = f"{one.name}{value}" if one.from_start else f"{one.name}@{stage}+2s{value}/5s"
+                assert len(kind.parse_faults([text])) == 1, text
+    found = {one["name"]: one for one in call("GET", "/rigs/a/faults", 200)}
+    assert found["sto"]["row"] == 33
+    assert found["frame-loss"]["value"] == "5%"
+    call("GET", "/rigs/real/faults", 403)
+    call("GET", "/rigs/nobody/faults", 404)
+
+
+def test_the_rigs_to_play_with_are_simulated():
+    assert [(rig.problem, rig.simulated) for rig in Rigs(None).all()] == [("", True), ("", True)]
+
+
+def test_a_drive_that_somebody_holds_may_turn(service):
+    with hold("a drive of this test"):
+        assert service.supervisor.turning()
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    folder = tmp_path / "logs"
+    (folder / "below").mkdir(parents=True)
+    (folder / "below" / "bad.mcap").write_bytes(b"no log")
+    (folder / "trace.csv").write_text(f"{HOSTILE},n,m\n0,1,2\n")
+    (folder / "trace.yaml").write_text("rig: R7\ncolumns: ['time=t', 'speed=n', 'torque=m']\n")
+    return folder
+
+
+def hurry(fleets: Fleets) -> None:
+    """It is nicer than all else: beside other tests it would take minutes, where a computer has little to spare."""
+    if (going := fleets._going) is None:
+        return                         # it has ended
+    process = going.process
+    wait_for("its nice", lambda: process.poll() is not None or os.getpriority(os.PRIO_PROCESS, process.pid) == 19)
+    with suppress(PermissionError, ProcessLookupError):
+        os.setpriority(os.PRIO_PROCESS, process.pid, 0)
+
+
+def test_many_logs_are_identified_again_and_wait_while_a_shaft_turns(call, service, logs):
+    turns = [True]
+    service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: turns[0])
+    assert call("GET", "/fleets/folders", 200) == ["", "logs"]
+    fleet = call("POST", "/fleets", 202, json={"folder": "logs", "tolerance": 0.01})["id"]
+    assert call("POST", "/fleets", 202, json={"folder": "logs", "tolerance": 0.01})["id"] == fleet
+    with pytest.raises(Conflict, match="other logs are being identified"):
+        fleets.ask("logs", "below", {}, "local")
+    hurry(fleets)
+    held = wait_for("logs that are found", lambda: (one := fleets.get(fleet)).total and one)
+    assert (held.held, held.total, held.done) == (True, 2, 0)
+    turns[0] = False
+    wait_for("its end", lambda: fleets.get(fleet).state != "running")
+    found = call("GET", f"/fleets/{fleet}", 200)
+    assert (found["state"], found["done"], found["failed"]) == ("done", 2, 2)
+    assert found["summary"]["out"] == "fleet.csv"
+    bad, trace = call("GET", f"/fleets/{fleet}/rows", 200)
+    assert (bad["log"], trace["log"]) == ("below/bad.mcap", "trace.csv")
+    assert HOSTILE in trace["error_text"]
+    assert call("GET", f"/fleets/{fleet}/rows?from=1", 200) == [trace]
+    rows = list(csv.DictReader(call("GET", f"/fleets/{fleet}/fleet.csv", 200).text.splitlines()))
+    assert [row["log"] for row in rows] == ["below/bad.mcap", "trace.csv"]
+    call("POST", "/fleets", 202, json={"folder": "logs", "tolerance": 0.01})       # again: it is all done
+    hurry(fleets)
+    wait_for("its end", lambda: fleets.get(fleet).state != "running")
+    assert fleets.get(fleet).summary["done_before"] == 2
+    assert [one["id"] for one in call("GET", "/fleets", 200)] == [fleet]
+    assert [one["what"] for one in call("GET", "/audit", 200)["entries"]].count("fleet asked") == 3
+
+
+def test_a_fleet_that_is_ended_or_whose_web_dies_keeps_what_is_done(call, service, logs):
+    turns = [True]
+    service.web.fleets = fleets = Fleets(service.store, {"logs": logs}, lambda: turns[0])
+    fleet = fleets.ask("logs", "", {}, "local").id
+    hurry(fleets)
+    wait_for("logs that are found", lambda: fleets.get(fleet).total)
+    again = Fleets(service.store, {"logs": logs}, lambda: False)           # as the next web sees it
+    assert again.get(fleet).state == "interrupted"
+    call("POST", f"/fleets/{fleet}/stop", 200, json={})
+    wait_for("its end", lambda: fleets.get(fleet).state == "interrupted")
+
+
+@pytest.mark.parametrize("body", [
+    {"folder": "/etc"}, {"folder": "logs", "below": ".."}, {"folder": "logs", "below": "../logs2"},
+    {"folder": "logs", "below": "/etc"}, {"folder": "logs", "below": "nothing"}, {"folder": "logs", "below": "a\0b"},
+    {"folder": "logs", "below": "link"}, {"folder": ""}, {"folder": "", "below": "x"}, {"folder": "logs", "model": "x"},
+    {"folder": "logs", "tolerance": 0}, {"folder": "logs", "confidence": 1.0}, {"jobs": 3}, {"folder": HOSTILE},
+])
+def test_a_fleet_goes_through_no_other_folder(call, service, logs, body):
+    (logs.parent / "logs2").mkdir()
+    (logs / "link").symlink_to("/etc")
+    service.web.fleets = Fleets(service.store, {"logs": logs}, lambda: False)
+    call("POST", "/fleets", 422, json=body)
+    assert call("GET", "/fleets", 200) == []
+
+
+def test_no_other_file_is_a_fleet(call):
+    for name in ("nothing", "..", "%2e%2e", "..%2fruns"):
+        assert call._client.get(f"/api/v1/fleets/{name}").status_code in (404, 405)
