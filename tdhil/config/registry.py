@@ -50,7 +50,7 @@ EXCITATIONS: dict[str, Entry] = {
     "pulses": Entry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
     "coast-down": Entry("tdhil.runner.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
 }
-"""What stage 5 can do; each a `tdhil.runner.excitation.ExcitationKind`."""
+"""Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
 
 DEFAULT_EXCITATION = "multisine"
 
