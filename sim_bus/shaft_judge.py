@@ -34,6 +34,9 @@ REACTION_S = 1.0
 ACCELERATES_RAD_S = 0.3
 """A shaft that gets faster by so much in a stop accelerates against it."""
 
+BEFORE_S = 3.0
+"""In a release above a string no quick stop has been asked for yet: it is compared with the speed of so long before."""
+
 EXIT_CODES = frozenset({0, 3, 4, 5, 6, 7, 8, 9, 130, 143})
 """As `tdhil.errors` has them, but for 1 (a mistake of tdhil's own) and 2 (what was asked for can't be)."""
 
@@ -167,6 +170,7 @@ def _disabled(shaft: Shaft, outcome: Outcome, machine: Machine) -> str:
     accelerated = shaft.stop_s < at_s and (
         speed > shaft.speed_at(shaft.stop_s) + ACCELERATES_RAD_S or shaft.reversed_at(at_s)
     )
+    accelerated = accelerated or speed > shaft.speed_at(at_s - BEFORE_S) + ACCELERATES_RAD_S
     beyond = speed > machine.speed_max_rad_s       # above a string torque is removed from such a shaft only
     if accelerated and outcome.removed and (beyond or not machine.string):
         return ""

@@ -167,6 +167,7 @@ class Cia402Drive:
         self._unwrapped: Unwrapped | None = None
         self._shown_s = clock.now_s()  # when the mode was last displayed
         self._wish = Wish.OFF
+        self._removes_torque = False
         self._in_operation = False     # enabled, and seen enabled since
         self._was_remote, self._local = False, 0       # bit 9: was it set in operation, and for how long not since
         self._ever_asked = False       # to be enabled
@@ -414,6 +415,10 @@ class Cia402Drive:
         """From the next cycle on towards switch on disabled."""
         self._wish = Wish.OFF
 
+    def remove_torque(self) -> None:
+        """From the next cycle on disable voltage (transition 9 or 12); see `drivers.drive.RemovesTorque`."""
+        self._wish, self._removes_torque = Wish.OFF, True
+
     def reset_fault(self) -> None:
         """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word.
 
@@ -459,7 +464,7 @@ class Cia402Drive:
                 self._read_back.sent(offset[0], offset_raw)
         if changes:
             self._sent_code, self._since_mode_sent, self._mode_overwritten = code, 0, False
-        word = controlword_towards(self._reported.state, self._wish)
+        word = DISABLE_VOLTAGE if self._removes_torque else controlword_towards(self._reported.state, self._wish)
         self._link.send(self._rpdo1_id, self._shape.setpoints(word, torque_raw, speed_raw), self._ticks.check)
         self._read_back.sent(self._shape.target_speed[0], speed_raw)
         self._read_back.sent(0x6071, torque_raw)

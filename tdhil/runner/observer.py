@@ -77,6 +77,18 @@ UNANSWERED_S, UNANSWERED_SHARE = 8.0, 0.05
 """In a stop, a reported speed that changes by no more than this share under a braking torque at its limit, for so long,
 answers nothing: a shaft that slow would take minutes to stop."""
 
+FLAT_S, FLAT_LIMIT_S, FLAT_LAGS = 1.0, 1.5, 3.0
+"""A reported speed that stays within its own noise is lost, if meanwhile the torque that is commanded in torque mode
+should have moved it for so long beyond so many lags, or if the torque stands at its limit for the second time: nothing
+controls the speed then, and only a load that equals the limit to the last newton metre would keep it."""
+
+FLAT_MOVES = 3.0
+"""How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance."""
+
+YIELD_S, YIELD_APART, YIELD_LEFT = 3.0, 0.5, 0.25
+"""A wound-up shaft that is told to yield follows, since the string pulls it. Over so long the way by the reported speed
+is compared with the commanded one: the reports are false if it is apart by this share, and is less than that share."""
+
 HELD_S = 1.5
 """A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
 its limit, is held or not seen."""
@@ -175,6 +187,10 @@ UNSEEN_SHARE = 0.1
 UNSEEN_MOST_S = 60.0
 """A shaft whose motion nobody has seen is given so long to run out at most, s."""
 
+RUN_OUT_SHARE, RUN_OUT_MOST_S = 0.5, 240.0
+"""Least friction, as a share of what stage 2 found, of a shaft that runs out without torque; and how long it gets at
+most, s, or where no friction is known."""
+
 BLIND_MOST_S = 5.0
 """Standstill is watched for so long beyond the lags at most, so that friction stops what the reports can hide, s."""
 
@@ -183,6 +199,8 @@ PUSHING_S, PUSHING_SHARE = 1.0, 0.1
 torque limit, where the reported speed is not believed or never showed a motion."""
 DOUBTED_SHARE = 0.5
 """With a report in doubt, this share of the torque limit is more than a quick stop takes in the direction of motion."""
+DOUBTED_REST_SHARE = 0.1
+"""Share of the speed that counts as standstill, for a report that was in doubt and may have a wrong scale."""
 IMPULSE_SHARE = 0.3
 """Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
 FASTER_SHARE = 0.1
@@ -261,6 +279,8 @@ class Observer:
         self._angles = _Angle(self._lag_s, speed_resolution_rad_s, self._still_rad_s)
         self._turns: Unwrapped | None = None
         self._runaway = _Runaway(limits)
+        self._flat = _Flat(limits, self._lag_s)
+        self._yielding: deque[tuple[float, float, float, float]] = deque()
         self._revival: _Revival | None = None
         self._angle_revival: _Revival | None = None
         self._failed = [0] * (len(WINDOWS_S) + 1)
@@ -269,6 +289,8 @@ class Observer:
         self.swinging_offset_nm = 0.0
         """The largest torque offset that the stage may command in speed mode, N·m."""
         self.doubt: Contradiction | None = None
+        self.backwards = False
+        """Set by a stage that saw the shaft turn backwards under a forward torque: the sign of a report is inverted."""
         self._time_s = self._block_from_s = -math.inf
         self._speed = self._torque = self._before = 0.0
         self._impulse = self._rough = self._way = self._bent = 0.0
@@ -302,7 +324,15 @@ class Observer:
 
     def know(self, model: RigGuess) -> None:
         """Take J and friction of stage 2, with their uncertainty."""
-        self._knowledge.know(model)
+        before = self._knowledge.words
+        if not self._knowledge.know(model):
+            self._doubt(
+                frozenset({Signal.SPEED, Signal.TORQUE}),
+                f"the way up to the first speed and the rest of stage 2 contradict each other: {before}, then"
+                f" {self._knowledge.words}",
+                "Did the scale of torque or speed change meanwhile, or the load? Check the profile and the encoder",
+                self._time_s,
+            )
         self._restart()
 
     @property
@@ -316,6 +346,16 @@ class Observer:
     def blind_s(self) -> float:
         """How long friction takes at most to stop what (1) cannot find, s."""
         return self._knowledge.blind_s(self._still_rad_s)
+
+    @property
+    def turned(self) -> bool:
+        """Whether the shaft turned when the stop began, or shortly before it."""
+        return self.turns(self._runaway.start_rad_s)
+
+    @property
+    def run_out_s(self) -> float:
+        """How long the shaft turns on at most without torque, s."""
+        return self._knowledge.run_out_s(self._runaway.start_rad_s)
 
     # -- each cycle ------------------------------------------------------------------------------------------
 
@@ -428,6 +468,12 @@ class Observer:
             return True
         return self._revival is not None and self._revival.alive and self._balanced
 
+    def rest_rad_s(self, at_rest_rad_s: float) -> float:
+        """The speed that counts as standstill, rad/s: less once a report was in doubt, since its scale may be wrong."""
+        if self.doubt is None:
+            return at_rest_rad_s
+        return min(at_rest_rad_s, max(DOUBTED_REST_SHARE * at_rest_rad_s, self._noise_rad_s()))
+
     def angle_quiet(self, at_rest_rad_s: float) -> bool:
         """Whether the angle moves no faster than this, rad/s; true where no angle is reported."""
         rate = self.rate_rad_s
@@ -437,7 +483,7 @@ class Observer:
     def _balanced(self) -> bool:
         """Whether the torque at reported standstill is too small to keep the shaft turning against its friction."""
         points = self._points
-        if self._limits.winds_up or not self._knowledge.known or not points:
+        if self._limits.winds_up or not points:
             return True
         return abs(points[-1].torque) <= 0.5 * self._knowledge.breakaway_low_nm + 5.0 * self._torque_count_nm
 
@@ -561,6 +607,8 @@ class Observer:
         asked = command.mode is Mode.SPEED and abs(command.speed_rad_s) > 4.0 * self._still_rad_s
         strained = abs(point.torque) >= AT_LIMIT_SHARE * self._limits.torque_nm
         self._see_strained(point, command, strained, block_s)
+        self._see_flat(point, command, strained)
+        self._see_yielding(point, command)
         held = self._moved and asked and strained and abs(point.speed) <= self._still_rad_s
         self._held_s = self._held_s + block_s if held else 0.0
         if self._held_s >= HELD_S:
@@ -583,6 +631,46 @@ class Observer:
                 f"the torque has been at its limit for {STRAINED_S:g} s ({point.torque:.0f} N·m) while the reported"
                 f" speed stays at {point.speed:.2f} rad/s, near the commanded {command.speed_rad_s:.2f} rad/s",
                 "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
+            )
+
+    def _see_flat(self, point: _Point, command: Command, strained: bool) -> None:
+        """Above a string (1) bounds too little: a speed that does not answer shows by staying the same."""
+        if not self._limits.winds_up:
+            return
+        noise = 2.0 * self._noise_rad_s()
+        for_s = self._flat.see(point, command, noise, strained, self._knowledge)
+        if for_s > 0.0 and self.turns(point.speed):
+            self._doubt(
+                frozenset({Signal.SPEED}),
+                f"the reported speed has stayed at {point.speed:.2f} rad/s to within its noise for {for_s:.1f} s, while"
+                f" the torque went to {point.torque:.0f} N·m, which moves this shaft",
+                "Check the encoder and its cable. Is the load as large as the torque limit?", point.time_s,
+            )
+
+    def _see_yielding(self, point: _Point, command: Command) -> None:
+        """In a stop above a string: whether the shaft goes the way that it is told to yield."""
+        seen = self._yielding
+        if not (self._runaway.begun and self._limits.winds_up and command.mode is Mode.SPEED):
+            seen.clear()
+            return
+        apart_s = point.time_s - seen[-1][0] if seen else 0.0
+        seen.append((point.time_s, apart_s, command.speed_rad_s, point.speed))
+        while point.time_s - seen[0][0] > YIELD_S:
+            seen.popleft()
+        if point.time_s - seen[0][0] < YIELD_S - 2.0 * self._point_s:
+            return
+        told = math.fsum(part_s * one for _, part_s, one, _ in seen)
+        went = math.fsum(part_s * one for _, part_s, _, one in seen)
+        speeds = [one for _, _, one, _ in seen]
+        late = self._lag_s * (max(speeds) - min(speeds))
+        clear = 2.0 * self._still_rad_s * YIELD_S
+        apart = abs(told) > clear and abs(told - went) > YIELD_APART * abs(told) + late
+        if apart and abs(went) < YIELD_LEFT * abs(told):
+            self._doubt(
+                frozenset({Signal.SPEED}),
+                f"the shaft is told to yield to the drill string, by {told:.2f} rad within {YIELD_S:g} s, and the"
+                f" reported speed accounts for {went:.2f} rad",
+                "Check the encoder and its cable. Is the shaft held by a brake?", point.time_s,
             )
 
     def _noise_rad_s(self) -> float:
@@ -750,13 +838,18 @@ class _Knowledge:
             limits.torque_nm / STIFFEST_STRING_S
         )
 
-    def know(self, model: RigGuess) -> None:
-        """Stage 2's rough model. A part of the load may hang on a shaft that twists, so J may seem smaller."""
+    def know(self, model: RigGuess) -> bool:
+        """Take stage 2's rough model; whether it agrees with what the first ramp showed.
+
+        A part of the load may hang on a shaft that twists, so J may seem smaller.
+        """
         self._model = model
         error = model.inertia_rel_error
         least = min(1.0 - min(error, 0.75), 1.0 - FRICTION_SHARE)
+        learned_low, learned_high = LIGHTEST_SHARE * self.inertia_low, self.inertia_high
         self.inertia_low = least * model.inertia_kg_m2
         self.inertia_high = (1.0 + error) * model.inertia_kg_m2
+        return self.inertia_high >= learned_low and self.inertia_low <= learned_high
 
     @property
     def known(self) -> bool:
@@ -782,8 +875,10 @@ class _Knowledge:
 
     @property
     def breakaway_low_nm(self) -> float:
-        """The least torque that keeps the shaft turning slowly, N·m."""
-        return 0.0 if self._model is None else (1.0 - FRICTION_SHARE) * self._model.coulomb_nm
+        """The least torque that keeps the shaft turning slowly, N·m; before stage 2 ends by what moved it first."""
+        if self._model is None:
+            return self.breakaway_nm / SLOW_FRICTION
+        return (1.0 - FRICTION_SHARE) * self._model.coulomb_nm
 
     @property
     def pushing_nm(self) -> float:
@@ -857,6 +952,20 @@ class _Knowledge:
         left = impulse - FRICTION_LEVELS * friction * took_s - self._lag_s * more_nm
         self.inertia_low = max(0.0, left) / change / UNLEARNED
 
+    def run_out_s(self, speed_rad_s: float) -> float:
+        """How long friction alone takes at most from this speed to standstill, s.
+
+        From J dω/dt = −s (T_c + B ω): t = J/(s B) ln(1 + B ω/T_c), with s = `RUN_OUT_SHARE`.
+        """
+        model, speed = self._model, abs(speed_rad_s)
+        if model is None or model.coulomb_nm <= 0.0:
+            return RUN_OUT_MOST_S
+        ratio = model.viscous_nm_s_rad * speed / model.coulomb_nm
+        # ln(1 + x)/x: 1 without viscous friction
+        by_viscous = math.log1p(ratio) / ratio if ratio > 1e-6 else 1.0
+        took_s = self.inertia_high * speed / (RUN_OUT_SHARE * model.coulomb_nm) * by_viscous
+        return min(RUN_OUT_MOST_S, took_s)
+
     def blind_s(self, still_rad_s: float) -> float:
         """How long friction takes at most to stop what (1) cannot find, s."""
         model = self._model
@@ -865,6 +974,43 @@ class _Knowledge:
         # A lag hides lag·ΔT of impulse; while a shaft comes to rest the torque changes by about its friction.
         hidden_nms = self._lag_s * 2.0 * model.steady_torque_nm(self._limits.speed_min_rad_s)
         return min(BLIND_MOST_S, hidden_nms / self.breakaway_low_nm)
+
+
+class _Flat:
+    """A reported speed that stays the same, and the torque meanwhile. `limits.winds_up` only."""
+
+    def __init__(self, limits: MachineLimits, lag_s: float) -> None:
+        self._limits = limits
+        self._lag_s = lag_s
+        self._since_s: float | None = None
+        self._low = self._high = self._least = self._most = self._began = self._moved = self._seen_s = 0.0
+        self._strained_s = 0.0
+
+    def see(self, point: _Point, command: Command, noise_rad_s: float, strained: bool, known: _Knowledge) -> float:
+        """Take one point; for how long the speed has not answered, s; 0: it may well have."""
+        torque = command.torque_nm if command.mode is Mode.TORQUE else point.torque
+        low, high = min(self._low, point.speed), max(self._high, point.speed)
+        if self._since_s is None or high - low > noise_rad_s:
+            self._since_s = self._seen_s = point.time_s
+            self._low = self._high = point.speed
+            self._least = self._most = self._began = torque
+            self._moved = self._strained_s = 0.0
+            return 0.0
+        took_s, self._seen_s = point.time_s - self._seen_s, point.time_s
+        self._low, self._high = low, high
+        self._least, self._most = min(self._least, torque), max(self._most, torque)
+        self._strained_s = self._strained_s + took_s if strained else 0.0
+        for_s = point.time_s - self._since_s
+        if command.mode is Mode.SPEED:
+            self._began, self._least, self._most, self._moved = torque, torque, torque, 0.0
+            return for_s if self._strained_s >= FLAT_LIMIT_S else 0.0
+        self._moved += took_s * (torque - self._began)
+        if not known.known or for_s < FLAT_S + FLAT_LAGS * self._lag_s:
+            return 0.0
+        moves = FLAT_MOVES * noise_rad_s
+        by_inertia = abs(self._moved) / known.inertia_high
+        by_string = (self._most - self._least) / known.string_nm_s_rad
+        return for_s if min(by_inertia, by_string) >= moves else 0.0
 
 
 class _Frozen:
@@ -1079,7 +1225,7 @@ class _Runaway:
         self.begun = False
         self._slowest_rad_s = self._slowest_angle_rad_s = math.inf
         self._before: _Point | None = None
-        self._start_rad_s = 0.0
+        self.start_rad_s = 0.0
         self._by_impulse_rad_s: float | None = None
         self._pushing_s = self._pushed_nm = 0.0
         self._apart_nm_s = self._took_s = 0.0
@@ -1088,7 +1234,7 @@ class _Runaway:
     def begin(self, speed_rad_s: float) -> None:
         """A quick stop was asked for, from this speed."""
         self.begun = True
-        self._start_rad_s = speed_rad_s
+        self.start_rad_s = speed_rad_s
 
     def see(self, point: _Point, known: _Knowledge, observer: Observer) -> None:
         """Take one point of a stop."""
@@ -1096,7 +1242,7 @@ class _Runaway:
             return
         before, self._before = self._before, point
         if before is None or point.time_s <= before.time_s:
-            self._by_impulse_rad_s = self._start_rad_s if math.isfinite(known.inertia_high) else None
+            self._by_impulse_rad_s = self.start_rad_s if math.isfinite(known.inertia_high) else None
             return
         self._for_s += point.time_s - before.time_s
         if self._for_s >= PUSHING_S:
@@ -1118,7 +1264,7 @@ class _Runaway:
             least = PUSHING_SHARE * self._limits.torque_nm
         elif not observer.moved:       # a little torque may be left over that static friction holds
             least = DOUBTED_SHARE * (self._limits.probe_torque_nm or self._limits.torque_nm)
-        turning = observer.rate_rad_s if observer.rate_rad_s and observer.doubt is not None else self._start_rad_s
+        turning = observer.rate_rad_s if observer.rate_rad_s and observer.doubt is not None else self.start_rad_s
         forward = 1.0 if turning >= 0.0 else -1.0
         pushes = (forward * point.torque if observer.moved else abs(point.torque)) > least
         self._pushing_s = self._pushing_s + took_s if pushes else 0.0
@@ -1147,7 +1293,7 @@ class _Runaway:
         if self._limits.winds_up:
             # A string that is let go turns back. Its torque is taken away only from a shaft that is beyond its limit.
             self._slowest_rad_s = self._slowest_angle_rad_s = limit
-        faster = more + max(self._slowest_rad_s, IMPULSE_SHARE * abs(self._start_rad_s))
+        faster = more + max(self._slowest_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
         doubt = observer.doubt
         # Of a shaft that became lighter the inertia is not known any more, but its speed is followed.
         lighter = doubt is not None and doubt.lighter
@@ -1162,7 +1308,7 @@ class _Runaway:
         rate = observer.rate_rad_s
         if rate is not None:
             self._slowest_angle_rad_s = min(self._slowest_angle_rad_s, abs(rate))
-            if abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self._start_rad_s)):
+            if abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self.start_rad_s)):
                 by_position = f"the position moves at {rate:.2f} rad/s"
         by_torque = "" if lighter else self._by_torque(observer.believable, more)
         ways = [one for one in (by_speed, by_position, by_torque) if one]
@@ -1183,8 +1329,8 @@ class _Runaway:
 
     def _beyond(self, by_impulse_rad_s: float, more_rad_s: float, believable: bool) -> bool:
         """Whether torque alone takes the shaft past its speed limit or, with a speed in doubt, clearly past zero."""
-        start = abs(self._start_rad_s)
-        forward = by_impulse_rad_s * (1.0 if self._start_rad_s >= 0.0 else -1.0)
+        start = abs(self.start_rad_s)
+        forward = by_impulse_rad_s * (1.0 if self.start_rad_s >= 0.0 else -1.0)
         if believable or self._limits.winds_up:
             return abs(by_impulse_rad_s) > max(start, self._limits.speed_max_rad_s) + more_rad_s
         slack = IMPULSE_SHARE * start + more_rad_s

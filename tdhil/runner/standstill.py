@@ -7,7 +7,7 @@ A shaft stands still once all of these have held for long enough:
 - no report contradicts another, or the contradiction has been refuted (`observer.Observer.believable`); then the torque
   must be too small to keep the shaft turning,
 - the drive shows a state in which the shaft may stand still: a quick stop or speed mode that reports standstill, or no
-  torque. A statusword that is no state shows nothing.
+  torque, or torque mode with zero torque. A statusword that is no state shows nothing.
 
 "Long enough" is the time in which every lag runs out, and in which friction stops what the reports can hide.
 """
@@ -42,13 +42,16 @@ class Standstill:
         """Whether speed and position are zero in this sample, and may be believed."""
         observer = self._observer
         return (
-            abs(observer.speed_rad_s(sample)) <= self._at_rest_rad_s
+            abs(observer.speed_rad_s(sample)) <= observer.rest_rad_s(self._at_rest_rad_s)
             and observer.angle_quiet(self._at_rest_rad_s)
             and observer.believable
         )
 
-    def see(self, sample: Sample) -> bool:
-        """Take one sample; true once the shaft has been at rest for long enough."""
+    def see(self, sample: Sample, *, without_torque: bool = False) -> bool:
+        """Take one sample; true once the shaft has been at rest for long enough.
+
+        ``without_torque``: zero torque is commanded, in torque mode.
+        """
         # A single lost frame does not undo what the others showed; a longer gap does.
         gap_s, self._heard_s = sample.time_s - self._heard_s, sample.time_s
         if not self.quiet(sample):
@@ -57,5 +60,5 @@ class Standstill:
         if self._since_s is None or gap_s > self._longest_gap_s:
             self._since_s = sample.time_s
             return False
-        shown = sample.standstill or sample.state in NO_TORQUE
+        shown = without_torque or sample.standstill or sample.state in NO_TORQUE
         return shown and sample.time_s - self._since_s >= self.settle_s

@@ -209,11 +209,18 @@ TORQUE_BACK_S = 0.2
 """Before a quick stop whose speed signal is in doubt, zero torque is commanded for so long, s: some cycles, and the
 drive's own torque ramp."""
 
+TORQUE_FALLS_S = 0.5
+"""Before a shaft runs out, the torque that it turned under goes to zero within this time, s."""
+
+TORQUE_GONE_S = 2.0
+"""The reported torque must have followed zero torque after so long, s."""
+
 REPEAT_S = 1.0
 """The quick stop is asked for again after so long while the drive shows no valid state, s."""
 
 _STOPPING = (PowerState.QUICK_STOP, *NO_TORQUE)
 _REST = Command(Mode.SPEED, 0.0, 0.0)
+_NO_TORQUE_ASKED = Command(Mode.TORQUE, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -296,8 +303,16 @@ class StopSequence:
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
         self._loop.guard.observer.begin_stop()
-        if self._string is not None and not self._speed_doubted and self._slow_down():
+        if self._loop.guard.observer.backwards:
+            at_rest_s = self._coast()
+            if at_rest_s is not None:
+                disabled = self._remove_torque(_NO_TORQUE_ASKED)
+                stays = disabled and self._stays_at_rest()
+                return StopReport(stays, at_rest_s, disabled, tuple(self._trouble))
+        elif self._string is not None and not self._speed_doubted and self._slow_down():
             self._let_go(self._string)
+        if self._string is not None and self._speed_doubted and self._run_out(self._string):
+            return StopReport(False, None, self._torque_removed, tuple(self._trouble), self._trapped_nm)
         at_rest_s = self._decelerate()
         disabled, stays = self._torque_removed, False
         if at_rest_s is not None and not self._wound_up():
@@ -355,6 +370,9 @@ class StopSequence:
             if sample.state is not PowerState.ENABLED or sample.mode is not Mode.SPEED:
                 self._trouble.append(f"the drive shows '{sample.state.value}' while trapped torque is let go")
                 break
+            self._ask_position(sample.time_s)
+            if self._loop.guard.observer.runs_away(sample):
+                break
             command = Command(Mode.SPEED, going.step(sample.torque_nm, sample.speed_rad_s), 0.0)
         self._trapped_nm = going.trapped_nm
         if going.failed:
@@ -362,6 +380,46 @@ class StopSequence:
                 f"trapped torque did not come down: {going.trapped_nm:.0f} N·m at first, {going.torque_nm:.0f} N·m"
                 f" after {going.travel_rad:.1f} rad"
             )
+
+    def _run_out(self, string: StringReleaseLimits) -> bool:
+        """Bring the torque to zero in torque mode and wait until friction has stopped the shaft; then remove it.
+
+        Speed control by a speed that is not believed would drive the shaft on, and so would the drive's watchdog, which
+        brakes by the same signal. False where the drive does not follow torque mode, or its speed is believed again:
+        then the quick stop has to do.
+        """
+        last = self._loop.last
+        if last is None or last.state is not PowerState.ENABLED:
+            return False
+        observer = self._loop.guard.observer
+        torque_nm = kept_within(last.torque_nm - string.torque_offset_nm, -string.torque_nm, string.torque_nm)
+        # What flows while the shaft turns accelerates it and holds nothing: it goes at once.
+        quick_nm_s = abs(torque_nm) / TORQUE_FALLS_S if observer.turned else 0.0
+        step_nm = max(string.ramp_nm_s, quick_nm_s) * self._loop.period_s
+        waited_s = without_s = 0.0
+        while without_s < observer.run_out_s:
+            torque_nm = math.copysign(max(0.0, abs(torque_nm) - step_nm), torque_nm)
+            sample = self._exchange(Command(Mode.TORQUE, 0.0, torque_nm))
+            waited_s += self._loop.period_s
+            if torque_nm == 0.0:
+                without_s += self._loop.period_s
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    return False
+                continue
+            other_mode = sample.mode is not Mode.TORQUE and waited_s > MODE_S
+            if sample.state is not PowerState.ENABLED or other_mode:
+                return False
+            held_nm = abs(sample.torque_nm - string.torque_offset_nm)
+            if not self._speed_doubted or (without_s > TORQUE_GONE_S and held_nm > 2.0 * string.residual_nm):
+                return False
+        doubt = observer.doubt
+        self._trouble.append(
+            f"torque removed: the reported speed is not believed{'' if doubt is None else f' ({doubt.what})'}. The drive"
+            f" gave no torque for {without_s:.0f} s, in which friction stops the shaft; nobody saw it at rest"
+        )
+        self._remove_torque(_NO_TORQUE_ASKED)
+        return True
 
     def _wound_up(self) -> bool:
         """Does the drive hold a torque that disabling would let go at once?"""
@@ -391,6 +449,29 @@ class StopSequence:
         if at_rest_s is None and self._silent < self._enough_silent and self._contradicted():
             at_rest_s = self._see_rest(asked)
         return at_rest_s
+
+    def _coast(self) -> float | None:
+        """Give no torque in torque mode until the shaft is at rest: speed control with an inverted sign drives it on.
+
+        The sign of the reported speed does not matter for that. None where the drive does not do it.
+        """
+        rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
+        patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
+        while not patience.over:
+            sample = self._exchange(_NO_TORQUE_ASKED)
+            if sample is None:
+                if self._silent >= self._enough_silent:
+                    return None
+                patience.wait(self._loop.period_s)
+                continue
+            self._ask_position(sample.time_s)
+            torque_mode = sample.mode is Mode.TORQUE and sample.state is PowerState.ENABLED
+            if not torque_mode or self._loop.guard.observer.runs_away(sample):
+                return None
+            patience.see(sample.speed_rad_s, self._loop.period_s)
+            if rest.see(sample, without_torque=True):
+                return sample.time_s
+        return None
 
     def _take_torque_back(self) -> None:
         """Command zero torque in torque mode first.
@@ -488,9 +569,14 @@ class StopSequence:
         self._trouble.append(
             f"torque removed: the shaft accelerates against the quick stop ({how}). It runs out without a brake"
         )
-        drive = self._loop.drive
-        self._torque_removed = self._disable(drive.remove_torque if isinstance(drive, RemovesTorque) else drive.disable)
+        self._remove_torque()
         return True
+
+    def _remove_torque(self, command: Command = _REST) -> bool:
+        drive = self._loop.drive
+        request = drive.remove_torque if isinstance(drive, RemovesTorque) else drive.disable
+        self._torque_removed = self._disable(request, command)
+        return self._torque_removed
 
     def _leave_to_watchdog(self, sample: Sample) -> bool:
         """Once: from now on the drive's own watchdog hears nothing more. Whether that was done now."""
@@ -517,11 +603,11 @@ class StopSequence:
         )
         return True
 
-    def _disable(self, request: Callable[[], None]) -> bool:
+    def _disable(self, request: Callable[[], None], command: Command = _REST) -> bool:
         asked = self._ask(request)
         for _ in range(self._loop.cycles(3.0)):
             asked = asked or self._ask(request)
-            sample = self._exchange(_REST, or_poll=True)
+            sample = self._exchange(command, or_poll=True)
             if sample is not None and sample.state in (PowerState.OFF, PowerState.FAULT):
                 return True
             if self._silent >= self._enough_silent:
