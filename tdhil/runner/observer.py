@@ -85,9 +85,10 @@ controls the speed then, and only a load that equals the limit to the last newto
 FLAT_MOVES = 3.0
 """How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance."""
 
-YIELD_S, YIELD_APART, YIELD_LEFT = 3.0, 0.5, 0.25
-"""A wound-up shaft that is told to yield follows, since the string pulls it. Over so long the way by the reported speed
-is compared with the commanded one: the reports are false if it is apart by this share, and is less than that share."""
+YIELD_S, YIELD_STILL, YIELD_LEFT = 3.0, 3.0, 0.05
+"""A wound-up shaft that is told to yield follows, since the string pulls it. A reported speed that stays within this
+share of the range of the commanded speed, or within its own noise, does not; asked once the commanded one has a range of
+so many times the speed of standstill within so long."""
 
 HELD_S = 1.5
 """A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
@@ -280,7 +281,7 @@ class Observer:
         self._turns: Unwrapped | None = None
         self._runaway = _Runaway(limits)
         self._flat = _Flat(limits, self._lag_s)
-        self._yielding: deque[tuple[float, float, float, float]] = deque()
+        self._yielding: deque[tuple[float, float, float]] = deque()
         self._revival: _Revival | None = None
         self._angle_revival: _Revival | None = None
         self._failed = [0] * (len(WINDOWS_S) + 1)
@@ -653,23 +654,21 @@ class Observer:
         if not (self._runaway.begun and self._limits.winds_up and command.mode is Mode.SPEED):
             seen.clear()
             return
-        apart_s = point.time_s - seen[-1][0] if seen else 0.0
-        seen.append((point.time_s, apart_s, command.speed_rad_s, point.speed))
+        seen.append((point.time_s, command.speed_rad_s, point.speed))
         while point.time_s - seen[0][0] > YIELD_S:
             seen.popleft()
         if point.time_s - seen[0][0] < YIELD_S - 2.0 * self._point_s:
             return
-        told = math.fsum(part_s * one for _, part_s, one, _ in seen)
-        went = math.fsum(part_s * one for _, part_s, _, one in seen)
-        speeds = [one for _, _, one, _ in seen]
-        late = self._lag_s * (max(speeds) - min(speeds))
-        clear = 2.0 * self._still_rad_s * YIELD_S
-        apart = abs(told) > clear and abs(told - went) > YIELD_APART * abs(told) + late
-        if apart and abs(went) < YIELD_LEFT * abs(told):
+        # What was told last has not been answered yet.
+        told = [one for time_s, one, _ in seen if point.time_s - time_s >= 2.0 * self._lag_s]
+        went = [one for _, _, one in seen]
+        told_range, went_range = max(told) - min(told), max(went) - min(went)
+        noise = max(self._noise_rad_s(), YIELD_LEFT * told_range)
+        if told_range > YIELD_STILL * self._still_rad_s and went_range <= noise:
             self._doubt(
                 frozenset({Signal.SPEED}),
-                f"the shaft is told to yield to the drill string, by {told:.2f} rad within {YIELD_S:g} s, and the"
-                f" reported speed accounts for {went:.2f} rad",
+                f"the shaft is told to yield to the drill string, with {min(told):.2f} to {max(told):.2f} rad/s within"
+                f" {YIELD_S:g} s, and the reported speed stays at {point.speed:.2f} rad/s",
                 "Check the encoder and its cable. Is the shaft held by a brake?", point.time_s,
             )
 
