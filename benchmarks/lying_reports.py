@@ -136,10 +136,10 @@ def summary(rows: Sequence[dict[str, Any]]) -> str:
     lines.append(f"reaction time used at most: {max(used, default=0.0):.2f} s")
     codes = Counter(row["exit_code"] for row in rows)
     lines.append("exits: " + ", ".join(f"{code}: {count}" for code, count in sorted(codes.items())))
-    lines.append("what physics cannot tell, from the start of a run on:")
-    for name, one in UNKNOWABLE.items():
-        rules = ", ".join(sorted(one.rules))
-        lines.append(f"  {name}: {one.reason} (not asked: {rules})")
+    lines.append("what the reports cannot show:")
+    for one in UNKNOWABLE:
+        rules = ", ".join(sorted(one.unknowable.rules))
+        lines.append(f"  {one.words}: {one.unknowable.reason} (not asked: {rules})")
     return "\n".join(lines)
 
 

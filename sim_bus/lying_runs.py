@@ -289,27 +289,69 @@ class Unknowable:
     rules: frozenset[str]
 
 
-UNKNOWABLE: Mapping[str, Unknowable] = {
-    "torque-constant": Unknowable(
+@dataclass(frozen=True)
+class Blind:
+    """Where no arithmetic on the reports can find a lie: lies by their names' beginnings, moments, and the load."""
+
+    lies: tuple[str, ...]
+    unknowable: Unknowable
+    moments: frozenset[str] = frozenset()      # none: at any
+    string: bool | None = None                 # None: with or without
+    demand: bool | None = None                 # only where the drive reports no torque demand, and in speed mode
+
+    @property
+    def words(self) -> str:
+        """Which combinations these are."""
+        load = {None: "", True: ", above a string", False: ", without a string"}[self.string]
+        when = f", {' or '.join(sorted(one or 'from the start' for one in self.moments))}" if self.moments else ""
+        return " and ".join(name.rstrip("-") for name in self.lies) + load + when
+
+    def holds(self, told: Told, moment: str, program: Program) -> bool:
+        """Whether a combination is one of these."""
+        known = program.torque_mode or program.demand
+        return (
+            told.name.startswith(self.lies)
+            and (not self.moments or moment in self.moments)
+            and (self.string is None or self.string is program.string)
+            and (self.demand is None or self.demand is known)
+        )
+
+
+_FROM_START, _IN_STOP = frozenset({"", "setup+2s"}), frozenset({"stop", "stop+500ms"})
+UNKNOWABLE: tuple[Blind, ...] = (
+    Blind(("torque-constant",), Unknowable(
         "demanded, reported and commanded torque agree, and all are the same factor off: J is that factor off",
-        frozenset("c")),
-    "sensor-scale": Unknowable(
+        frozenset("c")), _FROM_START),
+    Blind(("sensor-scale", "sensor-slips"), Unknowable(
         "the drive's speed control, its speed limiter and its position counter follow one wrong sensor",
-        frozenset("cd")),
-    "torque-scale": Unknowable(
+        frozenset("cd")), _FROM_START),
+    Blind(("torque-scale",), Unknowable(
         "in speed mode no torque is commanded, and this drive reports no torque demand", frozenset("c")),
-}
-"""From power-on or stage 1 on. Later in a run each of them is a change, which can be found."""
+        _FROM_START, demand=False),
+    Blind(("sensor-",), Unknowable(
+        "above a drill string neither J nor the load is known before stage 2 ends: a torque at its limit may be a bit"
+        " that sticks, and how long a shaft runs out without torque is not known", frozenset("abd")),
+        _FROM_START | {"speed+12s"}, string=True),
+    Blind(("sensor-offset",), Unknowable(
+        "the drive holds the shaft at the offset with a torque that static friction could hold as well; once that is"
+        " off, the reported speed changes, and the run ends with exit 8", frozenset("a")), string=False),
+    Blind(("sensor-coarse",), Unknowable(
+        "a shaft that is slower than half a step of the sensor is reported at rest by speed, position and torque",
+        frozenset("ab"))),
+    Blind(("motor-polarity", "torque-sign"), Unknowable(
+        "the reports are those of a lost encoder and a torque that pushes the shaft on: the torque is removed",
+        frozenset("a")), _IN_STOP, string=False),
+)
+"""Each is named in `docs/stop.md`. Later in a run than stated each of them is a change, which can be found."""
 
 
 def unknowable(combination: Combination) -> Unknowable | None:
-    """Why a combination can't be known, if so."""
-    if combination.moment not in {"", "setup+2s"}:
+    """Why a combination can't be known, if so; of several the rules together."""
+    found = [one.unknowable for one in UNKNOWABLE
+             if one.holds(combination.told, combination.moment, combination.program)]
+    if not found:
         return None
-    program, name = combination.program, combination.told.name
-    if name == "torque-scale" and (program.torque_mode or program.demand):
-        return None
-    return UNKNOWABLE.get(name)
+    return Unknowable("; ".join(one.reason for one in found), frozenset().union(*(one.rules for one in found)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

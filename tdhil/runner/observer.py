@@ -204,8 +204,12 @@ DOUBTED_REST_SHARE = 0.1
 """Share of the speed that counts as standstill, for a report that was in doubt and may have a wrong scale."""
 IMPULSE_SHARE = 0.3
 """Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
-FASTER_SHARE = 0.1
-"""Of the speed limit, by which a shaft must have become faster under a quick stop."""
+FASTER_SHARE, FASTER_S = 0.1, 0.4
+"""Of the speed limit, by which a shaft must have become faster under a quick stop, and for how long, s: one reading, or
+an encoder that slips, may be wrong for a moment."""
+INVERTED_S, INVERTED_SHARE = 2.0, 0.3
+"""Over so long a speed that rises as the reported torque of the opposite sign accounts for, to within this share and the
+bounds of J, shows an inverted polarity."""
 
 
 class Signal(Enum):
@@ -1202,7 +1206,8 @@ class _Revival:
             self._steady = False
         first_s, first = self._first
         braked = ALIVE_SHARE * self._stop_rad_s2 * (time_s - first_s - ALIVE_S)
-        self.falling = self._steady and speed <= max(first - braked, 0.0) + 2.0 * self._still_rad_s
+        turned = first > 4.0 * self._still_rad_s       # a signal that shows zero from the first does not come down
+        self.falling = self._steady and turned and speed <= max(first - braked, 0.0) + 2.0 * self._still_rad_s
         if self._start is None and time_s >= self._from_s:
             self._start = time_s, speed if speed >= ALIVE_SHARE * self._first[1] else 0.0
         if self.alive or speed > 2.0 * self._still_rad_s:
@@ -1229,6 +1234,10 @@ class _Runaway:
         self._pushing_s = self._pushed_nm = 0.0
         self._apart_nm_s = self._took_s = 0.0
         self._for_s = self._unanswered_s = self._unanswered_rad_s = 0.0
+        self._speed_above_s = self._angle_above_s = 0.0
+        self._seen_s: float | None = None
+        self._recent: deque[_Point] = deque()
+        self._inverted = False
 
     def begin(self, speed_rad_s: float) -> None:
         """A quick stop was asked for, from this speed."""
@@ -1247,6 +1256,7 @@ class _Runaway:
         if self._for_s >= PUSHING_S:
             self._slowest_rad_s = min(self._slowest_rad_s, abs(point.speed))
         self._see_unanswered(point, observer, point.time_s - before.time_s)
+        self._see_inverted(point, known)
         took_s = point.time_s - before.time_s
         if self._by_impulse_rad_s is not None:
             # What a string takes is not known well enough for more than a torque near its limit.
@@ -1270,6 +1280,26 @@ class _Runaway:
         self._pushed_nm = point.torque
         self._apart_nm_s += took_s * abs(point.torque - observer.demand_nm) if observer.demand_nm is not None else 0.0
         self._took_s += took_s
+
+    def _see_inverted(self, point: _Point, known: _Knowledge) -> None:
+        """The speed rises as the reported torque would have it with the opposite sign."""
+        recent = self._recent
+        recent.append(point)
+        while point.time_s - recent[0].time_s > INVERTED_S:
+            recent.popleft()
+        start, self._inverted = recent[0], False
+        window_s = point.time_s - start.time_s
+        change = abs(point.speed) - abs(start.speed)
+        least = FASTER_SHARE * self._limits.speed_max_rad_s
+        if self._limits.winds_up or not known.known or window_s < 0.9 * INVERTED_S or change < least:
+            return
+        forward = math.copysign(1.0, point.speed)
+        pushed_nms = -forward * (point.impulse - start.impulse)
+        usual_nm = 0.5 * math.fsum(known.friction(point.speed, 0.0))
+        expected_nms = pushed_nms - forward * usual_nm * window_s
+        least_nms, most_nms = known.inertia_low * change, known.inertia_high * change
+        slack_nms = INVERTED_SHARE * abs(pushed_nms)
+        self._inverted = least_nms - slack_nms <= expected_nms <= most_nms + slack_nms
 
     def _see_unanswered(self, point: _Point, observer: Observer, took_s: float) -> None:
         """A torque at its limit opposes the reported speed, which does not change."""
@@ -1300,16 +1330,26 @@ class _Runaway:
             not observer.moved and not self._limits.winds_up
         )
         by_speed = by_position = ""
+        took_s = 0.0 if self._seen_s is None else min(sample.time_s - self._seen_s, FASTER_S)
+        self._seen_s = sample.time_s
+        above = observer.believable and abs(sample.speed_rad_s) > faster
+        self._speed_above_s = self._speed_above_s + took_s if above else 0.0
         if in_vain:
             by_speed = "the reported speed does not follow the torque"
-        elif observer.believable and abs(sample.speed_rad_s) > faster:
+        elif self._speed_above_s >= FASTER_S:
             by_speed = f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
         rate = observer.rate_rad_s
         if rate is not None:
             self._slowest_angle_rad_s = min(self._slowest_angle_rad_s, abs(rate))
-            if abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self.start_rad_s)):
+            above = abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
+            self._angle_above_s = self._angle_above_s + took_s if above else 0.0
+            if self._angle_above_s >= FASTER_S:
                 by_position = f"the position moves at {rate:.2f} rad/s"
         by_torque = "" if lighter else self._by_torque(observer.believable, more)
+        # The speed of a shaft that became lighter is followed; so it is where only the sign of the torque is wrong.
+        if lighter and self._inverted and abs(sample.speed_rad_s) > limit:
+            by_speed = by_speed or f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
+            by_torque = "it rises as the reported torque with the opposite sign accounts for"
         ways = [one for one in (by_speed, by_position, by_torque) if one]
         return "; ".join(ways) if len(ways) >= 2 else ""
 

@@ -303,7 +303,7 @@ class StopSequence:
     def _sequence(self) -> StopReport:
         self._loop.guard.expected = None
         self._loop.guard.observer.begin_stop()
-        if self._loop.guard.observer.backwards:
+        if self._loop.guard.observer.backwards or self._never_moved:
             at_rest_s = self._coast()
             if at_rest_s is not None:
                 disabled = self._remove_torque(_NO_TORQUE_ASKED)
@@ -451,12 +451,13 @@ class StopSequence:
         return at_rest_s
 
     def _coast(self) -> float | None:
-        """Give no torque in torque mode until the shaft is at rest: speed control with an inverted sign drives it on.
+        """Give no torque in torque mode until the shaft is at rest: None where the drive does not do it.
 
-        The sign of the reported speed does not matter for that. None where the drive does not do it.
+        For a shaft that speed control would drive on: the sign of a report is inverted, which does not matter for
+        standstill, or no motion has ever been reported.
         """
         rest = Standstill(self._loop.guard.observer, self._at_rest_rad_s, self._settle_s, self._longest_gap_s)
-        patience = StopTimeout(self._enough_s, self._at_rest_rad_s)
+        patience = StopTimeout(self._enough_s + rest.settle_s, self._at_rest_rad_s)
         while not patience.over:
             sample = self._exchange(_NO_TORQUE_ASKED)
             if sample is None:
@@ -483,6 +484,13 @@ class StopSequence:
             return
         for _ in range(self._loop.cycles(TORQUE_BACK_S)):
             self._exchange(Command(Mode.TORQUE, 0.0, 0.0))
+
+    @property
+    def _never_moved(self) -> bool:
+        """Above a string: torque was given, and no motion reported. Speed control could drive an unseen shaft on."""
+        observer, last = self._loop.guard.observer, self._loop.last
+        in_torque = last is not None and last.mode is Mode.TORQUE and last.state is PowerState.ENABLED
+        return self._string is not None and in_torque and observer.unseen_s > 0.0
 
     @property
     def _speed_doubted(self) -> bool:

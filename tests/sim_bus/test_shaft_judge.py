@@ -124,9 +124,13 @@ def test_faults_are_scripted_as_both_buses_take_them():
         parse_modbus(texts, "embedded") if one.program.modbus else parse_all(texts)
 
 
-def test_what_cannot_be_known_can_not_be_known_from_the_start_only():
-    found = {(one.told.name, one.moment) for one in product() if unknowable(one)}
-    assert {name for name, _ in found} == set(UNKNOWABLE)
-    assert {moment for _, moment in found} == {"", "setup+2s"}
+def test_what_cannot_be_known_is_a_small_part_and_each_reason_has_its_runs():
+    for blind in UNKNOWABLE:
+        assert any(blind.holds(one.told, one.moment, one.program) for one in product()), blind.words
+    found = [one for one in product() if unknowable(one)]
+    # the rest is asked for every rule; of those named, most are asked for the others
+    assert len(found) < 0.15 * len(product())
+    later = [one for one in found if one.moment not in {"", "setup+2s"} and "c" in unknowable(one).rules]
+    assert not later, "a J that is wrong by a change in mid-run is never excused"
     reported = [one for one in product() if one.told.name == "torque-scale" and unknowable(one)]
     assert reported and not any(one.program.torque_mode or one.program.demand for one in reported)
