@@ -325,6 +325,9 @@ UNKNOWABLE: tuple[Blind, ...] = (
     Blind(("sensor-scale", "sensor-slips"), Unknowable(
         "the drive's speed control, its speed limiter and its position counter follow one wrong sensor",
         frozenset("cd")), _FROM_START),
+    Blind(("sensor-slips",), Unknowable(
+        "speed and position go up and down together with the slip, as those of a shaft that accelerates",
+        frozenset("a")), _FROM_START),
     Blind(("torque-scale",), Unknowable(
         "in speed mode no torque is commanded, and this drive reports no torque demand", frozenset("c")),
         _FROM_START, demand=False),

@@ -85,10 +85,10 @@ controls the speed then, and only a load that equals the limit to the last newto
 FLAT_MOVES = 3.0
 """How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance."""
 
-YIELD_S, YIELD_STILL, YIELD_LEFT = 3.0, 3.0, 0.05
+YIELD_S, YIELD_STILL, YIELD_LEFT = 3.0, 1.0, 0.05
 """A wound-up shaft that is told to yield follows, since the string pulls it. A reported speed that stays within this
-share of the range of the commanded speed, or within its own noise, does not; asked once the commanded one has a range of
-so many times the speed of standstill within so long."""
+share of the range of the commanded speed, or within its own noise, does not; asked once the commanded one is beyond so
+many times the speed of standstill in the mean over so long."""
 
 HELD_S = 1.5
 """A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
@@ -204,9 +204,9 @@ DOUBTED_REST_SHARE = 0.1
 """Share of the speed that counts as standstill, for a report that was in doubt and may have a wrong scale."""
 IMPULSE_SHARE = 0.3
 """Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
-FASTER_SHARE, FASTER_S = 0.1, 0.4
-"""Of the speed limit, by which a shaft must have become faster under a quick stop, and for how long, s: one reading, or
-an encoder that slips, may be wrong for a moment."""
+FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
+"""Of the speed limit, by which a shaft must have become faster under a quick stop, and for how long, s; the last while
+the reported torque brakes it. An encoder that slips may report a higher speed for a moment."""
 INVERTED_S, INVERTED_SHARE = 2.0, 0.3
 """Over so long a speed that rises as the reported torque of the opposite sign accounts for, to within this share and the
 bounds of J, shows an inverted polarity."""
@@ -446,7 +446,7 @@ class Observer:
     @property
     def _position_lives(self) -> bool:
         """Whether the position went on after a contradiction, and so may stand in for the speed."""
-        return self._angle_revival is not None and self._angle_revival.alive
+        return self._angle_revival is not None and self._angle_revival.alive and self.rate_rad_s is not None
 
     @property
     def moved(self) -> bool:
@@ -461,7 +461,8 @@ class Observer:
     @property
     def comes_down(self) -> bool:
         """Whether a speed in doubt has come down since as a shaft does under a quick stop."""
-        return any(one is not None and one.falling for one in (self._revival, self._angle_revival))
+        seen = (self._revival, self._angle_revival)
+        return any(one is not None and one.falling and one.is_fresh(self._time_s) for one in seen)
 
     @property
     def believable(self) -> bool:
@@ -497,6 +498,14 @@ class Observer:
     def begin_stop(self) -> None:
         """A quick stop was asked for: from now on the shaft must become slower."""
         self._runaway.begin(self._earlier_rad_s())
+
+    def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
+        """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what it was held with before.
+
+        A torque like that of friction may have kept the shaft turning, by a speed signal that is off by so much. Without
+        it the reported speed then leaves standstill at friction's rate.
+        """
+        return self._knowledge.shows_s(at_rest_rad_s, torque_nm)
 
     def runs_away(self, sample: Sample) -> str:
         """How the shaft accelerates against the quick stop, seen in two independent ways; empty: it does not."""
@@ -666,9 +675,11 @@ class Observer:
         # What was told last has not been answered yet.
         told = [one for time_s, one, _ in seen if point.time_s - time_s >= 2.0 * self._lag_s]
         went = [one for _, _, one in seen]
+        mean = math.fsum(abs(one) for one in told) / max(1, len(told))
         told_range, went_range = max(told) - min(told), max(went) - min(went)
         noise = max(self._noise_rad_s(), YIELD_LEFT * told_range)
-        if told_range > YIELD_STILL * self._still_rad_s and went_range <= noise:
+        stands = abs(point.speed) <= 2.0 * self._still_rad_s
+        if stands and mean > YIELD_STILL * self._still_rad_s and went_range <= noise:
             self._doubt(
                 frozenset({Signal.SPEED}),
                 f"the shaft is told to yield to the drill string, with {min(told):.2f} to {max(told):.2f} rad/s within"
@@ -969,6 +980,13 @@ class _Knowledge:
         took_s = self.inertia_high * speed / (RUN_OUT_SHARE * model.coulomb_nm) * by_viscous
         return min(RUN_OUT_MOST_S, took_s)
 
+    def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
+        """See `Observer.shows_s`."""
+        model = self._model
+        if model is None or self._limits.winds_up or abs(torque_nm) <= 0.5 * self.breakaway_low_nm:
+            return 0.0
+        return 2.0 * at_rest_rad_s * self.inertia_high / (RUN_OUT_SHARE * model.coulomb_nm)
+
     def blind_s(self, still_rad_s: float) -> float:
         """How long friction takes at most to stop what (1) cannot find, s."""
         model = self._model
@@ -1216,6 +1234,10 @@ class _Revival:
             self._start is not None and self._came_down(self._start, time_s)
         )
 
+    def is_fresh(self, now_s: float) -> bool:
+        """Whether the signal still comes."""
+        return bool(self._last) and now_s - self._last[-1][0] <= STALE_S
+
     def _came_down(self, since: tuple[float, float], now_s: float) -> bool:
         start_s, start = since
         return start > 4.0 * self._still_rad_s and now_s - start_s >= ALIVE_SHARE * start / self._stop_rad_s2
@@ -1237,7 +1259,7 @@ class _Runaway:
         self._speed_above_s = self._angle_above_s = 0.0
         self._seen_s: float | None = None
         self._recent: deque[_Point] = deque()
-        self._inverted = False
+        self._inverted = self._brakes = False
 
     def begin(self, speed_rad_s: float) -> None:
         """A quick stop was asked for, from this speed."""
@@ -1274,10 +1296,13 @@ class _Runaway:
         elif not observer.moved:       # a little torque may be left over that static friction holds
             least = DOUBTED_SHARE * (self._limits.probe_torque_nm or self._limits.torque_nm)
         turning = observer.rate_rad_s if observer.rate_rad_s and observer.doubt is not None else self.start_rad_s
+        if self._limits.winds_up and observer.believable:
+            turning = point.speed      # the string may have turned it back
         forward = 1.0 if turning >= 0.0 else -1.0
         pushes = (forward * point.torque if observer.moved else abs(point.torque)) > least
         self._pushing_s = self._pushing_s + took_s if pushes else 0.0
         self._pushed_nm = point.torque
+        self._brakes = -forward * point.torque > least
         self._apart_nm_s += took_s * abs(point.torque - observer.demand_nm) if observer.demand_nm is not None else 0.0
         self._took_s += took_s
 
@@ -1330,20 +1355,21 @@ class _Runaway:
             not observer.moved and not self._limits.winds_up
         )
         by_speed = by_position = ""
-        took_s = 0.0 if self._seen_s is None else min(sample.time_s - self._seen_s, FASTER_S)
+        took_s = 0.0 if self._seen_s is None else min(sample.time_s - self._seen_s, STALE_S)
         self._seen_s = sample.time_s
         above = observer.believable and abs(sample.speed_rad_s) > faster
         self._speed_above_s = self._speed_above_s + took_s if above else 0.0
+        enough_s = FASTER_BRAKED_S if self._brakes else FASTER_S
         if in_vain:
             by_speed = "the reported speed does not follow the torque"
-        elif self._speed_above_s >= FASTER_S:
+        elif self._speed_above_s >= enough_s:
             by_speed = f"the reported speed rose to {sample.speed_rad_s:.2f} rad/s"
         rate = observer.rate_rad_s
         if rate is not None:
             self._slowest_angle_rad_s = min(self._slowest_angle_rad_s, abs(rate))
             above = abs(rate) > more + max(self._slowest_angle_rad_s, IMPULSE_SHARE * abs(self.start_rad_s))
             self._angle_above_s = self._angle_above_s + took_s if above else 0.0
-            if self._angle_above_s >= FASTER_S:
+            if self._angle_above_s >= enough_s:
                 by_position = f"the position moves at {rate:.2f} rad/s"
         by_torque = "" if lighter else self._by_torque(observer.believable, more)
         # The speed of a shaft that became lighter is followed; so it is where only the sign of the torque is wrong.
@@ -1359,7 +1385,7 @@ class _Runaway:
             return ""
         if self._unanswered_s >= UNANSWERED_S:
             return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
-        if self._pushing_s >= PUSHING_S and not self._limits.winds_up:
+        if self._pushing_s >= PUSHING_S and (believable or not self._limits.winds_up):
             return f"{self._pushed_nm:.0f} N·m push the shaft on"
         by_impulse = self._by_impulse_rad_s
         if by_impulse is not None and self._beyond(by_impulse, more_rad_s, believable):

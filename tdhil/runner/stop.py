@@ -270,7 +270,7 @@ class StopSequence:
                 torque_offset_nm=torque_offset_nm,
             )
         self._held: deque[float] = deque(maxlen=loop.cycles(MEAN_S))
-        self._trapped_nm = 0.0
+        self._trapped_nm = self._held_at_rest_nm = 0.0
         self._position_due_s = self._repeat_due_s = -math.inf
         self._torque_removed = False
         self._trouble: list[str] = []
@@ -523,6 +523,7 @@ class StopSequence:
             if not braking.see(sample.time_s, speed_rad_s) and self._leave_to_watchdog(sample):
                 patience = StopTimeout(self._enough_s + self._limits.watchdog_s, self._at_rest_rad_s)
             if rest.see(sample) and self._poll_agrees(rest):
+                self._held_at_rest_nm = math.fsum(self._held) / len(self._held)
                 return sample.time_s
         if observer.doubt is not None and not observer.believable:
             self._trouble.append(
@@ -626,6 +627,8 @@ class StopSequence:
     def _stays_at_rest(self) -> bool:
         """Nothing turns the shaft now that nothing holds it; it was seen at rest before."""
         quiet_s, told, heard_s = 0.0, False, self._loop.now_s
+        enough_s = max(self._settle_s, min(0.8 * REST_AFTER_S, self._loop.guard.observer.shows_s(
+            self._at_rest_rad_s, self._held_at_rest_nm)))
         for _ in range(self._loop.cycles(REST_AFTER_S)):
             sample = self._exchange(_REST, or_poll=True)
             if sample is None:
@@ -645,7 +648,7 @@ class StopSequence:
                         f"the shaft began to turn ({sample.speed_rad_s:.3f} rad/s) once its torque was off:"
                         " is something wound up, or hanging on it?"
                     )
-            elif quiet_s >= self._settle_s:
+            elif quiet_s >= enough_s:
                 return True
         return False
 

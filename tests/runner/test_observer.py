@@ -10,7 +10,8 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from drivers import Command, Mode, PowerState
-from tdhil.runner.observer import Signal
+from tdhil.runner.excitation import RigGuess
+from tdhil.runner.observer import RUN_OUT_MOST_S, Signal
 from tests.runner.reporting_rig import LIMITS, Bench, Reports, Rig
 
 COUNT_RAD = 2.0 * math.pi / 8192
@@ -488,3 +489,125 @@ def test_above_a_drill_string_the_torque_is_left_on_below_the_speed_limit(name):
     assert how
     assert bench.speed > LIMITS.speed_max_rad_s
     assert len(how.split("; ")) >= 2
+
+
+# -- above a drill string, and what later showed ----------------------------------------
+
+ABOVE_A_STRING = replace(PLAIN, limits=replace(LIMITS, load="string", torque_ramp_nm_s=40.0))
+
+
+def test_above_a_string_a_frozen_speed_at_the_torque_limit_is_found_within_seconds():
+    """The drive pushes on with all it has, since its frozen speed stays below the setpoint."""
+    bench = Bench(ABOVE_A_STRING)
+    bench.first_levels()
+    kept = bench.speed
+    bench.sensor = lambda speed: kept
+    bench.lie = frozen(bench, "speed_rad_s")
+    after_s = bench.found_after(6.0, lambda: bench.cycle(Command(Mode.SPEED, kept + 3.0, 0.0)))
+    assert after_s is not None and after_s < 3.0
+    assert bench.observer.doubt.signals == {Signal.SPEED}
+
+
+def test_above_a_string_a_frozen_speed_is_found_by_the_torque_that_should_have_moved_it():
+    bench = Bench(ABOVE_A_STRING).begun()
+    bench.excite(4.0, 5.0, 1.0)
+    assert bench.observer.doubt is None
+    bench.lie = frozen(bench, "speed_rad_s")
+    assert bench.found_after(10.0, lambda: bench.excite(1.0, 5.0, 1.0)) is not None
+
+
+def test_a_setpoint_that_steps_above_a_string_is_no_frozen_speed():
+    """A late report hardly moves at first; that is not counted."""
+    bench = Bench(replace(ABOVE_A_STRING, speed_lag_s=0.5, torque_lag_s=0.5)).begun()
+    for speed in (5.0, 5.2, 5.0, 6.0, 5.0):
+        bench.hold(4.0, speed)
+    assert bench.observer.doubt is None
+
+
+def test_a_shaft_that_is_told_to_yield_and_stands_is_not_believed():
+    bench = Bench(ABOVE_A_STRING).begun()
+    bench.ramp(0.0)
+    bench.hold(2.0, 0.0)
+    bench.observer.begin_stop()
+    bench.lie = lambda reports: reports._replace(speed_rad_s=0.0)
+
+    def swing():
+        bench.hold(0.5, 0.5)
+        bench.hold(0.5, -0.5)
+
+    assert bench.found_after(10.0, swing) is not None
+    assert bench.observer.doubt.signals == {Signal.SPEED}
+
+
+def test_a_shaft_that_yields_is_believed():
+    bench = Bench(ABOVE_A_STRING).begun()
+    bench.ramp(0.0)
+    bench.hold(2.0, 0.0)
+    bench.observer.begin_stop()
+    for _ in range(8):
+        bench.hold(0.5, 0.5)
+        bench.hold(0.5, -0.5)
+    assert bench.observer.doubt is None
+
+
+@pytest.mark.parametrize(("factor", "contradicts"), [(1.0, False), (0.05, True), (20.0, True)])
+def test_a_scale_that_changed_within_stage_2_contradicts_the_first_ramp(factor, contradicts):
+    bench = Bench(PLAIN)
+    bench.first_levels()
+    model = RigGuess(factor * PLAIN.inertia, PLAIN.viscous, PLAIN.coulomb, 0.15)
+    bench.observer.know(model)
+    assert (bench.observer.doubt is not None) is contradicts
+
+
+def test_an_inverted_polarity_is_a_second_way_where_no_position_is_reported():
+    """The motor pushes the other way than its current says: the speed rises as the torque with the opposite sign does."""
+    bench = Bench(PLAIN).begun()
+    bench.polarity = -1.0
+    how = bench.quick_stop(20.0)
+    assert "opposite sign" in how or "does not follow" in how
+    assert abs(bench.speed) < 2.0 * LIMITS.speed_max_rad_s
+
+
+def test_a_position_that_ceases_to_come_is_no_witness():
+    bench = Bench(WITH_POSITION).begun()
+    bench.lie = lambda reports: reports._replace(speed_rad_s=0.0)
+    bench.hold(1.0, 5.0)
+    assert bench.observer.doubt is not None
+    bench.observer.begin_stop()
+    bench.state = PowerState.QUICK_STOP
+    bench.hold(4.0, 0.0)
+    bench.lie = lambda reports: reports._replace(speed_rad_s=0.0, position_rad=None)
+    bench.hold(3.0, 0.0)
+    assert bench.observer.rate_rad_s is None
+    assert not bench.observer.believable and not bench.observer.comes_down
+
+
+def test_standstill_is_held_more_closely_once_a_report_was_in_doubt():
+    bench = Bench(PLAIN).begun()
+    assert bench.observer.rest_rad_s(0.05) == 0.05
+    bench.lie = changed("speed_rad_s", 0.5)
+    bench.hold(1.0, 5.0)
+    assert bench.observer.doubt is not None
+    assert bench.observer.rest_rad_s(1.0) < 0.5
+
+
+def test_a_shaft_runs_out_by_no_less_than_half_of_its_friction():
+    """t = J/(s B) ln(1 + B ω/T_c), against a simulation with just that friction."""
+    bench = Bench(ABOVE_A_STRING).begun()
+    bench.observer.begin_stop()
+    speed, time_s, dt = bench.speed, 0.0, 1e-3
+    while speed > 0.0:
+        speed -= dt * 0.5 * (PLAIN.coulomb + PLAIN.viscous * speed) / (1.05 * 1.15 * PLAIN.inertia)
+        time_s += dt
+    assert bench.observer.run_out_s == pytest.approx(time_s, rel=0.02)
+
+
+def test_without_friction_known_a_shaft_gets_the_longest_time_to_run_out():
+    assert Bench(ABOVE_A_STRING).observer.run_out_s == RUN_OUT_MOST_S
+
+
+def test_a_torque_like_frictions_at_standstill_makes_the_watch_longer():
+    bench = Bench(PLAIN).begun()
+    assert bench.observer.shows_s(0.05, 0.0) == 0.0
+    watched_s = bench.observer.shows_s(0.05, PLAIN.coulomb)
+    assert watched_s * 0.5 * PLAIN.coulomb / PLAIN.inertia >= 2.0 * 0.05

@@ -21,9 +21,13 @@ class Told:
     blind_s: float = 0.0
     unseen_s: float = 0.0
     by_position: float | None = None
+    rest_share: float = 1.0
 
     def speed_rad_s(self, sample):
         return sample.speed_rad_s if self.by_position is None else self.by_position
+
+    def rest_rad_s(self, at_rest_rad_s):
+        return self.rest_share * at_rest_rad_s
 
     def angle_quiet(self, at_rest_rad_s):
         assert at_rest_rad_s == AT_REST

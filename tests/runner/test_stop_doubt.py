@@ -277,3 +277,64 @@ def test_a_release_whose_speed_follows_is_not():
     here = StringWorld(replace(STRING, quick_stop_rad_s2=2.0), twist_nm=300.0, stiffness=30.0)
     report = here.stop_sequence().run()
     assert report.confirmed and here.guard.observer.doubt is None
+
+
+# -- a shaft that runs out ----------------------------------------
+
+
+def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
+    """It would push the shaft on; so would the watchdog. Torque mode at zero until friction has stopped it, then off."""
+    here = known(world, limits=STRING)
+    here.drive.sees = 0.0
+    doubted(here)
+    begun = len(here.drive.commands)
+    report = here.stop_sequence().run()
+    assert not report.confirmed and report.at_rest_s is None and report.disabled
+    assert "quick_stop" not in here.drive.calls and here.drive.calls.count("remove_torque") == 1
+    assert {one.mode for one in here.drive.commands[begun:]} == {Mode.TORQUE}
+    assert here.drive.commands[-1].torque_nm == 0.0
+    assert abs(here.drive.disabled_at[0]) < 0.05, "friction had the time to stop it"
+    assert any("nobody saw it at rest" in line for line in report.trouble)
+
+
+def test_a_drive_that_does_not_follow_torque_mode_gets_the_quick_stop(world):
+    here = known(world, limits=STRING)
+    here.drive.sees = 0.0
+    doubted(here)
+    here.drive.modes = (Mode.SPEED,)
+    here.drive.mode = Mode.SPEED
+    report = here.stop_sequence().run()
+    assert not report.confirmed
+    assert "quick_stop" in here.drive.calls
+
+
+def test_a_torque_that_stays_in_spite_of_zero_gets_the_quick_stop(world):
+    here = known(world, limits=STRING)
+    here.drive.sees = 0.0
+    doubted(here)
+    here.drive.misbehave = lambda drive, one: one._replace(torque_nm=200.0)
+    report = here.stop_sequence().run()
+    assert not report.confirmed and "quick_stop" in here.drive.calls
+
+
+@pytest.mark.parametrize("limits", [LIMITS, STRING])
+def test_an_inverted_sign_coasts_to_standstill_without_speed_control(world, limits):
+    here = world(Removing(direction=-1.0, viscous=4.0), limits)
+    here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
+    with pytest.raises(PreflightRefused, match="turned backwards"):
+        probe_sign(here.bench, limits, Mode.TORQUE, SPEED_RESOLUTION)
+    report = here.stop_sequence().run()
+    assert report.confirmed and report.disabled, report.trouble
+    assert "quick_stop" not in here.drive.calls
+    assert abs(here.drive.disabled_at[0]) < 0.05
+
+
+def test_above_a_string_a_probe_that_saw_no_motion_gets_no_speed_control(world):
+    here = world(Removing(sees=0.0, viscous=4.0), STRING)
+    here.bench.enable(Mode.TORQUE, Command(Mode.TORQUE, 0.0, 0.0))
+    with pytest.raises(PreflightRefused, match="did not move"):
+        probe_sign(here.bench, STRING, Mode.TORQUE, SPEED_RESOLUTION)
+    wait_s, begun_s = here.guard.observer.unseen_s, here.bench.now_s
+    here.stop_sequence().run()
+    assert "quick_stop" not in here.drive.calls
+    assert here.bench.now_s - begun_s >= wait_s
