@@ -82,13 +82,15 @@ FLAT_S, FLAT_LIMIT_S, FLAT_LAGS = 1.0, 1.5, 3.0
 should have moved it for so long beyond so many lags, or if the torque stands at its limit for the second time: nothing
 controls the speed then, and only a load that equals the limit to the last newton metre would keep it."""
 
-FLAT_MOVES = 3.0
-"""How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance."""
+FLAT_MOVES, YIELD_MOVES = 12.0, 3.0
+"""How many times its noise a speed must have been moved, by the bounds of J and of the string's impedance; and how fast
+a shaft must have been told to yield. A string that swings keeps a healthy speed within its noise against 5.6 times that
+(`benchmarks/healthy_runs.py`)."""
 
-YIELD_S, YIELD_STILL, YIELD_LEFT = 3.0, 1.0, 0.05
+YIELD_S, YIELD_STILL, YIELD_LEFT, SMOOTH_S = 4.0, 1.0, 0.05, 0.4
 """A wound-up shaft that is told to yield follows, since the string pulls it. A reported speed that stays within this
 share of the range of the commanded speed, or within its own noise, does not; asked once the commanded one is beyond so
-many times the speed of standstill in the mean over so long."""
+many times the speed of standstill in the mean over so long, of means over the last, s."""
 
 HELD_S = 1.5
 """A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
@@ -208,7 +210,7 @@ FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
 """Of the speed limit, by which a shaft must have become faster under a quick stop, and for how long, s; the last while
 the reported torque brakes it. An encoder that slips may report a higher speed for a moment."""
 INVERTED_S, INVERTED_SHARE = 2.0, 0.3
-"""Over so long a speed that rises as the reported torque of the opposite sign accounts for, to within this share and the
+the reported torque brakes it. A slipping encoder may report a higher speed for a moment."""
 bounds of J, shows an inverted polarity."""
 
 
@@ -502,7 +504,7 @@ class Observer:
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
         """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what it was held with before.
 
-        A torque like that of friction may have kept the shaft turning, by a speed signal that is off by so much. Without
+        """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what held it before.
         it the reported speed then leaves standstill at friction's rate.
         """
         return self._knowledge.shows_s(at_rest_rad_s, torque_nm)
@@ -672,14 +674,15 @@ class Observer:
             seen.popleft()
         if point.time_s - seen[0][0] < YIELD_S - 2.0 * self._point_s:
             return
-        # What was told last has not been answered yet.
-        told = [one for time_s, one, _ in seen if point.time_s - time_s >= 2.0 * self._lag_s]
+        # What was told last has not been answered yet, and what changes from cycle to cycle is torque noise.
+        told = _means([(time_s, one) for time_s, one, _ in seen if point.time_s - time_s >= 2.0 * self._lag_s], SMOOTH_S)
         went = [one for _, _, one in seen]
         mean = math.fsum(abs(one) for one in told) / max(1, len(told))
         told_range, went_range = max(told) - min(told), max(went) - min(went)
         noise = max(self._noise_rad_s(), YIELD_LEFT * told_range)
+        clear = max(YIELD_STILL * self._still_rad_s, YIELD_MOVES * noise)
         stands = abs(point.speed) <= 2.0 * self._still_rad_s
-        if stands and mean > YIELD_STILL * self._still_rad_s and went_range <= noise:
+        if stands and mean > clear and went_range <= noise:
             self._doubt(
                 frozenset({Signal.SPEED}),
                 f"the shaft is told to yield to the drill string, with {min(told):.2f} to {max(told):.2f} rad/s within"
@@ -995,6 +998,14 @@ class _Knowledge:
         # A lag hides lag·ΔT of impulse; while a shaft comes to rest the torque changes by about its friction.
         hidden_nms = self._lag_s * 2.0 * model.steady_torque_nm(self._limits.speed_min_rad_s)
         return min(BLIND_MOST_S, hidden_nms / self.breakaway_low_nm)
+
+
+def _means(values: list[tuple[float, float]], over_s: float) -> list[float]:
+    """Means of (time, value) over so long each, s."""
+    blocks: dict[int, list[float]] = {}
+    for time_s, value in values:
+        blocks.setdefault(math.floor((time_s - values[0][0]) / over_s), []).append(value)
+    return [math.fsum(block) / len(block) for block in blocks.values()]
 
 
 class _Flat:

@@ -413,10 +413,10 @@ class StopSequence:
             held_nm = abs(sample.torque_nm - string.torque_offset_nm)
             if not self._speed_doubted or (without_s > TORQUE_GONE_S and held_nm > 2.0 * string.residual_nm):
                 return False
-        doubt = observer.doubt
+        why = f" ({observer.doubt.what})" if observer.doubt is not None else ""
         self._trouble.append(
-            f"torque removed: the reported speed is not believed{'' if doubt is None else f' ({doubt.what})'}. The drive"
-            f" gave no torque for {without_s:.0f} s, in which friction stops the shaft; nobody saw it at rest"
+            f"torque removed: the reported speed is not believed{why}. The drive gave no torque for {without_s:.0f} s, in"
+            " which friction stops the shaft; nobody saw it at rest"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
         return True

@@ -560,7 +560,7 @@ def test_a_scale_that_changed_within_stage_2_contradicts_the_first_ramp(factor, 
 
 
 def test_an_inverted_polarity_is_a_second_way_where_no_position_is_reported():
-    """The motor pushes the other way than its current says: the speed rises as the torque with the opposite sign does."""
+    """The motor pushes the other way than its current says: the speed rises as the opposite torque would have it."""
     bench = Bench(PLAIN).begun()
     bench.polarity = -1.0
     how = bench.quick_stop(20.0)

@@ -283,7 +283,7 @@ def test_a_release_whose_speed_follows_is_not():
 
 
 def test_above_a_string_a_speed_that_is_lost_gets_no_speed_control(world):
-    """It would push the shaft on; so would the watchdog. Torque mode at zero until friction has stopped it, then off."""
+    """It would push the shaft on; so would the watchdog. Zero torque until friction has stopped it, then off."""
     here = known(world, limits=STRING)
     here.drive.sees = 0.0
     doubted(here)
