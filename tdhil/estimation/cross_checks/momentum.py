@@ -189,7 +189,7 @@ class Knot:
 class Row:
     """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w².
 
-    ``stepped``: a speed setpoint moved the shaft, a step a cycle, for some of it.
+    ``stepped_rad_s``: the part of ``change_rad_s`` in which a speed setpoint moved the shaft, a step a cycle.
     """
 
     first: Knot
@@ -201,7 +201,7 @@ class Row:
     time_s: float             # ∫w
     impulse_nm_s: float       # ∫w T
     energy_s: float
-    stepped: bool = False
+    stepped_rad_s: float = 0.0
 
 
 def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
@@ -282,6 +282,7 @@ _COAST_KNOT_S = 0.5
 _APART_S = 5.0            # at least, between knots of one calm stretch
 _CLOSER_S = 2.5           # the same where the rows alone must tell the scatter: more of them, if less independent
 _COAST_ENTRY_S = 1.5      # until the reports have forgotten the torque that was there before
+_SWITCH_S = 0.25          # either side of a change of mode, where its speed is read
 _BEYOND = 0.8             # friction is taken as known down to this share of the least speed that it was seen at
 
 
@@ -317,19 +318,28 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
         apart = first.end_s <= second.start_s + 1e-6 and first.coasting == second.coasting
         if apart and min(least, most) >= low and max(least, most) <= high:
             row = balance(samples, first, second)
-            found += [replace(row, stepped=_stepped(recording, row))] if row is not None else []
+            found += [replace(row, stepped_rad_s=_stepped_rad_s(recording, samples, row))] if row is not None else []
     return Balances(tuple(found), direction, calm) if found else None
 
 
-def _stepped(recording: Recording, row: Row) -> bool:
-    """Was a run of ours in speed mode for some of the time? Of a foreign trace nobody knows the setpoint."""
+def _stepped_rad_s(recording: Recording, samples: Samples, row: Row) -> float:
+    """Change of speed in the parts of a row that a run of ours spent in speed mode. 0 for a trace of another tool: its
+    setpoint is not known.
+    """
     if row.kind is Kind.COASTING or not recording.stages:
-        return False
+        return 0.0
     commanded = recording.commanded_torque_nm
     if commanded is None:
-        return True
-    first, last = np.searchsorted(recording.time_s, (row.first.start_s, row.second.end_s))
-    return bool(np.any(np.isnan(commanded[first:last])))
+        return row.change_rad_s
+    first, last = (int(i) for i in np.searchsorted(recording.time_s, (row.first.start_s, row.second.end_s)))
+    in_speed = np.concatenate(([False], np.isnan(commanded[first:last]), [False])).astype(np.int8)
+    changes = np.flatnonzero(np.diff(in_speed))
+    if len(changes) == 2 and changes[0] == 0 and changes[1] == last - first:
+        return row.change_rad_s
+    times = recording.time_s[first + np.minimum(changes, last - first - 1)]
+    speeds = np.array([_mean_speed(samples, Knot(at - _SWITCH_S, at + _SWITCH_S)) for at in times])
+    parts = speeds[1::2] - speeds[::2]
+    return float(np.sum(parts[np.isfinite(parts)]))
 
 
 def periodic_segments(recording: Recording) -> tuple[Segment, ...]:
