@@ -99,7 +99,9 @@ class ReadMoment:
     torque_lag_s: float
 
 
-def reading_share(loops: Sequence[SteppedSetpoint], moment: ReadMoment | None, torque_lag_s: float = 0.0) -> ReadingShare:
+def reading_share(
+    loops: Sequence[SteppedSetpoint], moment: ReadMoment | None, torque_lag_s: float = 0.0
+) -> ReadingShare:
     """Over the moments of reading that the skew leaves open, and over ``loops``, which are alike likely.
 
     With no skew every moment of a cycle is alike likely: then the share is 0 in the mean. ``torque_lag_s``: of the
@@ -145,8 +147,7 @@ _SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)
 
 
 def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:
-    """PI loops with a double pole at half their crossover, from slow to quick; a setpoint stepped once in ``period_s``.
-    """
+    """PI loops with a double pole at half their crossover, from slow to quick, stepped once in ``period_s``."""
     loops = []
     for share in _SHARES_OF_CROSSOVER:
         first_s = 4.0 / (share * _CROSSOVER_RAD_S)

@@ -1,4 +1,4 @@
-"""Gains of the drive's speed loop from the ramp of stage 2: against a simulation in fine steps, and what is not read."""
+"""Gains of the drive's speed loop from the ramp of stage 2: against a simulation, and what is not read."""
 
 from dataclasses import replace
 

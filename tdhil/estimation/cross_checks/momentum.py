@@ -279,6 +279,8 @@ def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *, pe
 
 KNOT_S = 1.0
 _COAST_KNOT_S = 0.5
+_SETTLED = ("speed", "hold")      # stages that end at a speed
+_SETTLING_PER_S = 0.05    # of the range of speed per second: a delay that is known to 0.02 s costs 0.1 % of the range
 _APART_S = 5.0            # at least, between knots of one calm stretch
 _CLOSER_S = 2.5           # the same where the rows alone must tell the scatter: more of them, if less independent
 _COAST_ENTRY_S = 1.5      # until the reports have forgotten the torque that was there before
@@ -306,6 +308,7 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
     knots += [knot for segment in periodic for knot in _period_knots(segment)]
     if not knots:
         return None
+    knots += _stage_knots(recording, samples, blocks, knots)
     speeds = np.array([_mean_speed(samples, knot) for knot in knots])
     direction = float(np.sign(np.nansum(speeds)))
     low, high = _seen(blocks, knots, direction)
@@ -369,6 +372,23 @@ def _calm_knots(span: Span, apart_s: float) -> list[Knot]:
         return [Knot(middle - 0.5 * KNOT_S, middle + 0.5 * KNOT_S)]
     starts = np.linspace(span.start_s, span.end_s - KNOT_S, count)
     return [Knot(float(start), float(start) + KNOT_S) for start in starts]
+
+
+def _stage_knots(recording: Recording, samples: Samples, blocks: Blocks, others: list[Knot]) -> list[Knot]:
+    """The last moment of stages 2 and 4, where the shaft has been brought to a speed but not held there for long.
+
+    What is left of a change of speed is in the row: the known delay takes its acceleration to the true speed.
+    """
+    found = []
+    for stage in recording.stages:
+        knot = Knot(stage.end_s - KNOT_S, stage.end_s)
+        inside = (blocks.time_s > knot.start_s) & (blocks.time_s < knot.end_s)
+        apart = all(knot.start_s >= one.end_s or knot.end_s <= one.start_s for one in others)
+        if stage.name in _SETTLED and apart and np.any(inside) and knot.end_s <= float(samples.time_s[-1]) + BLOCK_S:
+            reach = float(np.ptp(blocks.speed_rad_s))
+            if np.all(np.abs(blocks.acceleration_rad_s2[inside]) <= _SETTLING_PER_S * reach):
+                found.append(knot)
+    return found
 
 
 def _period_knots(segment: Segment) -> list[Knot]:

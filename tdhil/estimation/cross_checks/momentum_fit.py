@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.estimation.cross_checks.momentum import Balances, Kind, Row, overlap_s
+from tdhil.estimation.cross_checks.momentum import KNOT_S, Balances, Kind, Row, overlap_s
 from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
@@ -129,8 +129,10 @@ def fit_momentum(
     edges = gain * float(x[0])
     # a rounded speed is wrong at a knot: by the same amount, with opposite sign, in the two rows that share it
     knots = np.append(edges, 0.0) - np.append(0.0, edges)
+    # and its slope there, which the delay multiplies, by as much as a sawtooth over the knot
+    read = resolution.speed_rad_s * math.hypot(1.0, math.sqrt(12.0) * delay.seconds / KNOT_S)
     rounding = math.hypot(
-        resolution.speed_rad_s * float(np.linalg.norm(knots)),
+        read * float(np.linalg.norm(knots)),
         resolution.torque_nm * float(np.linalg.norm(gain * np.array([row.time_s for row in rows]))),
     )
     scatter = math.sqrt(density.value * float(spread[0, 0]))

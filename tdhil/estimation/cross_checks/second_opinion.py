@@ -31,12 +31,15 @@ from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
 from tdhil.estimation.samples import Samples, usual_interval
-from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare, ReadMoment, reading_share, usual_loops
+from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
 from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
 _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
+_WORTH_A_FIT = 0.005
+"""Of J: what reading in step may do with a usual speed loop, from which on the drive's own loop is looked at."""
+
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
 _ACQUISITION = "acquire"  # the stage that J comes from
 _CONTRADICTION = 1e-3
@@ -177,8 +180,7 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
 
 
 def _reading(case: Case, finding: Finding) -> ReadingShare:
-    """What reading in step with a speed setpoint adds to J of the rows that the setpoint moved, beyond what it adds to J
-    of stage 5.
+    """What reading in step with a speed setpoint adds to J of the ramps, beyond what it adds to J of stage 5.
 
     In torque mode stage 5 has none of it, and its skew tells the moment of reading. Stage 5 in speed mode is read like
     the ramps. But a ramp generator in the drive smooths a ramp's large steps more than the small ones of stage 5, so
@@ -211,7 +213,8 @@ def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
     period_s = usual_interval(case.samples.time_s)
     loops = usual_loops(period_s)
     reference, lag = reference_inertia(finding), finding.speed_lag_s
-    if reference is None or not reading_share(loops[-1:], None).sd > 0.0:
+    usual = reading_share(loops, _moment(finding), _least_lag_s(case, finding))
+    if reference is None or max(abs(usual.value), usual.sd) < _WORTH_A_FIT:
         return loops
     lag_s = lag.value if lag is not None else case.recording.lag_prior.speed_lag_s
     seen = None if lag_s is None else speed_loop(case.recording, case.samples, lag_s)
