@@ -38,7 +38,7 @@ _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
 _WORTH_A_FIT = 0.005
-"""Of J: what reading in step may do with a usual speed loop, from which on the drive's own loop is looked at."""
+"""Share of J that reading in step may add with a usual speed loop, from which on the drive's own loop is fitted."""
 
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
 _ACQUISITION = "acquire"  # the stage that J comes from
@@ -57,7 +57,9 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     fitted = _fitted_opinions(case, finding)
     opinions = tuple(opinion for opinion, _ in fitted)
     warnings = (*finding.warnings, *disagreements(opinions, finding))
-    against = (*fitted, *_before_acquisition(case, finding))
+    before = _before_acquisition(case, finding)
+    against = (*fitted, *before)
+    opinions = _with_least_change(opinions, before, len(against), finding, case.options.confidence)
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, case.options.confidence)
     if contradiction.reason:
@@ -131,9 +133,8 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
         if reference is None or opinion.agrees is not False:
             continue
         apart = abs(own.value - reference.value)
-        half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
-        wider = Estimate(own.value, own.value - half, own.value + half)
         share = _CONTRADICTION / len(opinions)
+        wider = _bent_by(own, fit, confidence)
         if apart > _ALIKE * reference.value and _agrees(wider, finding, confidence, share) is False:
             return Refusal(
                 f"two routes through the same run contradict each other: J is {reference.value:.4g} kg·m² by the "
@@ -144,6 +145,26 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 " during the run; then run it again",
             )
     return Refusal("", "")
+
+
+def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
+    """The interval of a balance, as wide as friction that bends may make it."""
+    half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
+    return Estimate(own.value, own.value - half, own.value + half)
+
+
+def _with_least_change(
+    opinions: tuple[SecondOpinion, ...], before: Fitted, compared: int, finding: Finding, confidence: float
+) -> tuple[SecondOpinion, ...]:
+    """The first one's note with the least change of a signal's scale at stage 5 that would contradict J."""
+    reference = reference_inertia(finding)
+    if not opinions or not before or reference is None or not reference.finite or not reference.value > 0.0:
+        return opinions
+    own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
+    half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
+    least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / compared) * half / reference.value)
+    note = f"{opinions[0].note}; a scale of speed or torque that changes at stage 5 shows from ±{least:.0%} on"
+    return (replace(opinions[0], note=note), *opinions[1:])
 
 
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
@@ -180,7 +201,7 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
 
 
 def _reading(case: Case, finding: Finding) -> ReadingShare:
-    """What reading in step with a speed setpoint adds to J of the ramps, beyond what it adds to J of stage 5.
+    """Share that reading in step with a speed setpoint adds to J of the ramps, beyond what it adds to J of stage 5.
 
     In torque mode stage 5 has none of it, and its skew tells the moment of reading. Stage 5 in speed mode is read like
     the ramps. But a ramp generator in the drive smooths a ramp's large steps more than the small ones of stage 5, so
@@ -281,8 +302,11 @@ def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: floa
     below = own.value < reference.value
     theirs = reference.value - reference.low if below else reference.high - reference.value
     ours = own.high - own.value
-    wider = student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
-    return abs(own.value - reference.value) <= wider * math.hypot(ours, theirs)
+    return abs(own.value - reference.value) <= _times_wider(confidence, miss_share) * math.hypot(ours, theirs)
+
+
+def _times_wider(confidence: float, miss_share: float) -> float:
+    return student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
 
 
 def _note(fit: MomentumFit, kind: Kind, delay: Delay) -> str:

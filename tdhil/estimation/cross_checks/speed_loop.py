@@ -80,7 +80,7 @@ def speed_loop(recording: Recording, samples: Samples, speed_lag_s: float) -> Sp
 
 
 def _least(of: Callable[[int], float], first: int, last: int, stride: int) -> int:
-    """Where ``of`` is least: on a grid of this stride, then between its neighbours there."""
+    """Return the minimum of ``of``: on a grid of this stride, then between its neighbours there."""
     best = min(range(first, last + 1, stride), key=of)
     return min(range(max(first, best - stride), min(last, best + stride) + 1), key=of) if stride > 1 else best
 
