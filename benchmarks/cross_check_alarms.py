@@ -57,9 +57,9 @@ from tdhil.estimation.result import Identification  # noqa: E402
 from tdhil.recording.log_writer import RunWriter  # noqa: E402
 from tdhil.recording.recording import Recording  # noqa: E402
 from tdhil.recording.run_log import RunLog  # noqa: E402
-from tdhil.run.runner import Runner  # noqa: E402
-from tdhil.run.settings import ExcitationRequest, StopRequest  # noqa: E402
-from tdhil.run.task import Task  # noqa: E402
+from tdhil.runner.five_stages import Runner  # noqa: E402
+from tdhil.runner.settings import ExcitationRequest, StopRequest  # noqa: E402
+from tdhil.runner.task import Task  # noqa: E402
 
 ALLOWED = 0.01
 
