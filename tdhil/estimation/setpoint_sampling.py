@@ -8,15 +8,20 @@ surges is then a sum where the shaft got the integral: for a steady acceleration
 
 T the cycle, ε the moment, g the answer of acceleration to a unit step of the setpoint (the impulse response of the
 speed's following H) as the torque report's lag leaves it. Nothing in the record tells: the reading is exactly that of a
-shaft with another inertia. It vanishes where a cycle is short beside the lags; at 10 Hz it is some percent. ε is not
-known, so the worst one is taken, and the interval stretched by it. (In torque mode the shaft's answer to a step of
-torque is smooth, and what sampling does to torque is a delay, which is a parameter of the fit.)
+shaft with another inertia. It vanishes where a cycle is short beside the lags; at 10 Hz it is some percent. For J of
+stage 5 in speed mode ε is not known, so the worst one is taken, and the interval stretched by it.
+
+In torque mode the shaft's answer to a step of torque is smooth, and what sampling does to torque is a delay, which is a
+parameter of the fit. A torque that stands for a cycle acts T/2 later in the mean than it was set; it is read ε after it
+was set. So the fit finds a skew of ε − T/2 (less the drive's own torque lag) between the reports, though both registers
+are of one moment. That skew tells ε, and with it what the ramps of the same run were read with in speed mode.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,12 +59,83 @@ def stretched(finding: Finding, recording: Recording) -> Finding:
 
 def worst_share(stepped: SteppedSetpoint, torque_lag_s: float) -> float:
     """|J_read/J − 1| at the worst moment of reading, at most a half."""
+    worst = float(np.max(np.abs(_shares(stepped, torque_lag_s))))
+    return min(worst, _MOST) if math.isfinite(worst) else _MOST
+
+
+def _shares(stepped: SteppedSetpoint, torque_lag_s: float) -> FloatArray:
+    """(_FINE + 1,) J_read/J − 1 at the moments 0 to T after a step."""
     _, answer = _answer(stepped, torque_lag_s)
     sums = stepped.period_s * answer.reshape(-1, _FINE).sum(axis=0)
     # Just before a step all is as at the step itself, but for the answer's own first moment.
-    every = np.append(sums, sums[0] - stepped.period_s * answer[0])
-    worst = float(np.max(np.abs(every - 1.0)))
-    return min(worst, _MOST) if math.isfinite(worst) else _MOST
+    every: FloatArray = np.append(sums, sums[0] - stepped.period_s * answer[0]) - 1.0
+    return every
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What reading in step adds to J, where the moment of reading is known by the skew.
+
+
+@dataclass(frozen=True)
+class ReadingShare:
+    """J_read/J − 1 and its standard deviation."""
+
+    value: float
+    sd: float
+
+
+EXACT_READING = ReadingShare(0.0, 0.0)
+
+_ONE_FRAME_SD_S = 0.002
+"""Registers of one reply are of one moment to within a task of the drive's: 1 to 4 ms in the profiles' manuals."""
+
+
+@dataclass(frozen=True)
+class ReadMoment:
+    """Skew between the reports of torque and speed in torque mode, s, its standard deviation, and the torque's lag."""
+
+    skew_s: float
+    skew_sd_s: float
+    torque_lag_s: float
+
+
+def reading_share(
+    loops: Sequence[SteppedSetpoint], moment: ReadMoment | None, torque_lag_s: float = 0.0
+) -> ReadingShare:
+    """Over the moments of reading that the skew leaves open, and over ``loops``, which are alike likely.
+
+    With no skew every moment of a cycle is alike likely: then the share is 0 in the mean. ``torque_lag_s``: of the
+    torque's report, where no ``moment`` has it.
+    """
+    lag_s = torque_lag_s if moment is None else moment.torque_lag_s
+    shares, weights = [], []
+    for stepped in loops:
+        ends = np.clip(_shares(stepped, lag_s), -_MOST, _MOST)
+        shares.append(0.5 * (ends[1:] + ends[:-1]))
+        weights.append(np.ones(_FINE) / _FINE if moment is None else _likely(stepped.period_s, moment))
+    share, weight = np.concatenate(shares), np.concatenate(weights) / len(loops)
+    mean = float(weight @ share)
+    sd = math.sqrt(float(weight @ (share - mean) ** 2))
+    if not math.isfinite(mean + sd):
+        return ReadingShare(0.0, _MOST)
+    return ReadingShare(mean, sd) if max(abs(mean), sd) >= NEGLIGIBLE else EXACT_READING
+
+
+def _likely(period_s: float, moment: ReadMoment) -> FloatArray:
+    """(_FINE,) How likely each part of a cycle is as the moment of reading. Their sum is 1.
+
+    A staircase that passes a lag τ and is read ε after its steps has the skew ε − T/2 − τ + T Σ e^(−(ε + nT)/τ), n ≥ 0.
+    """
+    at = (np.arange(_FINE) + 0.5) / _FINE * period_s
+    skew = at - 0.5 * period_s
+    lag_s = moment.torque_lag_s
+    if lag_s > 1e-3 * period_s:
+        skew = skew - lag_s + period_s * np.exp(-at / lag_s) / -math.expm1(-period_s / lag_s)
+    apart = np.remainder(skew - moment.skew_s + 0.5 * period_s, period_s) - 0.5 * period_s
+    sd = math.hypot(moment.skew_sd_s, _ONE_FRAME_SD_S, period_s / _FINE)
+    exponent = -0.5 * (apart / sd) ** 2
+    weight: FloatArray = np.exp(exponent - np.max(exponent))
+    return weight / float(np.sum(weight))
 
 
 _CROSSOVER_RAD_S = 5.0
@@ -67,10 +143,16 @@ _CROSSOVER_RAD_S = 5.0
 answers a step. Simulated drives of all profiles stay below half of what follows from it."""
 
 
-def usual_following(period_s: float) -> SteppedSetpoint:
-    """A PI loop with a double pole at half its crossover, with a setpoint that is stepped once in ``period_s``."""
-    first_s = 4.0 / _CROSSOVER_RAD_S
-    return SteppedSetpoint(period_s, first_s, first_s, first_s / _CROSSOVER_RAD_S)
+_SHARES_OF_CROSSOVER = (0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def usual_loops(period_s: float) -> tuple[SteppedSetpoint, ...]:
+    """PI loops with a double pole at half their crossover, from slow to quick, stepped once in ``period_s``."""
+    loops = []
+    for share in _SHARES_OF_CROSSOVER:
+        first_s = 4.0 / (share * _CROSSOVER_RAD_S)
+        loops.append(SteppedSetpoint(period_s, first_s, first_s, first_s / (share * _CROSSOVER_RAD_S)))
+    return tuple(loops)
 
 
 def _answer(stepped: SteppedSetpoint, lag_s: float) -> tuple[FloatArray, FloatArray]:

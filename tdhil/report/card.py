@@ -169,9 +169,12 @@ def budget_table(budget: Sequence[Mapping[str, Any]], value: float, notes: bool 
 
 
 def estimate_text(part: Mapping[str, Any], unit: str) -> str:
-    """An estimate of the document with its interval; an open side is said."""
+    """An estimate of the document with its interval; an open side is named. At a bound of zero: "at most"."""
     if part["low"] is None or part["high"] is None:
         return f"{part['value']:.4g} {unit}, open on {'both sides' if part['low'] == part['high'] else 'one side'}"
+    shown, _, most = rounded(part["value"], part["low"], part["high"])
+    if part["low"] == 0.0 and part["high"] > 0.0 and float(shown) == 0.0:
+        return f"at most {most} {unit}"
     return with_interval(part["value"], part["low"], part["high"], unit)
 
 

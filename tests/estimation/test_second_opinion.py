@@ -16,6 +16,7 @@ from tdhil.estimation.cross_checks.momentum_fit import Delay, Density, Resolutio
 from tdhil.estimation.cross_checks.second_opinion import disagreements, second_opinions
 from tdhil.estimation.friction_levels import measure_levels
 from tdhil.estimation.samples import Samples, stretches, usable_samples
+from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.estimation.spectrum import period_lines
 from tdhil.recording.recording import Recording
 from tdhil.runner.excitation import ExcitationWish
@@ -219,15 +220,18 @@ def test_torque_read_in_step_with_a_speed_setpoint_is_an_unknown_of_its_own():
     for recording in usual_runs()[:10]:
         found = balances(recording, usable_samples(recording))
         rows = tuple(
-            replace(row, stepped=True, impulse_nm_s=row.impulse_nm_s + 0.08 * TRUE * row.change_rad_s)
-            if row.second.end_s < 24.0 else row for row in found.rows
+            replace(row, stepped_rad_s=row.change_rad_s, impulse_nm_s=row.impulse_nm_s + 0.08 * TRUE * row.change_rad_s)
+            if row.second.end_s < 24.0 else replace(row, stepped_rad_s=0.0) for row in found.rows
         )
-        assert any(abs(row.change_rad_s) > 3.0 for row in rows if row.stepped)
+        assert any(abs(row.change_rad_s) > 3.0 for row in rows if row.stepped_rad_s)
         read = replace(found, rows=rows)
         known, rounding = Delay(0.25, 0.018, True), Resolution(0.0, 0.0)
-        plain, open_share = (
-            fit_momentum(read, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95, share) for share in (0.0, 0.08)
+        plain, open_share, taken_out = (
+            fit_momentum(read, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95, share)
+            for share in (EXACT_READING, ReadingShare(0.0, 0.08), ReadingShare(0.08, 0.0))
         )
+        assert taken_out.inertia == pytest.approx(
+            fit_momentum(found, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95).inertia, abs=0.2)
         assert plain.inertia - TRUE > 0.02 * TRUE
         assert abs(open_share.inertia - TRUE) <= open_share.half_width
         plainly.append(plain.inertia)

@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import cont2discrete, lfilter
 
-from tdhil.estimation.setpoint_sampling import NEGLIGIBLE, worst_share
+from tdhil.estimation.setpoint_sampling import (
+    EXACT_READING,
+    NEGLIGIBLE,
+    ReadMoment,
+    reading_share,
+    usual_loops,
+    worst_share,
+)
 from tdhil.recording.recording import SteppedSetpoint
 
 FINE = 64
@@ -45,3 +52,53 @@ def test_it_vanishes_with_a_short_cycle_and_with_lag():
     assert shares[-1] < NEGLIGIBLE
     assert worst_share(SteppedSetpoint(0.1, *loop), 0.0) > 0.1 > worst_share(SteppedSetpoint(0.1, *loop), 0.05)
     assert np.isfinite(worst_share(SteppedSetpoint(0.1, 1.0, 1.0, 0.25), 0.5))      # poles that meet
+
+
+def pi_loop(period_s, gain=3.0, integral=1.0):
+    """H of a PI loop without friction, gains over J."""
+    return SteppedSetpoint(period_s, gain / integral, gain / integral, 1.0 / integral)
+
+
+def staircase_skew(period_s, lag_s, after_s):
+    """By how much a torque that is set once a cycle is read later than it acts, s: of a slow ramp of the setpoint."""
+    fine = period_s / 256
+    held = np.repeat(np.arange(4000) * period_s, 256)
+    keep = np.exp(-fine / lag_s)
+    told = lfilter([1.0 - keep], [1.0, -keep], held)
+    time = np.arange(len(held)) * fine
+    at = 256 * 3000 + round(after_s / fine)
+    acts = time[at] - 0.5 * period_s - lag_s       # a line through the staircase, behind the lag
+    return acts - told[at]
+
+
+@pytest.mark.parametrize("after", [0.1, 0.3, 0.5, 0.8])
+@pytest.mark.parametrize("lag_s", [1e-5, 0.01, 0.03])
+def test_the_skew_of_torque_mode_tells_what_a_ramp_in_speed_mode_is_read_with(after, lag_s):
+    period_s = 1.0 / 15.0
+    stepped = pi_loop(period_s)
+    skew = staircase_skew(period_s, lag_s, after * period_s)
+    found = reading_share([stepped], ReadMoment(skew, 0.001, lag_s))
+    shares = read_shares(stepped, lag_s)
+    assert found.value == pytest.approx(shares[round(after * FINE)], abs=max(3.0 * found.sd, 2e-3))
+    assert found.sd < 0.35 * np.max(np.abs(shares))
+
+
+def test_without_a_skew_every_moment_is_alike_likely():
+    stepped = pi_loop(0.1)
+    found = reading_share([stepped], None)
+    assert abs(found.value) < 0.1 * found.sd
+    assert found.sd == pytest.approx(float(np.std(read_shares(stepped, 0.0))), rel=0.05)
+
+
+def test_a_share_that_does_not_matter_is_none():
+    moment = ReadMoment(0.0, 0.001, 0.15)
+    assert reading_share([pi_loop(0.004)], moment) == EXACT_READING
+    assert reading_share(usual_loops(0.004), None, 0.15) == EXACT_READING
+
+
+def test_a_loop_that_is_not_known_leaves_more_open():
+    moment = ReadMoment(-0.014, 0.001, 0.0)
+    known = reading_share([pi_loop(1.0 / 15.0)], moment)
+    usual = reading_share(usual_loops(1.0 / 15.0), moment)
+    assert usual.sd > 1.5 * known.sd
+    assert abs(usual.value - known.value) < usual.sd

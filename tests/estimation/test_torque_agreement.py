@@ -159,6 +159,15 @@ def test_a_speed_whose_scale_changes_before_stage_5_is_never_valid(runs, factor)
         assert "two routes through the same run contradict each other" in found.reason
 
 
+def test_the_least_change_of_a_scale_that_shows_is_told(runs):
+    for one in runs:
+        note = identify(one).second_opinions[0].note
+        least = float(note.split("shows from ±")[1].split("%")[0]) / 100.0
+        assert 0.05 <= least < 0.2
+        speed = np.where(one.time_s < 43.0, 1.0, 1.0 - 1.8 * least) * one.speed_rad_s
+        assert identify(replace(one, speed_rad_s=speed), Options(tolerance=0.2)).inertia is None
+
+
 @pytest.fixture(scope="module")
 def turned(runs):
     """The same with the shaft's angle: the integral of the true speed, counted, in every fifth sample."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from tdhil.report.card import percent, plus_minus, print_card, with_interval
+from tdhil.report.card import estimate_text, percent, plus_minus, print_card, with_interval
 from tdhil.report.document import result_document
 from tests.report.findings import bare, full, open_sided, recording
 
@@ -84,3 +84,9 @@ def test_digits_follow_the_half_width():
     assert plus_minus(5.0, float("inf")) == "5"
     assert with_interval(-0.0003, -0.014, 0.016, "s") == "0.000 (-0.014 to 0.016) s"
     assert [percent(half, 100.0) for half in (3.95, 0.5, 12.3, 0.034)] == ["±4.0 %", "±0.50 %", "±12 %", "±0.034 %"]
+
+
+def test_a_lag_at_its_bound_of_zero_is_at_most_so_long():
+    assert estimate_text({"value": 4.6e-17, "low": 0.0, "high": 0.00197}, "s") == "at most 0.00197 s"
+    assert estimate_text({"value": 0.0012, "low": 0.0, "high": 0.002}, "s").startswith("0.0012 (")
+    assert estimate_text({"value": 0.0, "low": 0.0, "high": 0.0}, "s").startswith("0 ")

@@ -13,8 +13,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.estimation.cross_checks.momentum import Balances, Kind, Row, overlap_s
+from tdhil.estimation.cross_checks.momentum import KNOT_S, Balances, Kind, Row, overlap_s
 from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
+from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
 
 _ROWS_DIFFER_P = 0.01
@@ -72,12 +73,12 @@ class MomentumFit:
 
 def fit_momentum(
     found: Balances, kind: Kind, levels: Density, delay: Delay, resolution: Resolution, confidence: float,
-    reading_share: float = 0.0,
+    reading: ReadingShare = EXACT_READING,
 ) -> MomentumFit | None:
     """J from the rows of one kind; the others serve for friction where their speed hardly changes. None if they can't.
 
-    ``reading_share``: standard deviation of what slow sampling in step with a speed setpoint does to J in the rows that
-    one moved, as a share of J (`tdhil.estimation.setpoint_sampling`). Raises LinAlgError where the rows make no system.
+    ``reading``: what sampling in step with a speed setpoint adds to the impulse of the rows that the setpoint moved, as
+    a share of J (`tdhil.estimation.setpoint_sampling`). Raises LinAlgError where the rows make no system.
     """
     fastest = max(abs(row.travel_rad) / row.time_s for row in found.rows)
 
@@ -94,7 +95,7 @@ def fit_momentum(
 
     def solve(delay_s: float, *more: FloatArray, prior: float = 0.0) -> tuple[FloatArray, FloatArray, float]:
         """``more``: columns beside J, B and T_c; ``prior``: the inverse deviation of the last one, in rows' units."""
-        columns = np.column_stack([_design(rows, delay_s, found.direction), *more])
+        columns = np.column_stack([_design(rows, delay_s, found.direction, reading.value), *more])
         design = inverse @ columns
         if prior > 0.0:
             last = np.zeros((1, columns.shape[1]))
@@ -113,23 +114,25 @@ def fit_momentum(
     density = _pooled(levels, rest, len(rows) - 3)
     if density is None or not x[0] > 0.0:
         return None
-    stepped = np.array([row.change_rad_s if row.stepped else 0.0 for row in rows])
+    stepped = np.array([row.stepped_rad_s for row in rows])
     further: tuple[FloatArray, ...] = ()
     prior = 0.0
-    if reading_share > 0.0 and np.any(stepped):
-        further, prior = (stepped,), math.sqrt(density.value) / (reading_share * float(x[0]))
+    if reading.sd > 0.0 and np.any(stepped):
+        further, prior = (stepped,), math.sqrt(density.value) / (reading.sd * float(x[0]))
         x, spread, rest = solve(delay.seconds, *further, prior=prior)
         density = _pooled(levels, rest, len(rows) - 3) or density
         if not x[0] > 0.0:
             return None
     shifted = abs(float(solve(delay.seconds + delay.sd_s, *further, prior=prior)[0][0] - x[0]))
-    design = inverse @ np.column_stack([_design(rows, delay.seconds, found.direction), *further])
+    design = inverse @ np.column_stack([_design(rows, delay.seconds, found.direction, reading.value), *further])
     gain = (spread @ design.T @ inverse)[0]                       # ∂J/∂(impulse of each row)
     edges = gain * float(x[0])
     # a rounded speed is wrong at a knot: by the same amount, with opposite sign, in the two rows that share it
     knots = np.append(edges, 0.0) - np.append(0.0, edges)
+    # and its slope there, which the delay multiplies, by as much as a sawtooth over the knot
+    read = resolution.speed_rad_s * math.hypot(1.0, math.sqrt(12.0) * delay.seconds / KNOT_S)
     rounding = math.hypot(
-        resolution.speed_rad_s * float(np.linalg.norm(knots)),
+        read * float(np.linalg.norm(knots)),
         resolution.torque_nm * float(np.linalg.norm(gain * np.array([row.time_s for row in rows]))),
     )
     scatter = math.sqrt(density.value * float(spread[0, 0]))
@@ -165,13 +168,13 @@ def _covariance(rows: list[Row]) -> FloatArray:
     return covariance
 
 
-def _design(rows: list[Row], delay_s: float, direction: float) -> FloatArray:
-    """(rows, 3): columns J, B, T_c."""
+def _design(rows: list[Row], delay_s: float, direction: float, share: float) -> FloatArray:
+    """(rows, 3): columns J, B, T_c; ``share`` of J is read too much where a setpoint moved the shaft."""
     table = []
     for row in rows:
         delay = 0.0 if row.kind is Kind.COASTING else delay_s
         table.append([
-            row.change_rad_s + delay * row.change_rad_s2,
+            row.change_rad_s + delay * row.change_rad_s2 + share * row.stepped_rad_s,
             row.travel_rad + delay * row.change_rad_s,
             direction * row.time_s,
         ])

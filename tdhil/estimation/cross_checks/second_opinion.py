@@ -27,15 +27,19 @@ from tdhil.estimation.cross_checks.momentum_fit import (
     Resolution,
     fit_momentum,
 )
+from tdhil.estimation.cross_checks.speed_loop import speed_loop
 from tdhil.estimation.frequency_domain import student_quantile
 from tdhil.estimation.result import Estimate, Refusal, SecondOpinion, normal_quantile
 from tdhil.estimation.samples import Samples, usual_interval
-from tdhil.estimation.setpoint_sampling import NEGLIGIBLE, usual_following, worst_share
-from tdhil.recording import FloatArray, Recording
+from tdhil.estimation.setpoint_sampling import ReadingShare, ReadMoment, reading_share, usual_loops
+from tdhil.recording import FloatArray, Recording, SteppedSetpoint
 
 _LEAST_DOF = 3.0
 _OPEN = 0.5               # a half-width beyond this share of J is no opinion
 _FALSE_ALARM = 0.01       # of the runs; a warning that comes in every twentieth sound one is soon read past
+_WORTH_A_FIT = 0.005
+"""Share of J that reading in step may add with a usual speed loop, from which on the drive's own loop is fitted."""
+
 Fitted = tuple[tuple[SecondOpinion, MomentumFit], ...]
 _ACQUISITION = "acquire"  # the stage that J comes from
 _CONTRADICTION = 1e-3
@@ -53,7 +57,9 @@ def cross_checked(finding: Finding, case: Case) -> Finding:
     fitted = _fitted_opinions(case, finding)
     opinions = tuple(opinion for opinion, _ in fitted)
     warnings = (*finding.warnings, *disagreements(opinions, finding))
-    against = (*fitted, *_before_acquisition(case, finding))
+    before = _before_acquisition(case, finding)
+    against = (*fitted, *before)
+    opinions = _with_least_change(opinions, before, len(against), finding, case.options.confidence)
     inertia = _inertia(case, finding, opinions)
     contradiction = _contradiction(against, finding, case.options.confidence)
     if contradiction.reason:
@@ -127,9 +133,8 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
         if reference is None or opinion.agrees is not False:
             continue
         apart = abs(own.value - reference.value)
-        half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
-        wider = Estimate(own.value, own.value - half, own.value + half)
         share = _CONTRADICTION / len(opinions)
+        wider = _bent_by(own, fit, confidence)
         if apart > _ALIKE * reference.value and _agrees(wider, finding, confidence, share) is False:
             return Refusal(
                 f"two routes through the same run contradict each other: J is {reference.value:.4g} kg·m² by the "
@@ -140,6 +145,26 @@ def _contradiction(opinions: Fitted, finding: Finding, confidence: float) -> Ref
                 " during the run; then run it again",
             )
     return Refusal("", "")
+
+
+def _bent_by(own: Estimate, fit: MomentumFit, confidence: float) -> Estimate:
+    """The interval of a balance, as wide as friction that bends may make it."""
+    half = math.hypot(own.high - own.value, normal_quantile(confidence) * fit.bend)
+    return Estimate(own.value, own.value - half, own.value + half)
+
+
+def _with_least_change(
+    opinions: tuple[SecondOpinion, ...], before: Fitted, compared: int, finding: Finding, confidence: float
+) -> tuple[SecondOpinion, ...]:
+    """The first one's note with the least change of a signal's scale at stage 5 that would contradict J."""
+    reference = reference_inertia(finding)
+    if not opinions or not before or reference is None or not reference.finite or not reference.value > 0.0:
+        return opinions
+    own = _bent_by(before[0][0].inertia_kg_m2, before[0][1], confidence)
+    half = math.hypot(own.high - own.value, 0.5 * (reference.high - reference.low))
+    least = max(_ALIKE, _times_wider(confidence, _CONTRADICTION / compared) * half / reference.value)
+    note = f"{opinions[0].note}; a scale of speed or torque that changes at stage 5 shows from ±{least:.0%} on"
+    return (replace(opinions[0], note=note), *opinions[1:])
 
 
 def disagreements(opinions: tuple[SecondOpinion, ...], finding: Finding) -> tuple[str, ...]:
@@ -162,12 +187,12 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     delay = known_delay(recording, finding)
     resolution = _resolution(recording, case.samples, found)
     steps = recording.excitation is not None and has_plateaus(recording.excitation.kind)
-    share = _reading_share(case, finding)
+    reading = _reading(case, finding)
     opinions = []
     for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
         if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):
             continue
-        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence, share)
+        fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence, reading)
         if fit is None or not fit.half_width < _OPEN * fit.inertia:
             continue
         inertia = Estimate(fit.inertia, fit.inertia - fit.half_width, fit.inertia + fit.half_width)
@@ -175,21 +200,53 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     return tuple(opinions)
 
 
-def _reading_share(case: Case, finding: Finding) -> float:
-    """Standard deviation of what a stepped speed setpoint may do to the J of the rows that it moved; 0: negligible.
+def _reading(case: Case, finding: Finding) -> ReadingShare:
+    """Share that reading in step with a speed setpoint adds to J of the ramps, beyond what it adds to J of stage 5.
 
-    How the drive follows its setpoint is known of speed mode alone. Where the moment of reading lies is open: the worst
-    one is the bound of a uniform distribution.
+    In torque mode stage 5 has none of it, and its skew tells the moment of reading. Stage 5 in speed mode is read like
+    the ramps. But a ramp generator in the drive smooths a ramp's large steps more than the small ones of stage 5, so
+    that anything from none to all of it may be left between the two.
     """
-    stepped = case.recording.stepped_setpoint or usual_following(usual_interval(case.samples.time_s))
-    prior = case.recording.lag_prior
-    lag_s = 0.0
+    recording = case.recording
+    if recording.stepped_setpoint is None:
+        return reading_share(_loops(case, finding), _moment(finding), _least_lag_s(case, finding))
+    share = reading_share((recording.stepped_setpoint,), None, _least_lag_s(case, finding))
+    return ReadingShare(0.0, share.sd / math.sqrt(3.0))
+
+
+def _least_lag_s(case: Case, finding: Finding) -> float:
+    """The shortest lag of the torque's report that the data or the drive's documents allow, s."""
     if finding.torque_lag_s is not None:
-        lag_s = max(finding.torque_lag_s.low, 0.0)
-    elif prior.torque_lag_s is not None:
-        lag_s = max(prior.torque_lag_s - 2.0 * prior.torque_lag_sd_s, 0.0)
-    share = worst_share(stepped, lag_s)
-    return share / math.sqrt(3.0) if share >= NEGLIGIBLE else 0.0
+        return max(finding.torque_lag_s.low, 0.0)
+    prior = case.recording.lag_prior
+    return 0.0 if prior.torque_lag_s is None else max(prior.torque_lag_s - 2.0 * prior.torque_lag_sd_s, 0.0)
+
+
+def _moment(finding: Finding) -> ReadMoment | None:
+    skew, lag = finding.skew_s, finding.torque_lag_s
+    if skew is None or lag is None or not (skew.finite and lag.finite):
+        return None
+    return ReadMoment(skew.value, 0.5 * (skew.high - skew.low) / student_quantile(0.95, 1e6), max(lag.value, 0.0))
+
+
+def _loops(case: Case, finding: Finding) -> tuple[SteppedSetpoint, ...]:
+    """How the drive may have followed the setpoint of the ramps: as the ramp of stage 2 shows, else as is usual."""
+    period_s = usual_interval(case.samples.time_s)
+    loops = usual_loops(period_s)
+    reference, lag = reference_inertia(finding), finding.speed_lag_s
+    usual = reading_share(loops, _moment(finding), _least_lag_s(case, finding))
+    if reference is None or max(abs(usual.value), usual.sd) < _WORTH_A_FIT:
+        return loops
+    lag_s = lag.value if lag is not None else case.recording.lag_prior.speed_lag_s
+    seen = None if lag_s is None else speed_loop(case.recording, case.samples, lag_s)
+    if seen is None:
+        return loops
+    viscous = 0.0 if finding.viscous_nm_s_rad is None else finding.viscous_nm_s_rad.value
+    integral = seen.integral_gain_nm_rad
+    return tuple(
+        SteppedSetpoint(period_s, gain / integral, (gain + viscous) / integral, reference.value / integral)
+        for gain in seen.gain_nm_s_rad + math.sqrt(1.5) * seen.gain_sd_nm_s_rad * np.array([-1.0, 0.0, 1.0])
+    )
 
 
 def known_delay(recording: Recording, finding: Finding) -> Delay:
@@ -245,8 +302,11 @@ def _agrees(own: Estimate, finding: Finding, confidence: float, miss_share: floa
     below = own.value < reference.value
     theirs = reference.value - reference.low if below else reference.high - reference.value
     ours = own.high - own.value
-    wider = student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
-    return abs(own.value - reference.value) <= wider * math.hypot(ours, theirs)
+    return abs(own.value - reference.value) <= _times_wider(confidence, miss_share) * math.hypot(ours, theirs)
+
+
+def _times_wider(confidence: float, miss_share: float) -> float:
+    return student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
 
 
 def _note(fit: MomentumFit, kind: Kind, delay: Delay) -> str:
