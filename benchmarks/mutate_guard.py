@@ -241,7 +241,7 @@ EQUIVALENT = {
     **{f"{name}.py, module: Say = Callable[[str], None]": _FOR_MYPY
        for name in ("service/access", "service/door", "service/supervisor")},
     "session/holder.py, _holder: return None": _FALLS_THROUGH,
-    "session/holder.py, _take: time.sleep(0.01)": "a pause between two tries, of at most 30: without it they cost a core",
+    "session/holder.py, _take: time.sleep(0.01)": "a pause between tries: without it they cost a core",
     "service/audit.py, _verify: return None (last)": _FALLS_THROUGH,
     "service/audit.py, _add: file.flush()": _POWER,
     "service/audit.py, _add: os.fsync(file.fileno())": _POWER,

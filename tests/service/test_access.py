@@ -855,6 +855,33 @@ def test_the_right_password_takes_the_wrong_tries_of_that_pair_back():
         tries.begin("anna", "192.0.2.1")
 
 
+def test_addresses_that_a_name_came_from_are_kept_up_to_a_number(monkeypatch):
+    tries = Tries(lambda: 0.0)
+    monkeypatch.setattr(Tries, "_MOST", 3)
+    for number in range(5):
+        tries.good("anna", f"192.0.2.{number}")
+    assert tries._good == {("anna", "192.0.2.4")}
+
+
+def test_runs_of_more_than_a_day_ago_do_not_count(monkeypatch):
+    time_s = 0.0
+    pace = Pace(lambda: time_s)
+    for _ in range(3):
+        pace.begin("anna", "192.0.2.1", "a")
+        time_s += Pace.LIMITS[-1][0]
+    assert [len(times) for times in pace._begun.values()] == [1, 1]
+
+
+def test_a_login_is_a_good_try_and_has_an_end(tmp_path):
+    AccountsFile(tmp_path).add_user("anna", "operator", PASSWORD)
+    access = Access(tmp_path, login=True, clock=lambda: 1000.0)
+    access.refresh(first=True)
+    _, who = access.log_in("anna", PASSWORD, "192.0.2.1")
+    assert access.tries._good == {("anna", "192.0.2.1")}
+    assert access.ends_s(who) == 1000.0 + SESSION_S
+    assert access.ends_s(access_module.LOCAL) is None
+
+
 def test_tries_of_long_ago_are_forgotten(monkeypatch):
     time_s = 0.0
     tries = Tries(lambda: time_s)
