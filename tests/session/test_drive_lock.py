@@ -180,28 +180,28 @@ def test_who_holds_a_drive_is_said_by_command_and_is_said_no_more_after_it(port,
     at = address(port)
     with hold(at):
         assert holder_of(at).command == "tdhil identify --note 'two words'"
-    assert holder._path(at).read_bytes() == b""
+    assert drive_lock._path(at).read_bytes() == b""
 
 
 def test_all_holders_of_this_computer_are_listed(port, monkeypatch, tmp_path):
     tmp_path.chmod(0o1777)
-    monkeypatch.setattr(holder, "FOLDERS", (str(tmp_path),))
-    assert holder.holders() == []
+    monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
+    assert drive_lock.holders() == []
     with hold(address(port)), hold(address(port, unit=7)):
         pass
-    assert holder.holders() == []
+    assert drive_lock.holders() == []
     with hold(address(port)), hold(address(port, unit=7)):
-        assert [one.pid for one in holder.holders()] == [os.getpid()] * 2
+        assert [one.pid for one in drive_lock.holders()] == [os.getpid()] * 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts open files in /proc")
 def test_the_file_is_for_every_user_whatever_the_mask_and_is_opened_once(port, monkeypatch, tmp_path):
     tmp_path.chmod(0o1777)
-    monkeypatch.setattr(holder, "FOLDERS", (str(tmp_path),))
+    monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
     at, before, mask = address(port), files_open(), os.umask(0o077)
     try:
         with hold(at):
-            assert holder._path(at).stat().st_mode & 0o777 == 0o666
+            assert drive_lock._path(at).stat().st_mode & 0o777 == 0o666
             assert files_open() <= before + 2          # the file, and the name in the kernel
         assert files_open() == before
     finally:
@@ -214,7 +214,7 @@ def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(por
     at, real = address(port), os.open
 
     def comes_and_goes(path, flags, mode=0o777, **more):
-        if path != holder._path(at):
+        if path != drive_lock._path(at):
             return real(path, flags, mode, **more)
         raise FileExistsError(path) if flags & os.O_CREAT else FileNotFoundError(path)
 

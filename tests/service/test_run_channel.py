@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.service.wire import SOCKET, Listener, ask
+from tdhil.service.run_channel import SOCKET, Listener, ask
 from tests.service.conftest import HANGS_S, wait_for
 
 
