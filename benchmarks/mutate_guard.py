@@ -76,6 +76,8 @@ SUBJECTS = {
     "string_release": _run("string_release", *_STOP),
     "speed_check": _run("speed_check", "test_speed_check.py", "test_angles.py", "test_five_stages.py"),
     "preconditions": _run("preconditions", "test_stop_string.py", within="_LETS_GO refuse_with_string"),
+    "observer": _run("observer", "test_observer.py", "test_standstill.py"),
+    "standstill": _run("standstill", "test_standstill.py", "test_stop_feedback.py"),
     "control_loop": _run("control_loop", "test_control_loop.py", "test_deaf.py", "test_run_goes_wrong.py"),
     "steady": _run("stages/steady", "test_steady.py"),
     "setup": _run("stages/setup", *_RUNS, "test_run_refused.py"),
@@ -171,6 +173,7 @@ SUBJECTS = {
     "service/attendance": _service("attendance", "test_attendance.py"),
     "service/audit": _service("audit", "test_store.py"),
     "service/door": _service("door", "test_door.py"),
+    "service/run_channel": _service("run_channel", "test_run_channel.py", "test_supervisor.py", "test_lost_drive.py"),
     "service/drive_stop": _service("drive_stop", "test_drive_stop.py"),
     "session/drive_lock": Subject("tdhil/session/drive_lock.py", ("session/test_drive_lock.py",)),
     "session/kept": Subject("tdhil/session/kept.py", ("session/test_kept.py",)),
@@ -226,6 +229,7 @@ LONGEST_S, LONGEST = 90, 4
 
 _FALLS_THROUGH = "the function's last line: what falls off its end gives None, which its only caller takes alike"
 _POWER = "shows after a loss of power alone"
+_FOR_MYPY = "stands in annotations alone, and those are never evaluated"
 _A_PROCESS = "a process of its own loads the file and not the mutant; tests that begin one fail without the line"
 EQUIVALENT = {
     "stop.py, _slow_down: return False (last)": _FALLS_THROUGH,
@@ -234,6 +238,10 @@ EQUIVALENT = {
     "stop.py, __init__: self._speed_rad_s = math.inf (last)": "what is seen first sets it in any case",
     **{f"{name}.py, module: {line}": _A_PROCESS for name in ("service/run_process", "service/drive_stop")
        for line in ("if __name__ == '__main__':", "sys.exit(main(sys.argv[1:]))")},
+    **{f"{name}.py, module: Say = Callable[[str], None]": _FOR_MYPY
+       for name in ("service/access", "service/door", "service/supervisor")},
+    "session/drive_lock.py, _holder: return None": _FALLS_THROUGH,
+    "session/drive_lock.py, _take: time.sleep(0.01)": "a pause between tries: without it they cost a core",
     "service/audit.py, _verify: return None (last)": _FALLS_THROUGH,
     "service/audit.py, _add: file.flush()": _POWER,
     "service/audit.py, _add: os.fsync(file.fileno())": _POWER,

@@ -63,14 +63,6 @@ class Principal:
     session: str = ""
     csrf: str = ""
 
-    @property
-    def is_authenticated(self) -> bool:
-        return bool(self.roles)
-
-    @property
-    def display_name(self) -> str:
-        return self.name
-
 
 LOCAL: Final = Principal("local", frozenset(ROLES))
 NOBODY: Final = Principal("nobody", frozenset(), may_stop=False)

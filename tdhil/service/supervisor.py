@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, Final
 
 from drivers import CommunicationLost
@@ -67,6 +68,36 @@ class Asked:
     new: bool
 
 
+class Jobs:
+    """Small jobs, done one after the other in one thread, which is there from the beginning.
+
+    `add` waits for nothing. A thread for each job would not do: to start one takes 200 ms on a busy computer, and the
+    answer to a Stop would wait for it.
+    """
+
+    def __init__(self, name: str, say: Say) -> None:
+        self._jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        threading.Thread(target=self._work, args=(self._jobs, say), name=name, daemon=True).start()
+
+    def add(self, job: Callable[[], None]) -> None:
+        """Do it after those that were added before."""
+        self._jobs.put(job)
+
+    def finish(self, within_s: float) -> bool:
+        """Wait until all that was added is done. Is it?"""
+        done = threading.Event()
+        self._jobs.put(done.set)
+        return done.wait(within_s)
+
+    @staticmethod
+    def _work(jobs: SimpleQueue[Callable[[], None]], say: Say) -> None:
+        while True:
+            try:
+                jobs.get()()
+            except Exception as error:         # of one job: the others are done all the same
+                say(f"{type(error).__name__}: {error}")
+
+
 class Supervisor:
     """For any thread. ``say``: a line on the terminal of `tdhil serve`."""
 
@@ -91,7 +122,10 @@ class Supervisor:
         self.not_at_rest: list[str] = []               # of those that `brake` stopped
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
-        self._notes: list[threading.Thread] = []
+        self._begun: list[threading.Thread] = []
+        self._notes = Jobs("audit", say)
+        self._indexing = Jobs("index", say)            # of its own: it may be locked for long
+        self._being_indexed: set[str] = set()
 
     # -- begin and end of the service ----------------------------------------------------------------------------
 
@@ -114,8 +148,10 @@ class Supervisor:
         self._end.set()
         if self._thread is not None:
             self._thread.join(5.0)
-        for thread in self._notes:
+        for thread in self._begun:
             thread.join(5.0)
+        self._notes.finish(5.0)
+        self._indexing.finish(5.0)
 
     def brake(self, who: str, within_s: float = STOP_S) -> bool:
         """Begin no more runs, ask all to stop, and wait until they have ended; have they?
@@ -520,10 +556,11 @@ class Supervisor:
                 self.audit.note(who, what, run=run, rig=rig, **details)
             except OSError as error:
                 self.say(f"the audit can't be written: {error}")
-            if run is not None:
-                self._index(run)
 
-        self._in_background(write)
+        self._notes.add(write)
+        if run is not None and run not in self._being_indexed:
+            self._being_indexed.add(run)
+            self._indexing.add(lambda: self._index(run))
 
     def _begin_audit(self) -> None:
         try:
@@ -532,6 +569,7 @@ class Supervisor:
             self.say(f"the audit can't be written: {error}")
 
     def _index(self, run: str) -> None:
+        self._being_indexed.discard(run)       # first: what changes from here on is indexed once more
         try:
             self.index.put(self.store.summary(run))
             self._unindexed.discard(run)
@@ -554,7 +592,7 @@ class Supervisor:
     def _in_background(self, work: Callable[[], None]) -> None:
         thread = threading.Thread(target=work, daemon=True)
         thread.start()
-        self._notes = [one for one in self._notes if one.is_alive()] + [thread]
+        self._begun = [one for one in self._begun if one.is_alive()] + [thread]
 
     def turning(self) -> bool:
         """May a real shaft on this computer turn now: does a run of the service move, does anybody hold a drive?"""

@@ -797,3 +797,119 @@ def test_runs_that_show_a_code_are_limited_and_simulated_ones_are_not(guarded, m
         assert 1 <= int(refused.headers["retry-after"]) <= 600
     assert len(guarded.service.store.ids()) == 2
     guarded.run("done")                                    # a simulated one
+
+
+# -- the accounts as they change
+
+
+def test_accounts_are_known_from_the_start_and_read_again_until_the_end(tmp_path):
+    accounts, told = AccountsFile(tmp_path), []
+    accounts.add_user("anna", "operator", PASSWORD)
+    access = Access(tmp_path, login=True, changed=lambda what, name: told.append((what, name)))
+    access.close()                             # one that was never begun
+    access = Access(tmp_path, login=True, changed=lambda what, name: told.append((what, name)))
+    access.start()
+    assert list(access.accounts.known.users) == ["anna"]
+    assert told == []
+    accounts.add_user("bert", "viewer", PASSWORD)
+    wait_for("the second", lambda: told == [("user added", "bert (viewer)")])
+    accounts.remove_user("anna")
+    wait_for("one less", lambda: told[1:] == [("user removed", "anna")])
+    access.close()
+    assert not access._thread.is_alive()
+
+
+def test_accounts_that_can_not_be_read_are_told_of_once_and_those_of_before_hold(tmp_path):
+    accounts, said = AccountsFile(tmp_path), []
+    accounts.path.write_text("{")
+    access = Access(tmp_path, login=True, say=said.append)
+    access.refresh()
+    access.refresh()
+    assert len(said) == 1
+    accounts.path.unlink()
+    accounts.add_user("anna", "operator", PASSWORD)
+    access.refresh()
+    accounts.path.write_text("{")
+    access.refresh()
+    assert list(access.accounts.known.users) == ["anna"]
+    assert len(said) == 2                      # anew, since it was well in between
+
+
+def test_a_host_with_a_port_that_is_none_has_the_cookies_of_443():
+    scope = {"type": "http", "headers": [(b"host", b"rig:99999999")]}
+    assert access_module._named("x", HTTPConnection(scope)) == "x-443"
+
+
+# -- what is remembered has an end
+
+
+def test_the_right_password_takes_the_wrong_tries_of_that_pair_back():
+    tries = Tries(lambda: 0.0)
+    for _ in range(3):
+        for _ in range(Tries.OF_PAIR - 1):
+            tries.begin("anna", "192.0.2.1")
+        tries.good("anna", "192.0.2.1")
+    for _ in range(Tries.OF_PAIR):
+        tries.begin("anna", "192.0.2.1")
+    with pytest.raises(TooManyTries):
+        tries.begin("anna", "192.0.2.1")
+
+
+def test_addresses_that_a_name_came_from_are_kept_up_to_a_number(monkeypatch):
+    tries = Tries(lambda: 0.0)
+    monkeypatch.setattr(Tries, "_MOST", 3)
+    for number in range(5):
+        tries.good("anna", f"192.0.2.{number}")
+    assert tries._good == {("anna", "192.0.2.4")}
+
+
+def test_runs_of_more_than_a_day_ago_do_not_count(monkeypatch):
+    time_s = 0.0
+    pace = Pace(lambda: time_s)
+    for _ in range(3):
+        pace.begin("anna", "192.0.2.1", "a")
+        time_s += Pace.LIMITS[-1][0]
+    assert [len(times) for times in pace._begun.values()] == [1, 1]
+
+
+def test_a_login_is_a_good_try_and_has_an_end(tmp_path):
+    AccountsFile(tmp_path).add_user("anna", "operator", PASSWORD)
+    access = Access(tmp_path, login=True, clock=lambda: 1000.0)
+    access.refresh(first=True)
+    _, who = access.log_in("anna", PASSWORD, "192.0.2.1")
+    assert access.tries._good == {("anna", "192.0.2.1")}
+    assert access.ends_s(who) == 1000.0 + SESSION_S
+    assert access.ends_s(access_module.LOCAL) is None
+
+
+def test_tries_of_long_ago_are_forgotten(monkeypatch):
+    time_s = 0.0
+    tries = Tries(lambda: time_s)
+    monkeypatch.setattr(Tries, "_MOST", 3)
+    for number in range(6):
+        tries.begin(f"user {number}", f"192.0.2.{number}")
+    assert len(tries._tried) == 18
+    time_s = Tries.WINDOW_S
+    tries.begin("anna", "192.0.2.77")
+    assert {key[1] for key in tries._tried} == {"anna", "192.0.2.77"}
+
+
+def test_who_asked_for_runs_long_ago_is_forgotten(monkeypatch):
+    time_s = 0.0
+    pace = Pace(lambda: time_s)
+    monkeypatch.setattr(Pace, "_MOST", 3)
+    for number in range(6):
+        pace.begin(f"user {number}", f"192.0.2.{number}", "a")
+    assert len(pace._begun) == 12              # all of them count yet
+    time_s = Pace.LIMITS[-1][0]
+    pace.begin("anna", "192.0.2.77", "a")
+    assert set(pace._begun) == {("user", "anna"), ("address", "192.0.2.77")}
+
+
+def test_the_oldest_login_makes_room_for_a_new_one(tmp_path, monkeypatch):
+    AccountsFile(tmp_path).add_user("anna", "operator", PASSWORD)
+    access = Access(tmp_path, login=True)
+    access.refresh(first=True)
+    monkeypatch.setattr(access_module, "_MOST_SESSIONS", 3)
+    logins = [access.log_in("anna", PASSWORD, f"192.0.2.{number}")[1].session for number in range(5)]
+    assert [one[:16] for one in access._sessions] == logins[2:]

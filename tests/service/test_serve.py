@@ -7,12 +7,14 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -119,6 +121,23 @@ def test_a_run_outlives_its_web_and_is_one_result(tmp_path):
         assert second.client.rig("simulated-canopen")["last"]["inertia_kg_m2"] == pytest.approx(104.0, rel=0.02)
     one = json.loads((folder / "result.json").read_bytes())
     assert one == found["result"]
+
+
+def test_half_requests_that_are_cut_off_leave_no_traceback(tmp_path):
+    """Each took two of them, 5 KB of log and the time of a stop that came after it."""
+    with served(tmp_path / "data") as server:
+        at = urlsplit(server.url)
+        for _ in range(20):
+            with socket.create_connection((at.hostname, at.port), HANGS_S) as half:
+                half.sendall(b"POST /api/v1/runs/x/stop HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n{")
+        with socket.create_connection((at.hostname, at.port), HANGS_S) as half:
+            half.sendall(b"POST /api/v1/runs/x/stop HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9\r\n\r\n{")
+            half.shutdown(socket.SHUT_WR)
+            while half.recv(4096):             # its end is seen by the service
+                pass
+        assert server.client.rigs()
+        assert "Traceback" not in server.said()
+        assert "ERROR" not in server.said()
 
 
 @pytest.mark.real_time

@@ -75,7 +75,8 @@ def test_close_ends_its_threads_and_no_run(service):
     service.supervisor.note("anna", "asked", None, None)
     service.supervisor.close()
     assert not thread.is_alive()
-    assert not any(one.is_alive() for one in service.supervisor._notes)
+    assert not any(one.is_alive() for one in service.supervisor._begun)
+    assert [one.what for one in service.audit.entries()] == ["asked", "asked"]     # all that was noted is written
     assert service.store.status(run).state is State.MOVING
 
 
@@ -394,3 +395,58 @@ def test_a_run_that_cannot_be_written_down_is_none(service, monkeypatch, at, num
     assert refused.value.next_step.startswith("Nothing was started.")
     assert service.store.ids() == []
     assert service.supervisor.live() == []
+
+
+# -- threads that are there before they are needed
+
+
+def test_jobs_are_done_in_order_in_a_thread_that_was_there_and_one_that_fails_is_told_of(monkeypatch):
+    said: list[str] = []
+    jobs = supervisor_module.Jobs("test", said.append)
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: pytest.fail("a thread was started"))
+    done: list[int] = []
+    jobs.add(lambda: done.append(1))
+    jobs.add(lambda: done.append(1 // 0))
+    jobs.add(lambda: done.append(2))
+    assert jobs.finish(60.0)
+    assert done == [1, 2]
+    assert said == ["ZeroDivisionError: integer division or modulo by zero"]
+    blocked = threading.Event()
+    jobs.add(lambda: blocked.wait(60.0) and None)
+    assert not jobs.finish(0.01)
+    blocked.set()
+    assert jobs.finish(60.0)
+
+
+def test_a_stop_and_its_note_start_no_thread_and_wait_for_no_disk(service, monkeypatch):
+    """To start a thread takes long on a busy computer; the audit may wait for its disk as long as it likes."""
+    service.supervisor.start()
+    run = begun(service)
+    written, real = threading.Event(), service.audit.note
+    monkeypatch.setattr(service.audit, "note", lambda *what, **more: written.wait(60.0) and real(*what, **more))
+    ours, start, begin = threading.current_thread(), threading.Thread.start, []
+    monkeypatch.setattr(threading.Thread, "start", lambda one: (
+        begin.append(one.name) if threading.current_thread() is ours else None, start(one))[1])
+    service.supervisor.stop(run, "bert")
+    assert begin == []
+    written.set()
+    wait_for("the note", lambda: ("bert", "stop asked", run, "a") in lines(service))
+
+
+def test_what_changes_while_a_run_is_indexed_is_indexed_once_more(service, monkeypatch):
+    """And what is asked for ten times meanwhile is indexed once."""
+    run, begun_, go, puts = ended(service), threading.Event(), threading.Event(), []
+
+    def put(summary: Any) -> None:
+        puts.append(summary.id)
+        begun_.set()
+        assert go.wait(60.0)
+
+    monkeypatch.setattr(service.index, "put", put)
+    service.supervisor.note("anna", "one", run, "a")
+    assert begun_.wait(60.0)
+    for _ in range(10):
+        service.supervisor.note("anna", "more", run, "a")
+    go.set()
+    assert service.supervisor._indexing.finish(60.0)
+    assert puts == [run, run]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from drivers import PreflightRefused
 from tdhil.cli.main import main
 from tdhil.config import resolve
 from tdhil.errors import ExitCode, exit_code
@@ -163,3 +166,77 @@ def test_no_lock_is_no_motion(port, monkeypatch, tmp_path):
     with pytest.raises(Exception, match="can't be known") as refused, hold(address(port)):
         pass
     assert exit_code(refused.value) is ExitCode.REFUSED
+
+
+# -- the file of the lock
+
+
+def files_open() -> int:
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+def test_who_holds_a_drive_is_said_by_command_and_is_said_no_more_after_it(port, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/some/where/tdhil", "identify", "--note", "two words"])
+    at = address(port)
+    with hold(at):
+        assert holder_of(at).command == "tdhil identify --note 'two words'"
+    assert drive_lock._path(at).read_bytes() == b""
+
+
+def test_all_holders_of_this_computer_are_listed(port, monkeypatch, tmp_path):
+    tmp_path.chmod(0o1777)
+    monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
+    assert drive_lock.holders() == []
+    with hold(address(port)), hold(address(port, unit=7)):
+        pass
+    assert drive_lock.holders() == []
+    with hold(address(port)), hold(address(port, unit=7)):
+        assert [one.pid for one in drive_lock.holders()] == [os.getpid()] * 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts open files in /proc")
+def test_the_file_is_for_every_user_whatever_the_mask_and_is_opened_once(port, monkeypatch, tmp_path):
+    tmp_path.chmod(0o1777)
+    monkeypatch.setattr(drive_lock, "FOLDERS", (str(tmp_path),))
+    at, before, mask = address(port), files_open(), os.umask(0o077)
+    try:
+        with hold(at):
+            assert drive_lock._path(at).stat().st_mode & 0o777 == 0o666
+            assert files_open() <= before + 2          # the file, and the name in the kernel
+        assert files_open() == before
+    finally:
+        os.umask(mask)
+
+
+def test_a_file_that_comes_and_goes_and_a_system_without_locks_are_no_motion(port, monkeypatch):
+    import fcntl
+
+    at, real = address(port), os.open
+
+    def comes_and_goes(path, flags, mode=0o777, **more):
+        if path != drive_lock._path(at):
+            return real(path, flags, mode, **more)
+        raise FileExistsError(path) if flags & os.O_CREAT else FileNotFoundError(path)
+
+    with monkeypatch.context() as changed:
+        changed.setattr(os, "open", comes_and_goes)
+        with pytest.raises(PreflightRefused, match="it comes and goes"), hold(at):
+            pass
+
+    def no_locks(descriptor, what):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(PreflightRefused, match="No locks available"), hold(at):
+        pass
+
+
+def test_a_system_without_such_locks_knows_no_holder(port, monkeypatch):
+    at = address(port)
+    with hold(at):
+        monkeypatch.setattr(sys, "platform", "win32")
+        assert holder_of(at) is None
+        with hold(at):
+            pass
+        monkeypatch.undo()
+        assert holder_of(at) is not None
