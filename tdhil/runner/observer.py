@@ -208,9 +208,9 @@ IMPULSE_SHARE = 0.3
 """Uncertainty of the speed by impulse, as a share of the speed at which the stop began."""
 FASTER_SHARE, FASTER_S, FASTER_BRAKED_S = 0.1, 0.4, 1.0
 """Of the speed limit, by which a shaft must have become faster under a quick stop, and for how long, s; the last while
-the reported torque brakes it. An encoder that slips may report a higher speed for a moment."""
-INVERTED_S, INVERTED_SHARE = 2.0, 0.3
 the reported torque brakes it. A slipping encoder may report a higher speed for a moment."""
+INVERTED_S, INVERTED_SHARE = 2.0, 0.3
+"""Over so long a speed that rises as the reported torque of the opposite sign accounts for, within this share and the
 bounds of J, shows an inverted polarity."""
 
 
@@ -502,10 +502,10 @@ class Observer:
         self._runaway.begin(self._earlier_rad_s())
 
     def shows_s(self, at_rest_rad_s: float, torque_nm: float) -> float:
-        """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what it was held with before.
-
         """How long a shaft that is disabled must be seen at rest, s; ``torque_nm``: what held it before.
-        it the reported speed then leaves standstill at friction's rate.
+
+        A torque like that of friction may have kept the shaft turning, by a speed signal that is off by so much.
+        Without it the reported speed then leaves standstill at friction's rate.
         """
         return self._knowledge.shows_s(at_rest_rad_s, torque_nm)
 
