@@ -3,7 +3,7 @@
 Somebody set the drive for its motor, its gear, or for a test before this one; and a host that dies leaves behind what
 it wrote. So a torque or speed limit is lowered to rig.yaml's unasked and never raised, and a quick stop's ramp is made
 steeper and never gentler. Where the drive is tighter, its limit stays and the run keeps within it
-(`Preflight.kept_torque_nm`, `kept_speed_rad_s`); a quick stop that brakes harder just stays.
+(`Preflight.kept_torque_nm`, `Preflight.kept_speed_rad_s`); a quick stop that brakes harder just stays.
 
 A simulated drive is no exception: it leaves its factory as wide as it goes.
 """

@@ -162,7 +162,7 @@ class Tree:
 
     ``lines`` holds the line of each key (of each item in a list), ``value_lines`` the line where its value
     begins, ``refused`` the paths whose value was replaced by None because it already has its problem,
-    ``written`` what stood there where a value was converted (`yaml_units`).
+    ``written`` what stood there where a value was converted (`yaml_loader.settle`).
     """
 
     file: str

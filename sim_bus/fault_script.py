@@ -136,7 +136,7 @@ class Cast(Generic[F]):
 
 
 def parse(text: str) -> Scripted:
-    """One fault as the user writes it; its name and value are looked up in `fault_catalogue`. Raises FaultRefused."""
+    """One fault as the user writes it; its name and value are looked up in `Kinds`. Raises FaultRefused."""
     found = _FAULT.fullmatch(text.strip())
     if found is None:
         raise FaultRefused(f"{text!r} is no fault", where="--fault",

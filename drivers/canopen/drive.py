@@ -10,7 +10,7 @@ Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO 
 switch and the torque target that seeds it therefore act together. Where a torque offset is used (60B2h) it goes out in
 RPDO2 with every cycle, as zero from the cycle on in which a stop is asked for. A drive that knows no heartbeat consumer
 is asked by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in
-`shape`.
+`Shape`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the cyclic frames of a drive hold, where it departs from CiA 402's usual objects (see `objects`).
+"""What the cyclic frames of a drive hold, where it departs from CiA 402's usual objects.
 
 - A drive without torque mode is sent 6040h and 60FFh only; where its 6060h can't be mapped, there is no RPDO2.
 - One whose speed mode is vl (2) is told its speed in 6042h and tells it in 6044h, 16 bits each.
@@ -41,7 +41,7 @@ from profiles.canopen import CanopenProfile, ObjectType, Position
 #     RPDO2  6060h modes of operation i8 [| 60B2h torque offset i16 ‰, then in every cycle]
 #     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰] [| 6064h angle of the motor i32]
 #
-# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
+# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `Shape`.
 
 
 RPDO1 = struct.Struct("<Hhi")
@@ -387,7 +387,7 @@ class Feedback:
         self._doubtful = False         # an answer was given up in the cycle before: it may come in this one
         self._quickest_s: float | None = None
         self._usual_s = 0.0            # from a SYNC to its answer
-        self._extra = False            # since `believed` was asked last
+        self._extra = False            # since `doubted` was asked last
         self._ends_cycles = False      # a simulated peer says where a cycle ends
         self.data = _NO_WORD           # statusword, torque, speed; as `Shape.feedback` packs them
         self.over = False              # the peer said so of this cycle

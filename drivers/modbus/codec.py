@@ -1,7 +1,7 @@
 """The pure register codec: whole numbers in 16-bit registers, and counts of a unit as whole numbers.
 
 A 32-bit number takes two registers; which half comes first is the drive's choice (`Line.word_order`). Within a
-register the high byte comes first on the wire (Modbus Application Protocol, section 4.2); `requests` does that.
+register the high byte comes first on the wire (Modbus Application Protocol, section 4.2); `access.requests` does that.
 """
 
 from __future__ import annotations

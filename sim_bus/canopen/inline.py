@@ -95,7 +95,7 @@ def _stamped(message: can.Message) -> can.Message:
 class InlineSimulator(Embedded):
     """A stepped simulator that acts whenever a station sends; ``bus`` is one, and `station` makes more.
 
-    What fails in it leaves it silent, as a thread is that has ended, and is raised by `check` and `close`. An exception
+    What fails in it leaves it silent, as a thread is that has ended, and is raised by `Embedded.check` and `Embedded.close`. An exception
     from outside (KeyboardInterrupt) goes on its way, and nothing more is taken then: it may have come in the middle of
     a step.
     """

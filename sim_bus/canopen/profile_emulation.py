@@ -20,7 +20,7 @@ from sim_bus.reports import Feedback
 # ---------------------------------------------------------------------------------------------------------------------
 # The manufacturer's settings of a worn profile: their objects, what they stand at, and what those that limit do.
 #
-# A simulated drive is delivered ready: what a profile requires to be set by hand is set. `Settings.spoil` undoes one.
+# A simulated drive is delivered ready: what a profile requires to be set by hand is set.
 
 
 DATA_TYPES = {

@@ -1,4 +1,4 @@
-"""The simulated drive's parameters: what each counts in, and what it does. What they start with: `starting`."""
+"""The simulated drive's parameters: what each counts in, and what it does. What they start with: `start`."""
 
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ _NONE, _WORDLESS = Refusal("", ""), Words()
 
 @dataclass(frozen=True)
 class Finding:
-    """What a route makes of a case, in one form whichever route: `verdict.conclude` makes the verdict of it.
+    """What a route makes of a case, in one form whichever route: `conclude` makes the verdict of it.
 
     ``inertia``: as the data have it, bounded; None where the residuals contradict the model, of which then nothing else
     is told, and where it can't be told, as the ``refusal`` says. ``conditions``: what J is conditional on besides the

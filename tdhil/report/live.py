@@ -174,7 +174,7 @@ class View:
 class LiveDisplay:
     """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle.
 
-    Nothing here writes: a thread does (`painter`), from a view that no longer changes once it is handed over.
+    Nothing here writes: a thread does (`Painter`), from a view that no longer changes once it is handed over.
     """
 
     def __init__(self, console: Console, show_preflight: bool) -> None:

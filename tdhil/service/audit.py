@@ -10,8 +10,8 @@ A line's hash is an HMAC-SHA256 with the key. Without the key, each of these is 
 out, put in or added; lines cut off at the end, also with a rewritten or an older head.json; the whole folder `audit`
 deleted or put back from an older copy.
 
-What can't be held: a user of this computer who can read `audit.key` (the service's own user, root) can write another
-chain that holds. And where `audit.key` is deleted together with the folder, a new chain begins. Only a head that was
+What can't be held: a user of this computer who can read ``audit.key`` (the service's own user, root) can write another
+chain that holds. And where ``audit.key`` is deleted together with the folder, a new chain begins. Only a head that was
 exported before shows either: `Audit.verify` takes it. So export it at times, to another computer.
 """
 

@@ -176,7 +176,7 @@ class Store:
             raise NotThere("the run has no request", where=f"run {run}") from None
 
     def status(self, run: str) -> Status:
-        """As its file has it; that of a file that can't be read is `interrupted`."""
+        """As its file has it; that of a file that can't be read is ``interrupted``."""
         folder = self.place(run)
         plain = read_json(folder / _USED) or read_json(folder / "state.json")
         try:

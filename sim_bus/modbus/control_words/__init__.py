@@ -1,4 +1,4 @@
-"""The families of control and status words, by their names in a profile (`control.family`)."""
+"""The families of control and status words, by their names in a profile (``control.family``)."""
 
 from sim_bus.modbus.control_words.base import Extra, Wiring, Words
 from sim_bus.modbus.control_words.cia402 import Cia402Words

@@ -1,6 +1,6 @@
 """Friction over speed, at every steady speed that the run saw, and whether it is the straight line that B takes it for.
 
-Over a stretch with weight w(t) (`momentum_rows`) the balance of momentum gives friction free of lags,
+Over a stretch with weight w(t) (`momentum.Row`) the balance of momentum gives friction free of lags,
 
     T_f = (∫w T − J (Δω + δ Δα)) / ∫w     at     ω = ∫w ω / ∫w,     variance D ∫w² / (∫w)²,
 

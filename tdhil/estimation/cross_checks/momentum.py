@@ -15,7 +15,7 @@ from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 #
 # Calm is what every reporting lag agrees on: while speed hardly changes, reported and true speed and torque are the
 # same, whatever filters stand between. Between two calm stretches a momentum balance needs no model of the reports
-# (`momentum_rows`). Coasting is motion without torque: there the torque's lag has nothing to act on.
+# (`balance`). Coasting is motion without torque: there the torque's lag has nothing to act on.
 
 
 BLOCK_S = 0.5

@@ -1,7 +1,7 @@
 """Inertia and friction from balances of momentum: generalised least squares with a disturbance of unknown density.
 
-Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum_rows`: C is tridiagonal). D is known twice:
-from the scatter of the excited periods' mean torque (`friction.Levels.density`), and from the residuals of the rows
+Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum.Row`: C is tridiagonal). D is known twice:
+from the scatter of the excited periods' mean torque (`friction_levels.Levels.density`), and from the residuals of the rows
 themselves. They are pooled, unless the rows scatter more than the periods allow (F test, 1 %): then friction or load
 behave otherwise in the changes of speed, and the rows' own scatter is what the interval must be built on.
 """

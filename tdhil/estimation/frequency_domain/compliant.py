@@ -56,7 +56,7 @@ from tdhil.recording import Pipe
 # Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
 # shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
 # wave's frequency 1/T, tells. So where two masses explain the data, J_r and J_L are theirs, but their intervals hold
-# whatever string the data do not contradict (`result.py`; one whose lowest swing the lines can see, `fit.too_slow`);
+# whatever string the data do not contradict (`result_of`; one whose lowest swing the lines can see, `too_slow`);
 # J_r + J_L is the same in both. Only who says ``--model two-mass`` takes the spring's weight for nothing.
 #
 # So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up
@@ -238,7 +238,7 @@ def _refuse_count(
     priors: tuple[GaussianPrior, ...],
     known: int = 0,
 ) -> Refusal | None:
-    """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft; ``known`` of the load."""
+    """Equations and unknowns, as `rigid.refuse_count` has them for a rigid shaft; ``known`` of the load."""
     assert model.compliant is not None
     equations = 2 * len(lines) + (constraint is not None) + len(priors) + known
     unknowns = len(model.compliant().names) + _REPORTS

@@ -148,7 +148,7 @@ class Wave:
         return turned
 
     def over_period(self, phi: FloatArray) -> FloatArray:
-        """The shaft's own speed behind the report ``phi`` (6,) (`reports`), (N,) rad/s."""
+        """The shaft's own speed behind the report ``phi`` (6,) (`signal_filters`), (N,) rad/s."""
         found: FloatArray = self.mean + (self._turned @ (self.speed / signal_filters.filters(phi, self._s)[0])).real
         return found
 

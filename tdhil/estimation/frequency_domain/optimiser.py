@@ -1,7 +1,7 @@
 """Least squares by Levenberg and Marquardt's damped Gauss-Newton steps, within bounds, some parameters held.
 
 Written out because the profile of an interval asks for hundreds of small descents, each from a good start: a general
-solver's set-up costs more than the few steps that they take. scipy's `least_squares` is the oracle in the tests.
+solver's set-up costs more than the few steps that they take. `scipy.optimize.least_squares` is the oracle in the tests.
 
 A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound. What it
 would take beyond a bound goes to the bound, and the rest is solved again (cut alone, the rest would go where they only

@@ -270,7 +270,7 @@ class _Fit:
         return low, "standstill (as far ahead as the guard looks)"
 
     def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
-        """Would the guard see the shaft turn backwards nowhere? As `guard.predicted_speed`, with the plan's torque."""
+        """Would the guard see the shaft turn backwards nowhere? As `Guard.predicted_speed`, with the plan's torque."""
         foresight_s, guess = self.limits.foresight_s, self.guess
         swung = amplitude_rad_s * self.swing
         speed = offset_rad_s + swung * self.shape.deviation()

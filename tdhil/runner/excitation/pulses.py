@@ -9,7 +9,7 @@ J dω/dt = −B ω − T_c tells the ratios only: multiply all three by anything
 the torque of the way back up, so every coast is paired with a powered ramp, and the ramps differ in steepness.
 
 Whatever the rough inertia's error, the swing stays within the window; in torque mode that includes what the guard
-foresees (`limits.foresight_s`) while the torque pushes.
+foresees (`Guard.foresight_s`) while the torque pushes.
 """
 
 from __future__ import annotations

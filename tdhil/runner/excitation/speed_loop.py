@@ -3,7 +3,7 @@
 A speed loop with integral action makes H(s) = (1 + b s)/(1 + a₁ s + a₂ s²) of setpoint to speed: flat at low frequency,
 often a little above one near its bandwidth, falling beyond; the report adds its lag. It is fitted to the ramp between
 the two mean speeds of stage 2, sampled as slowly as the line has it. It plans, and bounds what slow sampling between
-the setpoint's steps may do to J (`setpoint_sampling`); J itself is not read off it.
+the setpoint's steps may do to J (`tdhil.estimation.setpoint_sampling`); J itself is not read off it.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The sign probe of stage 1 only ever pushes forward. A drive (or a profile) that takes a torque setpoint below zero for
 one above it passes that, and would speed the shaft up where it is to brake it. Stage 2 ends at its lower speed; there,
-at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`braking_pulse`), and the answer awaited
-(`braking_answer`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
+at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`plan_pulse`), and the answer awaited
+(`Listener`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
 torque below zero through in torque mode.
 """
 

@@ -35,7 +35,7 @@ from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_
 # What can be set about one run of the paper's closed loop, and the names by which a factor or `--set` calls it.
 #
 # The defaults are Table 1's where the paper names one value and inferred where it does not: friction and duration from
-# Table 6, P and I from the two gains of section 3.4.3 (see `figures_signal`). They are consistent with the published
+# Table 6, P and I from the two gains of section 3.4.3 (see `figures.SignalSettings`). They are consistent with the published
 # figures, not confirmed by them.
 
 

@@ -1,7 +1,7 @@
 """Figures 9, 10, 12 and 13: one thing is swept, the speed follows the sine more or less well (section 3.4).
 
 P and I of these figures aren't printed, and "the parameters are held constant" through 3.4.1 to 3.4.3: the defaults
-are those that give the two gains printed for figure 11 (`figures_signal`). Amplitude, gain and phase are taken over
+are those that give the two gains printed for figure 11 (`figures.SignalSettings`). Amplitude, gain and phase are taken over
 the last whole periods of each record's second half.
 """
 
