@@ -172,7 +172,7 @@ M = TypeVar("M")
 
 
 @dataclass(frozen=True)
-class Kind(Generic[M]):
+class FaultKind(Generic[M]):
     """``value``: the default, '' where the fault takes none. ``make`` may raise ValueError."""
 
     row: int                           # of docs/faults.md; 0: none of its own
@@ -225,7 +225,7 @@ class KnownFault:
     from_start: bool
 
 
-class Kinds(dict[str, Kind[M]]):
+class Kinds(dict[str, FaultKind[M]]):
     """The faults of one bus by their names."""
 
     def make(self, fault: Scripted) -> M:

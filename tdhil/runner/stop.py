@@ -5,10 +5,10 @@
 2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer
    than the largest plausible lag. How long that takes depends on the torque limit and on what swings: as long as the
    shaft keeps getting slower, it is waited for.
-3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). Since a drive may
-   end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in speed mode,
-   at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at once, and is
-   then left holding what it holds: a wound-up string is not let go by disabling.
+3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). Since a
+   drive may end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in
+   speed mode, at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at
+   once, and is then left holding what it holds: a wound-up string is not let go by disabling.
 4. Only then disable, and confirm: torque off by status word, and the shaft still at rest without it.
 
 What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been

@@ -294,7 +294,7 @@ def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
     """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
     phi = np.zeros(signal_filters.COUNT)
     phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
-    seen = problem.torque / (signal_filters.Ratio(phi, problem.s).value[problem.owner] * problem.speed)
+    seen = problem.torque / (signal_filters.FilterRatio(phi, problem.s).value[problem.owner] * problem.speed)
     s = problem.s[problem.owner]
     weight = np.abs(problem.speed)
     inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))
