@@ -75,7 +75,7 @@ def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, 
     outcome = outcome_of(code, document, said, log_closed=closed(log))
     program, excuse = combination.program, unknowable(combination)
     machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
-                      program.speed_max_rad_s, program.string)
+                            program.speed_max_rad_s, program.string)
     judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset(),
                    reaction_s=reaction_s)
     return {

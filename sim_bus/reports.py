@@ -439,12 +439,12 @@ _ALL = tuple(Feedback)
 
 def _of_value(signal: Feedback, words: str, way: _QuantityDistortion) -> ReportFault:
     return ReportFault(f"{signal.value}-{way.name}", f"{words} {way.text}",
-               lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes)
+                       lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes)
 
 
 def _of_sensor(way: _QuantityDistortion) -> ReportFault:
     return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {way.text}; control and position follow it",
-               lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes)
+                       lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes)
 
 
 def _of_words(name: str, summary: str, *words: tuple[Feedback, Callable[[], Word]]) -> ReportFault:
@@ -477,9 +477,9 @@ _ROWS = (
     _of_words("feedback-ones", "all reports have all bits set, the statusword too",
               *((signal, Ones) for signal in _ALL)),
     ReportFault("feedback-delay", "speed, torque, demand and position come so much later",
-        lambda v: OfValues(tuple(_QUANTITIES), lambda: DelayedValue(seconds(v))), "500ms", "TIME"),
+                lambda v: OfValues(tuple(_QUANTITIES), lambda: DelayedValue(seconds(v))), "500ms", "TIME"),
     ReportFault("encoder-inverted", "the reported speed has the wrong sign",
-        lambda _: OfValues((Feedback.SPEED,), lambda: Linear(-1.0)), row=36),
+                lambda _: OfValues((Feedback.SPEED,), lambda: Linear(-1.0)), row=36),
     _of_stage("torque-constant", "the true torque is this times what the drive reports and demands",
               lambda v: PowerStage(factor=factor(v)), "0.5", "FACTOR"),
     _of_stage("motor-polarity", "the true torque has the opposite sign of what the drive reports and demands",

@@ -155,8 +155,8 @@ def facts_of(entry: ProfileEntry) -> Iterator[tuple[str, str, str]]:
 def _facts(model: BaseModel, prefix: str) -> Iterator[tuple[str, str, str]]:
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
-        if name in ("source", "confidence") or isinstance(value, ProfileEntry) or _entries(value) or value in (None,
-                                                                                                               ()):
+        if (name in ("source", "confidence") or isinstance(value, ProfileEntry) or _entries(value)
+                or value in (None, ())):
             continue
         key = prefix + (field.alias or name)
         if isinstance(value, BaseModel):

@@ -431,7 +431,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
 def _answer(best: Part | None, document: Part) -> AnswerBox:
     if best is None:
         return AnswerBox("red", "No tuned controller", (), "refused",
-                      "Nothing softer than the stiff loop can be recommended.", "")
+                         "Nothing softer than the stiff loop can be recommended.", "")
     gains = best["at_motor"]
     lines = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
     if gains["compensated_kg_m2"]:

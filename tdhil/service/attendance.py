@@ -146,8 +146,7 @@ class Watcher:
     def preflight(self, preflight: Preflight) -> None:
         checks = tuple(
             Check(visible(one.name), visible(one.wanted), visible(one.found), one.outcome.value,
-                          visible(one.where),
-                  visible(one.next_step))
+                  visible(one.where), visible(one.next_step))
             for one in preflight.checks
         )
         who = preflight.identity

@@ -182,8 +182,7 @@ class Supervisor:
             if not simulated or rig.motion == "watched":           # it shows a code
                 self.pace.begin(who, address, rig.id)
             request = self._write_down(StoredRequest("", rig.id, str(rig.path.resolve()), rig.sha256, options, who,
-                                                     now(),
-                                               simulated, rig.motion, key))
+                                                     now(), simulated, rig.motion, key))
             run = request.id
             try:
                 self._begin(run)

@@ -69,7 +69,7 @@ def evaluation_case(
         low, high = lag.get("low"), lag.get("high")
         error_s = 0.5 * (high - low) if low is not None and high is not None else 0.0
         real = IdentifiedRig(inertia["value"], _value(rig["viscous_nm_s_rad"]), _value(rig["coulomb_nm"]),
-                   max(0.0, lag["value"]), rig["gear_ratio"])
+                             max(0.0, lag["value"]), rig["gear_ratio"])
         prediction = Prediction(
             use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]))
         return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s,

@@ -179,7 +179,7 @@ def simulate(
             kept.append((time_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
     return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                 first.reshape(shape), last.reshape(shape))
+                           first.reshape(shape), last.reshape(shape))
 
 
 class _Waves:

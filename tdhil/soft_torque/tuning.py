@@ -228,8 +228,9 @@ def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
     return max(sqrt(held_hz[0] * second), NEXT_MODE_SHARE * second)
 
 
-def lowest_modes(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> tuple[NaturalMode,
-                                                                                                           ...]:
+def lowest_modes(
+    case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]
+) -> tuple[NaturalMode, ...]:
     """Those that the string's lowest mode has become."""
     return ClosedSystem(case.string, drive, law).modes(lowest_modes_below_hz(held_hz))
 

@@ -23,8 +23,7 @@ from pydantic import TypeAdapter, ValidationError
 import tdhil
 from drivers.drive import RawFrame
 from drivers.errors import CommunicationLost, DataFileError
-from profiles.entry import DriveProfile
-from profiles.entry import RegistryEntry as ProfileEntry
+from profiles.entry import DriveProfile, ProfileEntry
 from profiles.library import SCHEMAS
 from profiles.model import Positive
 from profiles.yaml_loader import parse_model

@@ -59,8 +59,8 @@ def synthetic(plant, seed, noise_nm, hertz=LINES, amplitude=0.2, lags=(0.4, 0.15
             return sum(np.sum((a - a.mean()) * np.conj(b - b.mean())) for a, b in zip(one, other, strict=True)) / 10.0
 
         found.append(SpectralLine(hz, np.array([x.mean() for x in speed]), np.array([x.mean() for x in torque]),
-                          np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
-                          complex(scatter(torque, speed)), 10.0))
+                                  np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
+                                  complex(scatter(torque, speed)), 10.0))
     sd = 0.05 * noise_nm
     return tuple(found), ViscousConstraint(plant.impedance(1e-5).real + sd * rng.normal(), 0.0, sd, 10.0)
 

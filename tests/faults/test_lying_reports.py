@@ -45,6 +45,6 @@ def test_no_lie_is_believed(combination, tmp_path):
     document = done.document if done.out.strip() else {}
     outcome = outcome_of(done.code, document, done.err, log_closed=closed(log))
     machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
-                      program.speed_max_rad_s, program.string)
+                            program.speed_max_rad_s, program.string)
     judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset())
     assert judged.broken == {}, outcome.message

@@ -35,7 +35,7 @@ class Asked:
         self.run = self.store.new_id()
         self.folder = self.store.place(self.run)
         self.store.begin(StoredRequest(self.run, "rig", str(self.rig), found.sha256, options, "local", now(), simulated,
-                                 motion))
+                                       motion))
 
     def serve(self) -> int:
         return main([str(self.folder)])

@@ -133,8 +133,8 @@ def test_friction_torque_and_loads() -> None:
     assert rigid.friction_torque(Params(), ShaftState(), 25.0) == 25.0
     assert rigid.friction_torque(Params(friction="dahl"), ShaftState(1.0, 0.0, 0.012)) == pytest.approx(60.0)
     with_load = step(Params(load_nm=30.0), ShaftState(1.0), 100.0, 0.002)
-    assert with_load == step(Params(), ShaftState(1.0), 70.0, 0.002) == step(Params(), ShaftState(1.0), 100.0, 0.002,
-                                                                             30.0)
+    without = step(Params(), ShaftState(1.0), 70.0, 0.002)
+    assert with_load == without == step(Params(), ShaftState(1.0), 100.0, 0.002, 30.0)
 
 
 def test_parameters_are_checked() -> None:

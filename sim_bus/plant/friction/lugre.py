@@ -60,8 +60,9 @@ def _pieces(shaft: ShaftParams, dt_s: float) -> int:
     return max(1, min(_MOST_PIECES, ceil(dt_s * max(min(by_inertia, by_damping), falling))))
 
 
-def _through_zero(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float,
-                                                                                                        float]:
+def _through_zero(
+    shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float
+) -> tuple[float, float, float]:
     end, bristle_end, travel = _piece(shaft, speed, bristle, drive, dt_s)
     if speed * end >= 0.0:
         return end, bristle_end, travel

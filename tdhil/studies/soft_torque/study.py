@@ -163,8 +163,8 @@ def controllers(settings: SoftTorqueSettings) -> list[ControllerRow]:
         swinging = [mode for mode in modes if name != "the paper's 300/300, scaled to J" or mode.damping < 0.5]
         reflected = reflection_at(machine, law, string, np.array([held[0]]))[0]
         rows.append(ControllerRow(name, machine, law, EXPECTED[name], float(reflected),
-                        tuple(sorted(mode.damping for mode in swinging)),
-                        tuple(mode.frequency_hz for mode in swinging)))
+                                  tuple(sorted(mode.damping for mode in swinging)),
+                                  tuple(mode.frequency_hz for mode in swinging)))
     return rows
 
 
