@@ -38,7 +38,7 @@ class PowerState(Enum):
 
 
 class PowerRequest(Enum):
-    """Where the caller wants the drive to be."""
+    """Power state that the caller requests."""
 
     OFF = "off"
     ENABLED = "enabled"

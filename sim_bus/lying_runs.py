@@ -306,7 +306,7 @@ class Blind:
         when = f", {' or '.join(sorted(one or 'from the start' for one in self.moments))}" if self.moments else ""
         return " and ".join(name.rstrip("-") for name in self.lies) + load + when
 
-    def holds(self, told: Told, moment: str, program: Program) -> bool:
+    def holds(self, told: LieWithValue, moment: str, program: CommandLine) -> bool:
         """Whether a combination is one of these."""
         known = program.torque_mode or program.demand
         return (
