@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from tdhil.errors import TdhilError  # noqa: E402
-from tdhil.fleet import FleetRequest, FleetRow, Settings, read_table, run_fleet  # noqa: E402
+from tdhil.fleet import FleetRequest, FleetRow, FleetSettings, read_table, run_fleet  # noqa: E402
 from tdhil.process_pool import Pool, TaskLimits  # noqa: E402
 from tests.fleet import poison  # noqa: E402
 from tests.fleet.simulated_logs import rig_plants, write_rig  # noqa: E402
@@ -218,7 +218,7 @@ def cost(asked: argparse.Namespace, folder: Path) -> None:
                    stdout=subprocess.DEVNULL, cwd=ROOT)
     print(f"tdhil replay, a process of its own: {children_cpu_s(before):.2f} s CPU")
     request = FleetRequest((str(logs),), folder / "cost.csv", jobs=2)
-    for what, settings in (("cold", Settings()), ("from the cache", Settings(confidence=0.9))):
+    for what, settings in (("cold", FleetSettings()), ("from the cache", FleetSettings(confidence=0.9))):
         before, own, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.process_time(), time.monotonic()
         summary = run_fleet(replace(request, settings=settings))
         whole = children_cpu_s(before) + time.process_time() - own

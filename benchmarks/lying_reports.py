@@ -31,7 +31,7 @@ for library in ("OPENBLAS", "OMP", "MKL"):
     os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
 from sim_bus.lying_runs import UNKNOWABLE, Combination, product, sample, standard, unknowable  # noqa: E402
-from sim_bus.shaft_judge import REACTION_S, Machine, judge, outcome_of, read_shaft  # noqa: E402
+from sim_bus.shaft_judge import REACTION_S, JudgedMachine, judge, outcome_of, read_shaft  # noqa: E402
 
 RULES = {
     "a": "disabled while it turned", "b": "reported at rest while it turned", "c": "a valid interval misses J",
@@ -74,8 +74,8 @@ def run(combination: Combination, folder: Path, reaction_s: float) -> dict[str, 
     document = json.loads(out.getvalue()) if out.getvalue().strip() else {}
     outcome = outcome_of(code, document, said, log_closed=closed(log))
     program, excuse = combination.program, unknowable(combination)
-    machine = Machine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
-                      program.speed_max_rad_s, program.string)
+    machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
+                            program.speed_max_rad_s, program.string)
     judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset(),
                    reaction_s=reaction_s)
     return {

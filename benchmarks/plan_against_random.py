@@ -18,14 +18,14 @@ from dataclasses import replace
 import numpy as np
 
 from tdhil.recording import LagPrior
-from tdhil.runner import ControlAssumptions, Guard, Knowledge
-from tdhil.runner.design import Noise, choose, expected_half_width
+from tdhil.runner import ControlAssumptions, DesignKnowledge, Guard
+from tdhil.runner.design import NoiseDensity, choose, expected_half_width
 from tdhil.runner.design.choice import highest_line_hz, relative_sd
 from tdhil.runner.excitation import (
-    ExcitationWish,
     MotionLimits,
     Plan,
     PlanRefused,
+    PlanRequest,
     RigGuess,
     Shape,
     make_plan,
@@ -41,12 +41,13 @@ HIGHEST_HARMONIC = 12
 BEYOND_HZ = 3.0
 
 
-def machine(plant: CoveragePlant) -> tuple[MotionLimits, RigGuess, Knowledge]:
+def machine(plant: CoveragePlant) -> tuple[MotionLimits, RigGuess, DesignKnowledge]:
     """A plant as stages 2 and 3 would show it."""
     limits = MotionLimits(*plant.window_rad_s, plant.torque_limit_nm, Guard.foresight_s(ControlAssumptions()))
     noise = plant.noise
-    known = Knowledge(
-        Noise(2.0 * noise.load_nm**2 * noise.load_time_s, noise.sensor_rad_s**2 * plant.step_s, noise.load_time_s),
+    known = DesignKnowledge(
+        NoiseDensity(2.0 * noise.load_nm**2 * noise.load_time_s, noise.sensor_rad_s**2 * plant.step_s,
+                     noise.load_time_s),
         LagPrior(),
     )
     return limits, RigGuess(plant.inertia_kg_m2, plant.viscous_nm_s_rad, plant.coulomb_nm), known
@@ -62,7 +63,7 @@ def random_plan(
     amplitudes = tuple(float(harmonic**-slope * rng.uniform(0.5, 1.5)) for harmonic in harmonics)
     shape = unit_peak(Shape(harmonics, amplitudes, tuple(map(float, rng.uniform(0.0, 2.0 * math.pi, len(harmonics))))))
     reach = math.exp(rng.uniform(math.log(0.3), 0.0))
-    wish = ExcitationWish(
+    wish = PlanRequest(
         shape=shape, frequency_hz=reach * highest_hz / harmonics[-1],
         offset_share=float(rng.uniform(0.15, 0.45)),
     )
@@ -82,7 +83,7 @@ def compare(
     """Half-widths of the chosen plan and of the best random one, and their common length."""
     limits, guess, known = machine(plant)
     theta = known.theta(guess)
-    chosen = choose(limits, guess, ExcitationWish(), known, CONFIDENCE)
+    chosen = choose(limits, guess, PlanRequest(), known, CONFIDENCE)
     rng = np.random.default_rng(seed)
     highest_hz = BEYOND_HZ if beyond else highest_line_hz(max(known.speed_lag_s, known.torque_lag_s))
     found: list[tuple[float, int, Plan]] = []

@@ -24,16 +24,16 @@ from sim_bus.plant import Params
 from sim_bus.plant.drill_string import StringParams
 from tdhil.soft_torque import (
     RPM,
-    Bottom,
+    BottomEnd,
     EvaluationCase,
     HostLoop,
+    IdentifiedRig,
     Interval,
     Phase,
+    PipeSection,
     Prediction,
-    Program,
-    Rig,
-    Section,
     SpeedController,
+    SpeedProgram,
     StringFile,
     TopDrive,
     evaluate,
@@ -43,7 +43,7 @@ from tdhil.soft_torque import (
 BIT = {"friction": "stribeck", "static_nm": 5000.0, "coulomb_nm": 2500.0, "stribeck_speed_rad_s": 2.5,
        "viscous_nm_s_rad": 20.0, "inertia_kg_m2": 374.0}
 STRING = string_of(StringFile(
-    sections=(Section(length_m=3000.0, outer_diameter_m=0.127, inner_diameter_m=0.1086),), bottom=Bottom(**BIT)))
+    sections=(PipeSection(length_m=3000.0, outer_diameter_m=0.127, inner_diameter_m=0.1086),), bottom=BottomEnd(**BIT)))
 MEANT = TopDrive(1500.0, 8.0, 60.0, (0.020, 0.010, 0.003))
 MODES_HZ = (0.1299, 0.567, 1.079)
 CONTROLLERS = {       # law, set speeds from and to, least damping
@@ -92,14 +92,15 @@ def real_critical(law: SpeedController, low_rpm: float, high_rpm: float, seed: i
 
 
 def virtual(
-    name: str, rate_hz: float, seed: int, *, lags_s: tuple[float, float] = (0.40, 0.15), believed: Rig | None = None,
+    name: str, rate_hz: float, seed: int, *, lags_s: tuple[float, float] = (0.40, 0.15),
+    believed: IdentifiedRig | None = None,
     torque_scale: float = 1.0,
 ) -> tuple[float | None, float | None, str]:
     """Critical speed in rpm, damping and verdict by the course of `tdhil evaluate`."""
     law, start, highest, damping = CONTROLLERS[name]
-    rig = believed or Rig(1500.0, 8.0, 60.0, lags_s[0])
+    rig = believed or IdentifiedRig(1500.0, 8.0, 60.0, lags_s[0])
     inverter = Inverter(params(SpeedController(6000.0, 4000.0), real=False, lags_s=lags_s), np.random.default_rng(seed))
-    program, period_s = Program(start * RPM, highest * RPM), 1.0 / rate_hz
+    program, period_s = SpeedProgram(start * RPM, highest * RPM), 1.0 / rate_hz
     host = HostLoop(STRING, MEANT, law, rig, program, period_s, 30_000.0)
     count, step_s = inverter.steps(period_s)
     inverter.control.speed(program.start_rad_s)
@@ -130,9 +131,9 @@ def main() -> int:
         ("50 Hz", 3.0, {"rate_hz": 50.0}),
         ("100 Hz", 3.0, {"rate_hz": 100.0}),
         ("lags 20/10 ms, 50 Hz", 3.0, {"rate_hz": 50.0, "lags_s": (0.02, 0.01)}),
-        ("lag believed 0.45 s", 6.0, {"rate_hz": 100.0, "believed": Rig(1500.0, 8.0, 60.0, 0.45)}),
-        ("lag believed 0.35 s", 6.0, {"rate_hz": 100.0, "believed": Rig(1500.0, 8.0, 60.0, 0.35)}),
-        ("F_c believed 30 N·m less", 6.0, {"rate_hz": 100.0, "believed": Rig(1500.0, 8.0, 30.0, 0.40)}),
+        ("lag believed 0.45 s", 6.0, {"rate_hz": 100.0, "believed": IdentifiedRig(1500.0, 8.0, 60.0, 0.45)}),
+        ("lag believed 0.35 s", 6.0, {"rate_hz": 100.0, "believed": IdentifiedRig(1500.0, 8.0, 60.0, 0.35)}),
+        ("F_c believed 30 N·m less", 6.0, {"rate_hz": 100.0, "believed": IdentifiedRig(1500.0, 8.0, 30.0, 0.40)}),
         ("torque 0.98 of commanded", 6.0, {"rate_hz": 100.0, "torque_scale": 0.98}),
     ]
     failed = 0

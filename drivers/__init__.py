@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
     from drivers.preflight import (
         ACCEPTED_BY as ACCEPTED_BY, ANY_CLIENT as ANY_CLIENT, NOTHING_STOPS_IT as NOTHING_STOPS_IT,
-        NO_WATCHDOG_FLAG as NO_WATCHDOG_FLAG, SHARED_FLAG as SHARED_FLAG, Table as Table,
+        NO_WATCHDOG_FLAG as NO_WATCHDOG_FLAG, SHARED_FLAG as SHARED_FLAG, PreflightTable as PreflightTable,
     )
     from drivers.quick_stop import (
         BareStopReport as BareStopReport, Ended as Ended, Target as Target, bare_stop as bare_stop,

@@ -37,6 +37,14 @@ class PowerState(Enum):
     UNKNOWN = "no valid state"     # the status word is none that the drive can show: nothing is known of it
 
 
+class PowerRequest(Enum):
+    """Power state that the caller requests."""
+
+    OFF = "off"
+    ENABLED = "enabled"
+    QUICK_STOP = "quick stop"
+
+
 class Command(NamedTuple):
     """One cycle's wish: the mode, and the setpoint of each mode (the other one seeds a later switch).
 

@@ -3,7 +3,7 @@
 Somebody set the drive for its motor, its gear, or for a test before this one; and a host that dies leaves behind what
 it wrote. So a torque or speed limit is lowered to rig.yaml's unasked and never raised, and a quick stop's ramp is made
 steeper and never gentler. Where the drive is tighter, its limit stays and the run keeps within it
-(`Preflight.kept_torque_nm`, `kept_speed_rad_s`); a quick stop that brakes harder just stays.
+(`Preflight.kept_torque_nm`, `Preflight.kept_speed_rad_s`); a quick stop that brakes harder just stays.
 
 A simulated drive is no exception: it leaves its factory as wide as it goes.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from drivers.drive import Check, Outcome
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 
 WIDER_FLAG = "--accept-wider-limit"
 TORQUE, SPEED, QUICK_STOP = "torque", "speed", "quick-stop"
@@ -34,7 +34,7 @@ class OwnLimits:
         return self.wider(limit, wanted, found) and limit not in self._accepted
 
     def keep(
-        self, table: Table, limit: str, title: str, wanted: str, found: str, found_si: float, where: str
+        self, table: PreflightTable, limit: str, title: str, wanted: str, found: str, found_si: float, where: str
     ) -> None:
         """The row of one that stays."""
         self.kept[limit] = min(abs(found_si), self.kept.get(limit, abs(found_si)))
@@ -43,7 +43,7 @@ class OwnLimits:
         table.checks.append(Check(title, wanted, text, Outcome.NOTE, where, f"{WIDER_FLAG} {limit} sets rig.yaml's"))
 
     def written(
-        self, table: Table, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,
+        self, table: PreflightTable, limit: str, title: str, wanted: str, now: str, before: str, good: bool, where: str,
         mend: str = "", *, wider: bool = False,
     ) -> bool:
         """The row of one that was written, with what stood there before; whether it reads back as wanted."""

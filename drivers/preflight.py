@@ -9,7 +9,7 @@ from drivers.drive import Check, Outcome
 from drivers.errors import CommandRejected, PreflightRefused
 
 
-class Table:
+class PreflightTable:
     """Collects the rows. One that fails doesn't hide those after it: an engineer wants the whole list."""
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ _HINT = f"A drive whose watchdog is off, and can't be armed, is taken by name on
 _NOT_OFF = f"{NO_WATCHDOG_FLAG} takes a watchdog that is off, not one that is set otherwise"
 
 
-def settle(table: Table, tried: Table, accepted: bool, is_off: Callable[[], bool]) -> bool:
+def settle(table: PreflightTable, tried: PreflightTable, accepted: bool, is_off: Callable[[], bool]) -> bool:
     """Take over the rows that arming gave; whether the watchdog is armed.
 
     ``is_off`` is asked only where a row was refused and the operator has accepted a drive without: then they become
@@ -74,7 +74,7 @@ def settle(table: Table, tried: Table, accepted: bool, is_off: Callable[[], bool
     return not refused
 
 
-def spare(table: Table, title: str, wanted: str, found: str, where: str) -> None:
+def spare(table: PreflightTable, title: str, wanted: str, found: str, where: str) -> None:
     """A row about the watchdog's own parameter that would be refused, were a watchdog that is off not accepted."""
     table.checks.append(_noted(Check(title, wanted, found, Outcome.REFUSED, where)))
 
@@ -98,7 +98,8 @@ HELD_SHARE, HELD_COUNTS = 0.02, 5.0
 """Of the torque limit, or so many counts of the reported torque: less than both is nothing."""
 
 
-def check_nothing_held(table: Table, held_nm: float | None, limit_nm: float, count_nm: float, where: str) -> bool:
+def check_nothing_held(table: PreflightTable, held_nm: float | None, limit_nm: float, count_nm: float,
+                       where: str) -> bool:
     """A row of what a drive in quick stop holds, N·m; None: it doesn't tell. Whether the shaft may be let go."""
     most_nm = max(HELD_SHARE * limit_nm, HELD_COUNTS * count_nm)
     found = "not told" if held_nm is None else f"{held_nm:.4g} N·m"
@@ -114,7 +115,8 @@ def check_nothing_held(table: Table, held_nm: float | None, limit_nm: float, cou
 # The rated torque, which the drive and rig.yaml may both know: one row of the preflight table, whatever the bus.
 
 
-def agreed_rated_torque(table: Table, from_drive_nm: float | None, rig_nm: float | None, where: str) -> float | None:
+def agreed_rated_torque(table: PreflightTable, from_drive_nm: float | None, rig_nm: float | None,
+                        where: str) -> float | None:
     """N·m; rig.yaml's, and the drive's where the rig has none. None, and refused, where neither tells.
 
     ``where`` names the object or the register.

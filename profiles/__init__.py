@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from profiles.eds_import import begin_profile as begin_profile
     from profiles.eds_reader import read_eds as read_eds
     from profiles.entry import (
-        Confidence as Confidence, DriveProfile as DriveProfile, Entry as Entry, Require as Require,
+        Confidence as Confidence, DriveProfile as DriveProfile, ProfileEntry as ProfileEntry, Require as Require,
         SpeedControllerParameters as SpeedControllerParameters,
     )
     from profiles.errors import DataFileError as DataFileError, Problem as Problem, TdhilError as TdhilError

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import DriveProfile, Entry, Positive, Require
+from profiles.entry import DriveProfile, Positive, ProfileEntry, Require
 from profiles.model import DataModel, Finding, refuse_if
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -37,7 +37,7 @@ class ObjectAt(DataModel):
     type: ObjectType
 
 
-class Parameter(Entry):
+class Parameter(ProfileEntry):
     """A setting of the drive: read in preflight, and checked, written, or used as a scale."""
 
     name: Name
@@ -87,7 +87,7 @@ I16 = Annotated[int, Field(ge=-0x8000, le=0x7FFF)]
 I8 = Annotated[int, Field(ge=-0x80, le=0x7F)]
 
 
-class IdentityEntry(Entry):
+class IdentityEntry(ProfileEntry):
     """Object 1018h; None = not checked."""
 
     vendor: U32 | None = Field(default=None, description="1018h:1")
@@ -95,7 +95,7 @@ class IdentityEntry(Entry):
     revision: U32 | None = Field(default=None, description="1018h:3")
 
 
-class Modes(Entry):
+class Modes(ProfileEntry):
     """Modes of operation (6060h) in order of preference; the drive's 6502h decides which of them it gets."""
 
     speed: tuple[I8, ...] = Field(min_length=1, description="modes that regulate speed, such as [9, 3]")
@@ -115,7 +115,7 @@ class Modes(Entry):
         return self
 
 
-class QuickStop(Entry):
+class QuickStop(ProfileEntry):
     """What controlword bit 2 does."""
 
     option_code: I16 | None = Field(
@@ -130,7 +130,7 @@ class QuickStop(Entry):
     )
 
 
-class Speed(Entry):
+class Speed(ProfileEntry):
     """Speed as reported in 606Ch and commanded in 60FFh, and what limits it."""
 
     vl: bool = Field(
@@ -149,7 +149,7 @@ class Speed(Entry):
     deceleration_rpm_s_per_lsb: Positive | None = Field(description="unit of 6084h in rpm/s; null = no such object")
 
 
-class Position(Entry):
+class Position(ProfileEntry):
     """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right.
 
     Read only, and believed only where the drive has it.
@@ -184,7 +184,7 @@ class TorqueActual(ObjectAt):
         return self
 
 
-class Torque(Entry):
+class Torque(ProfileEntry):
     """Torque as reported in 6077h and commanded in 6071h, as a share of the rated torque.
 
     6071h is used where `Modes.torque` names a mode, and only there.
@@ -207,7 +207,7 @@ class Torque(Entry):
     has_demand: bool = Field(description="does the drive report its torque demand in 6074h, in the unit of 6077h?")
 
 
-class TorqueOffset(Entry):
+class TorqueOffset(ProfileEntry):
     """A torque that the drive adds to that of its own speed loop: 60B2h, torque offset (CiA 402-2).
 
     Mapped and used by those runs alone that ask for it, such as the measurement of the drive's own impedance.
@@ -221,7 +221,7 @@ class TorqueOffset(Entry):
     )
 
 
-class Watchdog(Entry):
+class Watchdog(ProfileEntry):
     """What stops the drive when the host falls silent."""
 
     kind: Literal["heartbeat", "node_guarding", "none"] = Field(
@@ -253,7 +253,7 @@ class Watchdog(Entry):
         return self
 
 
-class ReportingFilter(Entry):
+class ReportingFilter(ProfileEntry):
     """An object that holds the smoothing which the drive puts on a reported signal."""
 
     signal: Literal["speed", "torque"] = Field(description="the signal that it smooths")
@@ -264,7 +264,7 @@ class ReportingFilter(Entry):
     per_lsb: Positive = Field(default=1.0, description="seconds, or hertz, for one count")
 
 
-class Cyclic(Entry):
+class Cyclic(ProfileEntry):
     """The cycle of setpoints and feedback."""
 
     rate_hz: float = Field(default=250.0, gt=0, le=2000, description="cycles a second unless told otherwise")
@@ -338,10 +338,10 @@ class CanopenProfile(DriveProfile):
         """The parameter of that name; KeyError if there is none (references are checked on loading)."""
         return {one.name: one for one in self.parameters}[name]
 
-    def entries(self) -> tuple[tuple[str, Entry], ...]:
+    def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """(name, entry) of everything that the profile says, with its source and confidence."""
-        found: list[tuple[str, Entry]] = [
-            (name, part) for name, part in self if isinstance(part, Entry) and part != STANDARD_POSITION
+        found: list[tuple[str, ProfileEntry]] = [
+            (name, part) for name, part in self if isinstance(part, ProfileEntry) and part != STANDARD_POSITION
         ]
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         return (*found, *((f"parameters.{part.name}", part) for part in self.parameters))

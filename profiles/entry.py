@@ -36,7 +36,7 @@ Positive = Annotated[float, Field(gt=0)]
 ProfileName = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/[a-z0-9._-]+$")]
 
 
-class Entry(DataModel):
+class ProfileEntry(DataModel):
     """One thing that a profile claims."""
 
     source: str = Field(min_length=3, description="the document, file or measurement that says so")
@@ -47,7 +47,7 @@ class Entry(DataModel):
 # The speed controller's own parameters, for whoever types gains into the drive. No run reads or writes them.
 
 
-class ControllerGain(Entry):
+class ControllerGain(ProfileEntry):
     """Its proportional gain."""
 
     title: str = Field(min_length=3, description="the manual's number and name, such as 'p1470 P gain'")
@@ -57,7 +57,7 @@ class ControllerGain(Entry):
     )
 
 
-class ControllerIntegral(Entry):
+class ControllerIntegral(ProfileEntry):
     """Its integral part."""
 
     title: str = Field(min_length=3, description="the manual's number and name")
@@ -87,7 +87,7 @@ class DriveProfile(DataModel):
         default=None, description="its speed controller's gains, for `tdhil tune`; no run touches them"
     )
 
-    def entries(self) -> tuple[tuple[str, Entry], ...]:
+    def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """(name, entry) of everything that the profile says, with its source and confidence."""
         raise NotImplementedError
 

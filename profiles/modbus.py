@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from profiles.entry import Confidence, DriveProfile, Entry, Positive, Require
+from profiles.entry import Confidence, DriveProfile, Positive, ProfileEntry, Require
 from profiles.model import DataModel, Finding, refuse_if
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -24,7 +24,7 @@ Unit = Literal["rpm", "rpm_s", "nm", "rated", "s", "hz", "kw", "none"]
 
 
 class Register(DataModel):
-    """Where a number stands. 32 bit: two registers, their order is `Line.word_order`."""
+    """Where a number stands. 32 bit: two registers, their order is `BusLine.word_order`."""
 
     address: Address = Field(description="on the wire, counted from 0")
     type: Literal["u16", "i16", "u32", "i32"] = Field(default="i16", description="how its bits are read")
@@ -37,7 +37,7 @@ class Register(DataModel):
         return 2 if self.type in ("u32", "i32") else 1
 
 
-class Signal(Entry):
+class CyclicSignal(ProfileEntry):
     """One number of the cycle, with its unit."""
 
     register_: Register = Field(alias="register")
@@ -54,7 +54,7 @@ class Bits(DataModel):
     value: Word
 
 
-class WordSignal(Entry):
+class WordSignal(ProfileEntry):
     """A word of bits in the cycle."""
 
     register_: Register = Field(alias="register")
@@ -74,7 +74,7 @@ class StatusState(DataModel):
     )
 
 
-class Control(Entry):
+class Control(ProfileEntry):
     """The words: what is sent towards each wish, and what the status means."""
 
     family: Literal["cia402", "profidrive", "abb", "danfoss_fc", "yaskawa", "delta"] = Field(
@@ -112,7 +112,7 @@ class ModeDisplay(DataModel):
     torque: Word = Field(description="value under the mask in torque control")
 
 
-class ModeSwitch(Entry):
+class ModeSwitch(ProfileEntry):
     """Speed or torque."""
 
     torque: bool = Field(description="can torque be regulated over the bus? false: speed-mode variant of the protocol")
@@ -137,14 +137,14 @@ class ModeSwitch(Entry):
         return self
 
 
-class QuickStop(Entry):
+class QuickStop(ProfileEntry):
     """What the quick-stop word does."""
 
     decelerates_in_torque_mode: bool = Field(description="false: the host asks for speed mode at zero speed first")
     ends: Literal["quick_stop", "off"] = Field(description="the state in which the drive is left once at rest")
 
 
-class Parameter(Entry):
+class Parameter(ProfileEntry):
     """A setting of the drive: read in preflight, and checked, written, or used as a scale.
 
     Without ``register`` it can't be read over the bus: rig.yaml must state it (drive_data.parameters.<name>).
@@ -187,7 +187,7 @@ class Parameter(Entry):
         return self
 
 
-class ModbusWatchdog(Entry):
+class ModbusWatchdog(ProfileEntry):
     """What stops the drive when the host falls silent."""
 
     kind: Literal["timeout", "none"]
@@ -225,7 +225,7 @@ class ModbusWatchdog(Entry):
         return self.fed_by.endswith("_of_this_connection") and self.fed_by_confidence != "unverified"
 
 
-class ModbusFilter(Entry):
+class ModbusFilter(ProfileEntry):
     """The smoothing on a reported signal: read from a parameter, or as documented."""
 
     signal: Literal["speed", "torque"]
@@ -240,7 +240,7 @@ class ModbusFilter(Entry):
         return self
 
 
-class NamePlate(Entry):
+class NamePlate(ProfileEntry):
     """Three parameters that must fit P = T·ω: a wrong address, scale or word order in any of them doesn't."""
 
     power: Name
@@ -249,7 +249,7 @@ class NamePlate(Entry):
     tolerance: float = Field(default=0.1, gt=0, lt=1, description="relative; name plates are rounded")
 
 
-class Echo(Entry):
+class Echo(ProfileEntry):
     """A register of the drive's own in which a setpoint shows up again, written at standstill, disabled.
 
     Worth most where it has a unit and a scale of its own: one that shares them with the setpoint can't tell them wrong.
@@ -262,7 +262,7 @@ class Echo(Entry):
     times: Name | None = None
 
 
-class Temperature(Entry):
+class Temperature(ProfileEntry):
     """Where the drive tells that something gets hot: warning bits, or a number with a limit."""
 
     title: str = Field(min_length=3, description="the manual's number and name")
@@ -281,7 +281,7 @@ class Temperature(Entry):
         return self
 
 
-_NO_ECHO = Entry(
+_NO_ECHO = ProfileEntry(
     source="no register shows before motion what the drive has made of this setpoint; look its address, type, scale "
     "and sign up in the manual",
     confidence="unverified",
@@ -289,7 +289,7 @@ _NO_ECHO = Entry(
 """Stands where an echo is missing: no check at standstill can find that setpoint's entry wrong, so a person answers."""
 
 
-class Position(Entry):
+class Position(ProfileEntry):
     """The motor shaft's angle as the drive counts it: what tells whether the unit of speed is right. Read only."""
 
     register_: Register = Field(alias="register")
@@ -299,16 +299,16 @@ class Position(Entry):
     )
 
 
-class ModbusCycle(Entry):
+class ModbusCycle(ProfileEntry):
     """The numbers of every cycle."""
 
     control: WordSignal
     status: WordSignal
-    speed_setpoint: Signal
-    torque_setpoint: Signal | None = None
-    speed: Signal
-    torque: Signal
-    torque_demand: Signal | None = None
+    speed_setpoint: CyclicSignal
+    torque_setpoint: CyclicSignal | None = None
+    speed: CyclicSignal
+    torque: CyclicSignal
+    torque_demand: CyclicSignal | None = None
     functions: tuple[Literal[3, 4, 6, 8, 16, 23], ...] = Field(
         min_length=1, description="function codes the drive knows"
     )
@@ -320,7 +320,7 @@ class ModbusCycle(Entry):
     rate_hz: float = Field(default=20.0, gt=0, le=1000, description="cycles a second unless told otherwise")
 
 
-class Line(Entry):
+class BusLine(ProfileEntry):
     """How the drive is reached, as it leaves the factory."""
 
     transports: tuple[Literal["tcp", "rtu"], ...] = Field(min_length=1)
@@ -337,7 +337,7 @@ class ModbusProfile(DriveProfile):
     """One drive on Modbus."""
 
     bus: Literal["modbus"]
-    line: Line
+    line: BusLine
     control: Control
     modes: ModeSwitch
     quick_stop: QuickStop
@@ -394,10 +394,10 @@ class ModbusProfile(DriveProfile):
         """The parameter of that name; KeyError if there is none (references are checked on loading)."""
         return next(one for one in self.parameters if one.name == name)
 
-    def entries(self) -> tuple[tuple[str, Entry], ...]:
+    def entries(self) -> tuple[tuple[str, ProfileEntry], ...]:
         """(name, entry) of everything that carries a source and a confidence; a missing echo is one, unverified."""
-        found: list[tuple[str, Entry]] = [(name, part) for name, part in self if isinstance(part, Entry)]
-        found += [(f"cycle.{name}", part) for name, part in self.cycle if isinstance(part, Entry)]
+        found: list[tuple[str, ProfileEntry]] = [(name, part) for name, part in self if isinstance(part, ProfileEntry)]
+        found += [(f"cycle.{name}", part) for name, part in self.cycle if isinstance(part, ProfileEntry)]
         found += [(f"parameters.{part.name}", part) for part in self.parameters]
         found += [(f"filters.{part.signal}", part) for part in self.filters]
         found += [(f"echoes.{part.setpoint}", part) for part in self.echoes]

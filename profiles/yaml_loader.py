@@ -3,7 +3,7 @@
 ::
 
     file → text (size, UTF-8) → `yaml_tree` (YAML 1.2 core; no tags, aliases, duplicates) → pydantic, strict
-                                                                    ↑ `yaml_units` (100 rpm → 10.47 rad/s) ↵
+                                                                    ↑ `settle` (100 rpm → 10.47 rad/s) ↵
 
 A value with a unit of its own is converted where the reader shows both (``convert``), else refused with what it is.
 Checks across several keys (`DataModel.contradictions`) run as far as the keys that they need are right.

@@ -147,7 +147,7 @@ MAX_DEPTH = 24
 MAX_NODES = 20_000
 
 
-class Broken(Exception):
+class BrokenYaml(Exception):
     """The text can't be read on; ``line`` counts from 1."""
 
     def __init__(self, line: int, message: str) -> None:
@@ -162,7 +162,7 @@ class Tree:
 
     ``lines`` holds the line of each key (of each item in a list), ``value_lines`` the line where its value
     begins, ``refused`` the paths whose value was replaced by None because it already has its problem,
-    ``written`` what stood there where a value was converted (`yaml_units`).
+    ``written`` what stood there where a value was converted (`yaml_loader.settle`).
     """
 
     file: str
@@ -189,7 +189,7 @@ class _Builder:
     def document(self) -> None:
         event = next(self._events)
         if isinstance(event, StreamEndEvent):
-            raise Broken(0, "the file is empty")
+            raise BrokenYaml(0, "the file is empty")
         if isinstance(event, DocumentStartEvent) and (event.version or event.tags):
             self._problem(event, "directives (%YAML, %TAG) are not read; remove the line")
         self._tree.data = self.node(next(self._events), ())
@@ -201,9 +201,9 @@ class _Builder:
     def node(self, event: Event, path: KeyPath) -> Any:
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            raise Broken(_line(event), f"more than {MAX_NODES} entries; this is no file of this program")
+            raise BrokenYaml(_line(event), f"more than {MAX_NODES} entries; this is no file of this program")
         if len(path) > MAX_DEPTH:
-            raise Broken(_line(event), f"nested more than {MAX_DEPTH} deep; this is no file of this program")
+            raise BrokenYaml(_line(event), f"nested more than {MAX_DEPTH} deep; this is no file of this program")
         self._tree.lines.setdefault(path, _line(event))
         self._tree.value_lines[path] = _line(event)
         if isinstance(event, AliasEvent):
@@ -295,7 +295,7 @@ def read_tree(text: str, file: str) -> Tree:
         events = iter(loader.get_event, None)
         assert isinstance(next(events), StreamStartEvent)
         _Builder(events, tree).document()
-    except Broken as broken:
+    except BrokenYaml as broken:
         tree.problems.append(Problem(file, broken.line, broken.message))
     except yaml.MarkedYAMLError as error:
         tree.problems.append(Problem(file, *syntax_error(error)))
@@ -308,7 +308,7 @@ def read_tree(text: str, file: str) -> Tree:
 
 def _check_characters(text: str) -> None:
     if bad := yaml.SafeLoader.NON_PRINTABLE.search(text):
-        raise Broken(text.count("\n", 0, bad.start()) + 1, f"the character U+{ord(bad.group()):04X} is not allowed")
+        raise BrokenYaml(text.count("\n", 0, bad.start()) + 1, f"the character U+{ord(bad.group()):04X} is not allowed")
 
 
 def _line(event: Event) -> int:

@@ -4,9 +4,9 @@ Every way to a stop goes through speed control, from torque mode too: quick stop
 disable operation with ramp (605Bh, 605Ch), fault reaction (605Eh). Ramp by option code: 1 slow-down ramp 6084h,
 2 quick-stop ramp 6085h, 3 torque limit; 5, 6, 7 are 1, 2, 3 and then stay in quick stop active.
 
-A drive may have a quick stop that doesn't brake from the torque modes: it then switches off (`Settings`). A quick stop
-that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps coming: another
-command has to be seen first.
+A drive may have a quick stop that doesn't brake from the torque modes: it then switches off (`ApplicationSettings`). A
+quick stop that the drive began by itself (6007h) is not undone by an enable-operation word that merely keeps coming:
+another command has to be seen first.
 """
 
 
@@ -70,7 +70,7 @@ class State(Enum):
     FAULT = "fault"
 
 
-class Command(Enum):
+class DeviceCommand(Enum):
     """What a controlword's bits 0 to 3 ask for."""
 
     SHUTDOWN = "shutdown"
@@ -91,40 +91,40 @@ STATUS: dict[State, int] = {
     State.FAULT: 0x08,
 }
 
-TRANSITIONS: dict[tuple[State, Command], State] = {
-    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY,                      # 2
-    (State.READY, Command.SWITCH_ON): State.SWITCHED_ON,                            # 3
-    (State.READY, Command.ENABLE): State.SWITCHED_ON,                               # 3, then 4
-    (State.READY, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,                    # 7
-    (State.READY, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,               # 7
-    (State.SWITCHED_ON, Command.ENABLE): State.ENABLED,                             # 4
-    (State.SWITCHED_ON, Command.SHUTDOWN): State.READY,                             # 6
-    (State.SWITCHED_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,              # 10
-    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,         # 10
-    (State.ENABLED, Command.SWITCH_ON): State.SWITCHED_ON,                          # 5
-    (State.ENABLED, Command.SHUTDOWN): State.READY,                                 # 8
-    (State.ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,             # 9
-    (State.ENABLED, Command.QUICK_STOP): State.QUICK_STOP,                          # 11
-    (State.QUICK_STOP, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,          # 12
-    (State.QUICK_STOP, Command.ENABLE): State.ENABLED,                              # 16, see `next_state`
+TRANSITIONS: dict[tuple[State, DeviceCommand], State] = {
+    (State.SWITCH_ON_DISABLED, DeviceCommand.SHUTDOWN): State.READY,                      # 2
+    (State.READY, DeviceCommand.SWITCH_ON): State.SWITCHED_ON,                            # 3
+    (State.READY, DeviceCommand.ENABLE): State.SWITCHED_ON,                               # 3, then 4
+    (State.READY, DeviceCommand.QUICK_STOP): State.SWITCH_ON_DISABLED,                    # 7
+    (State.READY, DeviceCommand.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,               # 7
+    (State.SWITCHED_ON, DeviceCommand.ENABLE): State.ENABLED,                             # 4
+    (State.SWITCHED_ON, DeviceCommand.SHUTDOWN): State.READY,                             # 6
+    (State.SWITCHED_ON, DeviceCommand.QUICK_STOP): State.SWITCH_ON_DISABLED,              # 10
+    (State.SWITCHED_ON, DeviceCommand.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,         # 10
+    (State.ENABLED, DeviceCommand.SWITCH_ON): State.SWITCHED_ON,                          # 5
+    (State.ENABLED, DeviceCommand.SHUTDOWN): State.READY,                                 # 8
+    (State.ENABLED, DeviceCommand.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,             # 9
+    (State.ENABLED, DeviceCommand.QUICK_STOP): State.QUICK_STOP,                          # 11
+    (State.QUICK_STOP, DeviceCommand.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,          # 12
+    (State.QUICK_STOP, DeviceCommand.ENABLE): State.ENABLED,                              # 16, see `next_state`
 }
 """Transitions on command. Those without one: 0 and 1 (start), 12 (quick stop done), 13 and 14 (fault), 15 (reset)."""
 
 
-def decode(controlword: int) -> Command:
+def decode(controlword: int) -> DeviceCommand:
     """The command in bits 0 to 3; every word is one."""
     if not controlword & 0b0010:
-        return Command.DISABLE_VOLTAGE
+        return DeviceCommand.DISABLE_VOLTAGE
     if not controlword & 0b0100:
-        return Command.QUICK_STOP
+        return DeviceCommand.QUICK_STOP
     if not controlword & 0b0001:
-        return Command.SHUTDOWN
-    return Command.ENABLE if controlword & 0b1000 else Command.SWITCH_ON
+        return DeviceCommand.SHUTDOWN
+    return DeviceCommand.ENABLE if controlword & 0b1000 else DeviceCommand.SWITCH_ON
 
 
-def next_state(state: State, command: Command, quick_stop_option: int) -> State:
+def next_state(state: State, command: DeviceCommand, quick_stop_option: int) -> State:
     """Where ``command`` leads; ``state`` itself where it is not allowed. 16 needs an option code 605Ah of 5 to 8."""
-    if state is State.QUICK_STOP and command is Command.ENABLE and quick_stop_option < 5:
+    if state is State.QUICK_STOP and command is DeviceCommand.ENABLE and quick_stop_option < 5:
         return state
     return TRANSITIONS.get((state, command), state)
 
@@ -136,7 +136,7 @@ def fault_reset_edge(before: int, now: int) -> bool:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-class Mode(IntEnum):
+class OperationMode(IntEnum):
     """Modes of operation, 6060h."""
 
     VELOCITY = 2                         # vl: follows its setpoint only where controlword bits 4 to 6 release it
@@ -147,7 +147,7 @@ class Mode(IntEnum):
 
 
 @dataclass(slots=True)
-class Settings:
+class ApplicationSettings:
     """Option codes and rates in SI units; the object dictionary writes them."""
 
     quick_stop_option: int = 2           # 605Ah
@@ -176,14 +176,14 @@ class Application:
 
     def __init__(self, inverter: Inverter) -> None:
         self.inverter = inverter
-        self.settings = Settings()
+        self.settings = ApplicationSettings()
         self.state = State.SWITCH_ON_DISABLED
-        self.mode = Mode.PROFILE_VELOCITY
+        self.mode = OperationMode.PROFILE_VELOCITY
         self.controlword = 0
         self.target_speed_rad_s = 0.0
         self.target_torque_nm = 0.0
         self.torque_offset_nm = 0.0    # 60B2h, of the cyclic synchronous modes
-        self.modes = frozenset(Mode) - {Mode.VELOCITY}        # only a drive whose profile says so has it
+        self.modes = frozenset(OperationMode) - {OperationMode.VELOCITY}    # only a drive whose profile says so has it
         self.warning = False
         self.deaf = False              # scripted: no command moves the state machine
         self.keeps_mode = False        # scripted: 6060h is taken and not followed
@@ -211,10 +211,11 @@ class Application:
             self._enter(State.SWITCH_ON_DISABLED)
             self.on_fault_reset()
         command, was_on = decode(word), self.energised
-        if self._own_stop and command is not Command.ENABLE:
+        if self._own_stop and command is not DeviceCommand.ENABLE:
             self._own_stop = False
-        coasts = self.mode in {Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
-        if command is Command.QUICK_STOP and coasts and self.state is State.ENABLED:
+        coasts = self.mode in {OperationMode.PROFILE_TORQUE,
+                               OperationMode.CYCLIC_TORQUE} and not self.settings.torque_quick_stop
+        if command is DeviceCommand.QUICK_STOP and coasts and self.state is State.ENABLED:
             self._enter(State.SWITCH_ON_DISABLED)
         while self._obey(command):
             pass
@@ -229,7 +230,7 @@ class Application:
             return True
         if code not in self.modes:
             return False
-        self.mode = Mode(code)
+        self.mode = OperationMode(code)
         self.on_event(f"mode {self.mode.value}")
         self._in_window_s = 0.0
         return True
@@ -251,8 +252,8 @@ class Application:
         if option == 1:
             self.fault()
         elif option == 2:
-            self._obey(Command.DISABLE_VOLTAGE)
-        elif option == 3 and self._obey(Command.QUICK_STOP):
+            self._obey(DeviceCommand.DISABLE_VOLTAGE)
+        elif option == 3 and self._obey(DeviceCommand.QUICK_STOP):
             self._own_stop = self.state is State.QUICK_STOP
         self._weighed = None
 
@@ -269,9 +270,10 @@ class Application:
     # -- what it says ------------------------------------------------------------------------------------
 
     @property
-    def first_mode(self) -> Mode:
+    def first_mode(self) -> OperationMode:
         """After power on: profile velocity, or what the drive has instead."""
-        return Mode.PROFILE_VELOCITY if Mode.PROFILE_VELOCITY in self.modes else min(self.modes, default=Mode.VELOCITY)
+        usual = OperationMode.PROFILE_VELOCITY
+        return usual if usual in self.modes else min(self.modes, default=OperationMode.VELOCITY)
 
     @property
     def standstill(self) -> bool:
@@ -306,16 +308,16 @@ class Application:
             reached = self.standstill
         elif self.state is not State.ENABLED:
             reached = False
-        elif self.mode is Mode.PROFILE_VELOCITY:
+        elif self.mode is OperationMode.PROFILE_VELOCITY:
             reached = self._in_window_s > self.settings.window_s
         else:
-            reached = self.mode is Mode.PROFILE_TORQUE and control.ramp_done
+            reached = self.mode is OperationMode.PROFILE_TORQUE and control.ramp_done
         if reached:
             word |= TARGET_REACHED
-        if self.mode is Mode.PROFILE_VELOCITY:
+        if self.mode is OperationMode.PROFILE_VELOCITY:
             specific = self.standstill                                        # speed is zero
         else:
-            cyclic = self.mode in {Mode.CYCLIC_VELOCITY, Mode.CYCLIC_TORQUE}
+            cyclic = self.mode in {OperationMode.CYCLIC_VELOCITY, OperationMode.CYCLIC_TORQUE}
             specific = cyclic and self.state is State.ENABLED and not stopping  # follows the setpoint
         return word | MODE_SPECIFIC if specific else word
 
@@ -343,22 +345,22 @@ class Application:
             tell, self.on_stop = self.on_stop, None
             tell()
         control, settings = self.inverter.control, self.settings
-        control.offset_nm = self.torque_offset_nm if self.mode is Mode.CYCLIC_VELOCITY else 0.0
+        control.offset_nm = self.torque_offset_nm if self.mode is OperationMode.CYCLIC_VELOCITY else 0.0
         if self._after_stop is not None or self.state is State.QUICK_STOP:
             control.stop(self._ramp(self._stop_option))
         elif self.state is not State.ENABLED:
             control.off()
         elif self.controlword & HALT:
             control.stop(self._ramp(settings.halt_option))
-        elif self.mode is Mode.VELOCITY:
+        elif self.mode is OperationMode.VELOCITY:
             released = self.controlword & RELEASED == RELEASED
             target = self.target_speed_rad_s if released else 0.0
             control.speed(target, settings.accel_rad_s2, settings.decel_rad_s2)
-        elif self.mode is Mode.CYCLIC_TORQUE:
+        elif self.mode is OperationMode.CYCLIC_TORQUE:
             control.torque(self.target_torque_nm + self.torque_offset_nm)
-        elif self.mode is Mode.CYCLIC_VELOCITY:
+        elif self.mode is OperationMode.CYCLIC_VELOCITY:
             control.speed(self.target_speed_rad_s)
-        elif self.mode is Mode.PROFILE_TORQUE:
+        elif self.mode is OperationMode.PROFILE_TORQUE:
             control.torque(self.target_torque_nm, settings.torque_slope_nm_s)
         else:
             control.speed(self.target_speed_rad_s, settings.accel_rad_s2, settings.decel_rad_s2)
@@ -369,7 +371,7 @@ class Application:
             return False
         if self.state is not State.ENABLED or self.halted or self._after_stop is not None:
             return True
-        in_speed = self.mode in {Mode.VELOCITY, Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY}
+        in_speed = self.mode in {OperationMode.VELOCITY, OperationMode.PROFILE_VELOCITY, OperationMode.CYCLIC_VELOCITY}
         return in_speed and (self.target_speed_rad_s == 0.0 or self._ramped_down())
 
     def _ramped_down(self) -> bool:
@@ -387,13 +389,13 @@ class Application:
 
     # -- transitions -------------------------------------------------------------------------------------
 
-    def _obey(self, command: Command) -> bool:
+    def _obey(self, command: DeviceCommand) -> bool:
         """Carries out one transition on command; True where the state changed, so that the next may follow."""
-        if self._own_stop and command is Command.ENABLE:
+        if self._own_stop and command is DeviceCommand.ENABLE:
             return False
         target = next_state(self.state, command, self.settings.quick_stop_option)
         if target is self.state:
-            if command is Command.ENABLE and self.state is State.ENABLED:
+            if command is DeviceCommand.ENABLE and self.state is State.ENABLED:
                 self._after_stop = None                  # taken back while slowing down
             return False
         if self.state is State.ENABLED and target in {State.READY, State.SWITCHED_ON}:

@@ -136,7 +136,7 @@ class Cast(Generic[F]):
 
 
 def parse(text: str) -> Scripted:
-    """One fault as the user writes it; its name and value are looked up in `fault_catalogue`. Raises FaultRefused."""
+    """One fault as the user writes it; its name and value are looked up in `Kinds`. Raises FaultRefused."""
     found = _FAULT.fullmatch(text.strip())
     if found is None:
         raise FaultRefused(f"{text!r} is no fault", where="--fault",
@@ -172,7 +172,7 @@ M = TypeVar("M")
 
 
 @dataclass(frozen=True)
-class Kind(Generic[M]):
+class FaultKind(Generic[M]):
     """``value``: the default, '' where the fault takes none. ``make`` may raise ValueError."""
 
     row: int                           # of docs/faults.md; 0: none of its own
@@ -225,7 +225,7 @@ class KnownFault:
     from_start: bool
 
 
-class Kinds(dict[str, Kind[M]]):
+class Kinds(dict[str, FaultKind[M]]):
     """The faults of one bus by their names."""
 
     def make(self, fault: Scripted) -> M:

@@ -19,7 +19,7 @@ import numpy as np
 from sim_bus.params import DriveParams, NoiseParams, RigParams
 from sim_bus.plant import MotorState, build
 from sim_bus.plant import Params as RigidParams
-from sim_bus.plant import State as RigidState
+from sim_bus.plant import ShaftState as RigidState
 from sim_bus.reports import Feedback, Lies
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from sim_bus.reports import LIES
 
 
 @dataclass(frozen=True)
-class Program:
+class CommandLine:
     """One command line, with ``{folder}`` for the folder in which `files` have been written."""
 
     name: str
@@ -150,27 +150,27 @@ _RATE = ("--rate", "20")
 _SPEED_ONLY = frozenset({"torque", "hold"})
 _SHORT = ("--periods", "4")
 
-PROGRAMS: Mapping[str, Program] = {one.name: one for one in (
-    Program("identify", (*_IDENTIFY, *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0),
-    Program("identify, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0,
-            demand=False, modbus=True),
-    Program("identify, speed mode, Modbus", (*_IDENTIFY, "--profile", "schneider/atv320", *_RATE, *_SHORT),
-            104.0, 20.0, 400.0, 10.0, position=False, demand=False, modbus=True, skipped=_SPEED_ONLY,
+PROGRAMS: Mapping[str, CommandLine] = {one.name: one for one in (
+    CommandLine("identify", (*_IDENTIFY, *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0),
+    CommandLine("identify, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT), 104.0, 20.0, 400.0, 10.0,
+                demand=False, modbus=True),
+    CommandLine("identify, speed mode, Modbus", (*_IDENTIFY, "--profile", "schneider/atv320", *_RATE, *_SHORT),
+                104.0, 20.0, 400.0, 10.0, position=False, demand=False, modbus=True, skipped=_SPEED_ONLY,
+                torque_mode=False),
+    CommandLine("identify, no position", (*_IDENTIFY, "--profile", "elmo/gold", *_RATE, *_SHORT),
+                104.0, 20.0, 400.0, 10.0, position=False, demand=False, skipped=_SPEED_ONLY, torque_mode=False),
+    CommandLine("identify, string", (*_IDENTIFY, *_RATE, *_SHORT, *_PLANT, *_RIG), 1500.0, 60.0, 4000.0, 10.0,
+                {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True),
+    CommandLine("identify, string, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT, *_PLANT, *_RIG),
+                1500.0, 60.0, 4000.0, 10.0, {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True,
+                demand=False, modbus=True),
+    CommandLine("impedance", (*_IDENTIFY, "--rate", "50", "--impedance", "offset", "--string-impedance", "20.56",
+                              "--periods", "8"), 104.0, 20.0, 400.0, 10.0, skipped=frozenset({"torque"}),
             torque_mode=False),
-    Program("identify, no position", (*_IDENTIFY, "--profile", "elmo/gold", *_RATE, *_SHORT),
-            104.0, 20.0, 400.0, 10.0, position=False, demand=False, skipped=_SPEED_ONLY, torque_mode=False),
-    Program("identify, string", (*_IDENTIFY, *_RATE, *_SHORT, *_PLANT, *_RIG), 1500.0, 60.0, 4000.0, 10.0,
-            {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True),
-    Program("identify, string, Modbus", (*_IDENTIFY, "--drive", "modbus", *_RATE, *_SHORT, *_PLANT, *_RIG),
-            1500.0, 60.0, 4000.0, 10.0, {"plant.yaml": _STRING_PLANT, "rig.yaml": _STRING_RIG}, string=True,
-            demand=False, modbus=True),
-    Program("impedance", (*_IDENTIFY, "--rate", "50", "--impedance", "offset", "--string-impedance", "20.56",
-                          "--periods", "8"), 104.0, 20.0, 400.0, 10.0, skipped=frozenset({"torque"}),
-            torque_mode=False),
-    Program("prbs, string", (*_IDENTIFY, *_RATE, "--excitation", "prbs", "--max-time", "160", *_PLANT, *_RIG),
-            1500.0, 60.0, 15000.0, 26.0, {"plant.yaml": _BIT_PLANT, "rig.yaml": _BIT_RIG}, string=True),
-    Program("virtual string", ("evaluate", "--simulate", "--virtual-string", "{folder}/string.yaml", "--controller",
-                               "{folder}/tune.json", "--use", "soft", "--rate", "50", *_PLANT, *_RIG),
+    CommandLine("prbs, string", (*_IDENTIFY, *_RATE, "--excitation", "prbs", "--max-time", "160", *_PLANT, *_RIG),
+                1500.0, 60.0, 15000.0, 26.0, {"plant.yaml": _BIT_PLANT, "rig.yaml": _BIT_RIG}, string=True),
+    CommandLine("virtual string", ("evaluate", "--simulate", "--virtual-string", "{folder}/string.yaml", "--controller",
+                                   "{folder}/tune.json", "--use", "soft", "--rate", "50", *_PLANT, *_RIG),
             1500.0, 60.0, 15000.0, 15.0,
             {"plant.yaml": _TOP_PLANT, "rig.yaml": _TOP_RIG, "string.yaml": _VIRTUAL_STRING, "tune.json": _TUNING}),
 )}
@@ -180,14 +180,14 @@ PROGRAMS: Mapping[str, Program] = {one.name: one for one in (
 
 
 @dataclass(frozen=True)
-class Told:
+class LieWithValue:
     """A lie with a value; ``of``: the limit that an amount is a share of."""
 
     name: str
     value: str = ""
     of: str = ""
 
-    def text(self, program: Program) -> str:
+    def text(self, program: CommandLine) -> str:
         """The value as the fault script takes it."""
         if not self.of:
             return self.value
@@ -195,14 +195,14 @@ class Told:
         return f"{float(self.value) * whole:g}"
 
 
-def _each(name: str, *values: str, of: str = "") -> tuple[Told, ...]:
-    return tuple(Told(name, value, of) for value in values)
+def _each(name: str, *values: str, of: str = "") -> tuple[LieWithValue, ...]:
+    return tuple(LieWithValue(name, value, of) for value in values)
 
 
-TOLD: tuple[Told, ...] = (
-    *(Told(f"{signal}-{way}") for signal in ("speed", "torque", "demand", "position", "sensor")
+TOLD: tuple[LieWithValue, ...] = (
+    *(LieWithValue(f"{signal}-{way}") for signal in ("speed", "torque", "demand", "position", "sensor")
       for way in ("lost", "frozen", "sign")),
-    *(Told(f"{signal}-ones") for signal in ("speed", "torque", "demand", "position")),
+    *(LieWithValue(f"{signal}-ones") for signal in ("speed", "torque", "demand", "position")),
     *_each("speed-scale", "0.1", "0.5", "0.9", "2", "10"),
     *_each("torque-scale", "0.1", "0.5", "0.9", "1.1", "2", "10"),
     *_each("demand-scale", "0.5", "2"), *_each("position-scale", "0.5", "2"),
@@ -216,7 +216,7 @@ TOLD: tuple[Told, ...] = (
     *_each("speed-coarse", "0.1", of="speed"), *_each("sensor-coarse", "0.1", of="speed"),
     *_each("torque-coarse", "0.2", of="torque"), *_each("demand-coarse", "0.2", of="torque"),
     *_each("position-coarse", "3"), *_each("sensor-slips", "30%", "80%"),
-    *(Told(name) for name in (
+    *(LieWithValue(name) for name in (
         "speed-swapped", "torque-swapped", "speed-torque-swapped", "status-zero", "status-ones", "status-frozen",
         "feedback-zero", "feedback-ones", "frozen-feedback", "motor-polarity", "quick-stop-inverted")),
     *_each("torque-constant", "0.5", "0.9", "1.1", "2"), *_each("torque-stuck", "-0.3", "0.3", of="torque"),
@@ -234,8 +234,8 @@ class Combination:
     """One run with one lie."""
 
     number: int
-    program: Program
-    told: Told
+    program: CommandLine
+    told: LieWithValue
     moment: str
 
     @property
@@ -306,7 +306,7 @@ class Blind:
         when = f", {' or '.join(sorted(one or 'from the start' for one in self.moments))}" if self.moments else ""
         return " and ".join(name.rstrip("-") for name in self.lies) + load + when
 
-    def holds(self, told: Told, moment: str, program: Program) -> bool:
+    def holds(self, told: LieWithValue, moment: str, program: CommandLine) -> bool:
         """Whether a combination is one of these."""
         known = program.torque_mode or program.demand
         return (
@@ -360,7 +360,7 @@ def unknowable(combination: Combination) -> Unknowable | None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _makes_sense(program: Program, told: Told, moment: str) -> bool:
+def _makes_sense(program: CommandLine, told: LieWithValue, moment: str) -> bool:
     """The drive reports that signal, and the run has that moment."""
     if told.name not in LIES and told.name != "frozen-feedback":
         raise ValueError(f"no lie is called {told.name}")
@@ -379,7 +379,7 @@ def product() -> tuple[Combination, ...]:
 
 def standard() -> Iterator[Combination]:
     """Every lie at every moment once, the programs taking turns."""
-    groups: dict[tuple[Told, str], list[Combination]] = {}
+    groups: dict[tuple[LieWithValue, str], list[Combination]] = {}
     for one in product():
         groups.setdefault((one.told, one.moment), []).append(one)
     for number, group in enumerate(groups.values()):

@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
-from sim_bus.fault_script import Kind, M, factor, seconds, share
+from sim_bus.fault_script import FaultKind, M, factor, seconds, share
 
 
 class Feedback(Enum):
@@ -58,7 +58,7 @@ class Linear(Distortion):
         return self._scale * value + self._offset
 
 
-class Frozen(Distortion):
+class FrozenValue(Distortion):
     """The first value stays."""
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class Frozen(Distortion):
         return self._value
 
 
-class Late(Distortion):
+class DelayedValue(Distortion):
     """Every value comes ``delay_s`` later; until then the first one stays."""
 
     def __init__(self, delay_s: float) -> None:
@@ -384,7 +384,7 @@ class OfStage(Lie):
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportFault:
     """A scripted fault: ``make`` of its value's text may raise ValueError. ``value`` '': it takes none."""
 
     name: str
@@ -397,7 +397,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class _Way:
+class _QuantityDistortion:
     """A way of distorting a quantity."""
 
     name: str
@@ -420,13 +420,15 @@ def _step(text: str) -> float:
 
 
 _WAYS = (
-    _Way("lost", "reads 0", lambda _: Linear(0.0)),
-    _Way("frozen", "stays at its last value", lambda _: Frozen()),
-    _Way("scale", "is multiplied by this", lambda v: Linear(factor(v)), "1.1", "FACTOR"),
-    _Way("sign", "has the opposite sign", lambda _: Linear(-1.0)),
-    _Way("offset", "is larger by this (rad/s, N·m, rad)", lambda v: Linear(1.0, _amount(v)), "1", "AMOUNT"),
-    _Way("delay", "comes so much later", lambda v: Late(seconds(v)), "500ms", "TIME"),
-    _Way("coarse", "has only multiples of this (rad/s, N·m, rad)", lambda v: Coarse(_step(v)), "1", "STEP"),
+    _QuantityDistortion("lost", "reads 0", lambda _: Linear(0.0)),
+    _QuantityDistortion("frozen", "stays at its last value", lambda _: FrozenValue()),
+    _QuantityDistortion("scale", "is multiplied by this", lambda v: Linear(factor(v)), "1.1", "FACTOR"),
+    _QuantityDistortion("sign", "has the opposite sign", lambda _: Linear(-1.0)),
+    _QuantityDistortion("offset", "is larger by this (rad/s, N·m, rad)", lambda v: Linear(1.0, _amount(v)), "1",
+                        "AMOUNT"),
+    _QuantityDistortion("delay", "comes so much later", lambda v: DelayedValue(seconds(v)), "500ms", "TIME"),
+    _QuantityDistortion("coarse", "has only multiples of this (rad/s, N·m, rad)", lambda v: Coarse(_step(v)), "1",
+                        "STEP"),
 )
 _QUANTITIES = {
     Feedback.SPEED: "the reported speed", Feedback.TORQUE: "the reported torque",
@@ -435,22 +437,23 @@ _QUANTITIES = {
 _ALL = tuple(Feedback)
 
 
-def _of_value(signal: Feedback, words: str, way: _Way) -> Row:
-    return Row(f"{signal.value}-{way.name}", f"{words} {way.text}",
-               lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes)
+def _of_value(signal: Feedback, words: str, way: _QuantityDistortion) -> ReportFault:
+    return ReportFault(f"{signal.value}-{way.name}", f"{words} {way.text}",
+                       lambda value: OfValues((signal,), lambda: way.make(value)), way.value, way.takes)
 
 
-def _of_sensor(way: _Way) -> Row:
-    return Row(f"sensor-{way.name}", f"the drive's own speed sensor {way.text}; control and position follow it",
-               lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes)
+def _of_sensor(way: _QuantityDistortion) -> ReportFault:
+    return ReportFault(f"sensor-{way.name}", f"the drive's own speed sensor {way.text}; control and position follow it",
+                       lambda value: OfSensor(lambda: way.make(value)), way.value, way.takes)
 
 
-def _of_words(name: str, summary: str, *words: tuple[Feedback, Callable[[], Word]]) -> Row:
-    return Row(name, summary, lambda _: OfWords(tuple((signal, make()) for signal, make in words)))
+def _of_words(name: str, summary: str, *words: tuple[Feedback, Callable[[], Word]]) -> ReportFault:
+    return ReportFault(name, summary, lambda _: OfWords(tuple((signal, make()) for signal, make in words)))
 
 
-def _of_stage(name: str, summary: str, make: Callable[[str], PowerStage], value: str = "", takes: str = "") -> Row:
-    return Row(name, summary, lambda text: OfStage(make(text)), value, takes)
+def _of_stage(name: str, summary: str, make: Callable[[str], PowerStage], value: str = "",
+              takes: str = "") -> ReportFault:
+    return ReportFault(name, summary, lambda text: OfStage(make(text)), value, takes)
 
 
 _ROWS = (
@@ -458,7 +461,8 @@ _ROWS = (
     *(_of_words(f"{signal.value}-ones", f"{words} has all bits set", (signal, Ones))
       for signal, words in _QUANTITIES.items()),
     *(_of_sensor(way) for way in (
-        *_WAYS, _Way("slips", "stands still for this share of every second", lambda v: Slipping(share(v)), "30%",
+        *_WAYS,
+        _QuantityDistortion("slips", "stands still for this share of every second", lambda v: Slipping(share(v)), "30%",
                      "SHARE"))),
     _of_words("speed-swapped", "the reported speed shows the torque's count",
               (Feedback.SPEED, lambda: Swapped(Feedback.TORQUE))),
@@ -472,10 +476,10 @@ _ROWS = (
     _of_words("feedback-zero", "all reports are 0, the statusword too", *((signal, Zero) for signal in _ALL)),
     _of_words("feedback-ones", "all reports have all bits set, the statusword too",
               *((signal, Ones) for signal in _ALL)),
-    Row("feedback-delay", "speed, torque, demand and position come so much later",
-        lambda v: OfValues(tuple(_QUANTITIES), lambda: Late(seconds(v))), "500ms", "TIME"),
-    Row("encoder-inverted", "the reported speed has the wrong sign",
-        lambda _: OfValues((Feedback.SPEED,), lambda: Linear(-1.0)), row=36),
+    ReportFault("feedback-delay", "speed, torque, demand and position come so much later",
+                lambda v: OfValues(tuple(_QUANTITIES), lambda: DelayedValue(seconds(v))), "500ms", "TIME"),
+    ReportFault("encoder-inverted", "the reported speed has the wrong sign",
+                lambda _: OfValues((Feedback.SPEED,), lambda: Linear(-1.0)), row=36),
     _of_stage("torque-constant", "the true torque is this times what the drive reports and demands",
               lambda v: PowerStage(factor=factor(v)), "0.5", "FACTOR"),
     _of_stage("motor-polarity", "the true torque has the opposite sign of what the drive reports and demands",
@@ -485,13 +489,13 @@ _ROWS = (
     _of_stage("torque-stuck", "the torque stays at this, N·m, while the power stage is on; it is reported as it is",
               lambda v: PowerStage(stuck_nm=_amount(v)), "100", "TORQUE"),
 )
-LIES: dict[str, Row] = {row.name: row for row in _ROWS}
+LIES: dict[str, ReportFault] = {row.name: row for row in _ROWS}
 """Scripted faults by name, for every bus."""
 
 
-def lying(act: Callable[[Lie], M]) -> dict[str, Kind[M]]:
+def lying(act: Callable[[Lie], M]) -> dict[str, FaultKind[M]]:
     """The table as faults of one bus; ``act`` makes one of its faults."""
-    def make(row: Row) -> Callable[[str], M]:
+    def make(row: ReportFault) -> Callable[[str], M]:
         return lambda value: act(row.make(value))
 
-    return {row.name: Kind(row.row, row.summary, make(row), row.value, row.takes) for row in LIES.values()}
+    return {row.name: FaultKind(row.row, row.summary, make(row), row.value, row.takes) for row in LIES.values()}

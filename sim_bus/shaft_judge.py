@@ -45,7 +45,7 @@ _STANDS = ("valid", "valid_wide")
 
 
 @dataclass(frozen=True)
-class Shaft:
+class TrueShaft:
     """The true shaft, from a shaft trace (`sim_bus.trace`)."""
 
     time_s: NDArray[np.float64]
@@ -76,19 +76,19 @@ class Shaft:
 _ON = {"operation enabled", "quick stop active", "fault reaction active"}
 
 
-def read_shaft(path: Path) -> Shaft:
+def read_shaft(path: Path) -> TrueShaft:
     """A trace that is complete."""
     rows = [line.split(",") for line in path.read_text(encoding="utf-8").split("\n")[1:-1]]
     numbers = np.array([[float(cell) for cell in row[:3]] for row in rows]).reshape(-1, 3)
     stops = [float(row[0]) for row in rows if row[4] == "state: quick stop active"]
-    return Shaft(
+    return TrueShaft(
         numbers[:, 0], numbers[:, 1], numbers[:, 2], np.array([row[3] in _ON for row in rows], dtype=np.bool_),
         tuple(float(row[0]) for row in rows if row[4] == DISABLED_BY_HOST), stops[0] if stops else inf,
     )
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ProcessOutcome:
     """How a process ended, and what it said."""
 
     code: int
@@ -105,13 +105,13 @@ class Outcome:
     message: str = ""
 
 
-def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_closed: bool) -> Outcome:
+def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_closed: bool) -> ProcessOutcome:
     """From exit code, JSON document and what stood on stderr."""
     document = document or {}
     words = " ".join(said.split())
     inertia, error = document.get("inertia_kg_m2") or {}, document.get("error") or {}
     seen = re.search(r"at rest \(seen at ([\d.]+) s\)", words)
-    return Outcome(
+    return ProcessOutcome(
         code, "shaft at rest" in words or seen is not None, float(seen[1]) if seen else None, document.get("verdict"),
         inertia.get("low_total", -inf), inertia.get("high_total", inf), _REMOVED in words.lower(), log_closed,
         error.get("message") or document.get("stop") or document.get("reason") or words[-200:],
@@ -119,7 +119,7 @@ def outcome_of(code: int, document: Mapping[str, Any] | None, said: str, *, log_
 
 
 @dataclass(frozen=True)
-class Machine:
+class JudgedMachine:
     """What the judge knows of the rig. ``torque_nm``: what the power stage may put on the shaft."""
 
     inertia_kg_m2: float
@@ -140,7 +140,7 @@ class Judged:
     fastest_rad_s: float
 
 
-def judge(shaft: Shaft, outcome: Outcome, machine: Machine, *, not_asked: frozenset[str] = frozenset(),
+def judge(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine, *, not_asked: frozenset[str] = frozenset(),
           reaction_s: float = REACTION_S) -> Judged:
     """Which rules a run broke."""
     seen: dict[str, str] = {}
@@ -161,7 +161,7 @@ def judge(shaft: Shaft, outcome: Outcome, machine: Machine, *, not_asked: frozen
                   {rule: text for rule, text in seen.items() if rule in not_asked}, used_s, shaft.fastest_rad_s)
 
 
-def _disabled(shaft: Shaft, outcome: Outcome, machine: Machine) -> str:
+def _disabled(shaft: TrueShaft, outcome: ProcessOutcome, machine: JudgedMachine) -> str:
     turning = [(at_s, shaft.speed_at(at_s)) for at_s in shaft.disabled_s]
     turning = [(at_s, speed) for at_s, speed in turning if speed > TURNING_RAD_S]
     if not turning:
@@ -177,7 +177,7 @@ def _disabled(shaft: Shaft, outcome: Outcome, machine: Machine) -> str:
     return f"disabled at {speed:.2f} rad/s, {at_s:.2f} s" + ", accelerating" * accelerated
 
 
-def _at_rest(shaft: Shaft, outcome: Outcome) -> str:
+def _at_rest(shaft: TrueShaft, outcome: ProcessOutcome) -> str:
     if not outcome.at_rest:
         return ""
     moments = [one for one in (outcome.seen_s, *shaft.disabled_s[-1:]) if one is not None]

@@ -38,7 +38,7 @@ def check_trace_path(path: Path, where: str = "trace") -> None:
                         next_step="Name another file")
 
 
-class Trace:
+class ShaftTrace:
     """Writes the file, over an older trace; without a path nothing happens. Raises NotATrace for any other file."""
 
     def __init__(self, path: Path | None) -> None:

@@ -167,7 +167,7 @@ def identify(
     """Identify J and all that comes with it from a recording; the same as ``tdhil replay``, digit for digit.
 
     ``model``: auto, rigid, two-mass, string or paper; ``confidence`` of the intervals; ``tolerance``: the relative
-    half-width that is enough for `valid`. None: as the run had it. Raises UsageError for values that can't be, and
+    half-width that is enough for ``valid``. None: as the run had it. Raises UsageError for values that can't be, and
     NothingRecorded where the run in a log ended before anything moved.
     """
     from tdhil.session import conclude

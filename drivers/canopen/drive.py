@@ -10,7 +10,7 @@ Both RPDOs are synchronous: what is sent before a SYNC acts at it, and the TPDO 
 switch and the torque target that seeds it therefore act together. Where a torque offset is used (60B2h) it goes out in
 RPDO2 with every cycle, as zero from the cycle on in which a stop is asked for. A drive that knows no heartbeat consumer
 is asked by node guarding instead (remote frame 700h+node); what else the frames of a drive hold differently is in
-`shape`.
+`Shape`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from drivers.canopen.bus import PEER_DEAD_S, CanLink
 from drivers.canopen.limits import check_parameters, note_temperature, set_limits
 from drivers.canopen.other_master import ForeignTraffic
 from drivers.canopen.pdo import (
-    Feedback,
+    PdoFeedback,
     Reported,
     Slow,
     Units,
@@ -39,7 +39,7 @@ from drivers.canopen.pdo import (
     shape_of,
 )
 from drivers.canopen.pdo_mapping import slow_syncs
-from drivers.canopen.position import Angle, find_angle
+from drivers.canopen.position import AngleObject, find_angle
 from drivers.canopen.preflight import (
     find_free_node,
     find_torque_offset,
@@ -50,22 +50,32 @@ from drivers.canopen.preflight import (
 from drivers.canopen.quick_stop import Standing
 from drivers.canopen.sdo import Objects
 from drivers.canopen.sdo_feedback import keep_stepping, poll, push
-from drivers.canopen.slow_feedback import Shown, SlowFeedback
+from drivers.canopen.slow_feedback import ModeAndDemand, SlowFeedback
 from drivers.canopen.state_machine import (
     DISABLE_VOLTAGE,
     FAULT_RESET,
     REMOTE,
     State,
-    Wish,
     controlword_towards,
     decode,
 )
-from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, Group, ReadBack, SignOfLife, Watch
+from drivers.canopen.supervision import HEARTBEAT_S, STOPPED, Group, NodeWatch, ReadBack, SignOfLife
 from drivers.clock import RATES_HZ, STALL_CYCLES, STALL_S, Clock, Ticks, how_late
-from drivers.drive import Command, Counters, DriveLimits, FrameTap, Identity, Mode, PositionReading, Preflight, Sample
+from drivers.drive import (
+    Command,
+    Counters,
+    DriveLimits,
+    FrameTap,
+    Identity,
+    Mode,
+    PositionReading,
+    PowerRequest,
+    Preflight,
+    Sample,
+)
 from drivers.errors import CommandRejected, CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import OwnLimits
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from drivers.undo_journal import UndoJournal
 from profiles import CYCLE_ID, MARKER_INDEX, MARKER_STAGE, STAGE_NUMBERS
 from profiles.canopen import CanopenProfile
@@ -128,7 +138,7 @@ class Cia402Drive:
         self._link = CanLink(bus, clock, tap)
         self._objects = Objects(self._link, node)
         self._journal = journal
-        self._watch = Watch(node, clock)
+        self._watch = NodeWatch(node, clock)
         self._foreign_traffic = ForeignTraffic(self._link, self._watch, clock, node=node, number=host_node)
         self._life = SignOfLife(self._link, self._watch, clock, profile, node=node, host_node=host_node)
         if self._life.asks:
@@ -163,10 +173,10 @@ class Cia402Drive:
         self._has_target = self._shape.target_torque
         self._slow = SlowFeedback(Slow(wide=self._wide), 1)
         self._watchdog_s = self._allowed_silence_s = 0.0
-        self._angle: Angle | None = None
+        self._angle: AngleObject | None = None
         self._unwrapped: Unwrapped | None = None
         self._shown_s = clock.now_s()  # when the mode was last displayed
-        self._wish = Wish.OFF
+        self._wish = PowerRequest.OFF
         self._removes_torque = False
         self._in_operation = False     # enabled, and seen enabled since
         self._was_remote, self._local = False, 0       # bit 9: was it set in operation, and for how long not since
@@ -183,9 +193,9 @@ class Cia402Drive:
         self._watch.on_boot_up = self._reported.restarted
         self._cycles = self._missed = self._late = 0
 
-    def _new_feedback(self) -> Feedback:
+    def _new_feedback(self) -> PdoFeedback:
         self._recent: deque[bool] = deque(maxlen=max(THIN_CYCLES, round(THIN_S / self.period_s)))
-        feedback = Feedback(self._shape, None if self.clock.stepped else self.clock.now_s, self.period_s)
+        feedback = PdoFeedback(self._shape, None if self.clock.stepped else self.clock.now_s, self.period_s)
         self._link.handlers[self._tpdo1_id] = feedback.on_tpdo1
         if self.clock.stepped:
             self._link.handlers[CYCLE_ID] = feedback.on_cycle_end
@@ -255,7 +265,7 @@ class Cia402Drive:
         """Set and read back limits, watchdog and PDOs; leaves the node operational, disabled, and watched."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
-        table, objects, scaling = Table(), self._objects, Table()
+        table, objects, scaling = PreflightTable(), self._objects, PreflightTable()
         self._units, rated_nm = find_units(scaling, objects, self._profile, self._rated_torque_nm)
         checks.check_identity(table, self._identity, self._profile)
         if not checks.check_state(table, objects, self._units, self._profile, limits):
@@ -399,25 +409,25 @@ class Cia402Drive:
         if mode not in self._codes:
             raise PreflightRefused(f"the drive has no {mode.value} mode", where="6502h", next_step="Use --mode speed")
         self._foreign_traffic.refuse_shared()
-        self._wish, self._in_operation, self._ever_asked = Wish.ENABLED, False, True
+        self._wish, self._in_operation, self._ever_asked = PowerRequest.ENABLED, False, True
 
     def quick_stop(self) -> None:
         """From the next cycle on quick stop (controlword bit 2); it isn't ended by enabling.
 
         Its option (605Ah) goes before it: somebody may have set that to coasting since it was read back last.
         """
-        if self._wish is Wish.ENABLED and self._fed:
+        if self._wish is PowerRequest.ENABLED and self._fed:
             with suppress(CommunicationLost):      # the cycle that follows says so
                 self._read_back.put_back(QUICK_STOP_OPTION, 0)
-        self._wish = Wish.QUICK_STOP
+        self._wish = PowerRequest.QUICK_STOP
 
     def disable(self) -> None:
         """From the next cycle on towards switch on disabled."""
-        self._wish = Wish.OFF
+        self._wish = PowerRequest.OFF
 
     def remove_torque(self) -> None:
         """From the next cycle on disable voltage (transition 9 or 12); see `drivers.drive.RemovesTorque`."""
-        self._wish, self._removes_torque = Wish.OFF, True
+        self._wish, self._removes_torque = PowerRequest.OFF, True
 
     def reset_fault(self) -> None:
         """One rising edge of controlword bit 7, by SDO, between connect and preflight; only on an operator's word.
@@ -442,10 +452,10 @@ class Cia402Drive:
         speed_raw = encode_speed(command.speed_rad_s, self._units, self._shape.target_speed)
         torque_raw = encode_torque(command.torque_nm, self._units)
         offset_raw = encode_torque_offset(command.torque_offset_nm, self._units)
-        if self._wish is not Wish.ENABLED or command.mode is not Mode.SPEED:
+        if self._wish is not PowerRequest.ENABLED or command.mode is not Mode.SPEED:
             offset_raw = 0
         self._ticks.wait(self._listen_after_all)
-        if self._wish is not Wish.ENABLED and not self._armed:
+        if self._wish is not PowerRequest.ENABLED and not self._armed:
             self._link.try_again()
         # What came since the last cycle is looked at before this cycle's setpoint goes out.
         self._check()
@@ -470,7 +480,7 @@ class Cia402Drive:
         self._read_back.sent(0x6071, torque_raw)
         self._read_back.sent(0x6060, code)
         sample = self._finish(now_s)
-        if self._wish is not Wish.QUICK_STOP:
+        if self._wish is not PowerRequest.QUICK_STOP:
             self._read_back.step(now_s)
         elif (sample.fresh or self._others_drive) and self._standing.undone(
             now_s, self._reported.state, self._others_drive
@@ -514,7 +524,7 @@ class Cia402Drive:
         if not fresh:
             self._missed += 1
         self._count(fresh)
-        if feedback.doubted() and self._wish is not Wish.ENABLED:
+        if feedback.doubted() and self._wish is not PowerRequest.ENABLED:
             fresh = False
         if fresh:
             status, torque_raw, speed_raw = self._layout.unpack(feedback.data)
@@ -541,7 +551,7 @@ class Cia402Drive:
     def _count(self, fresh: bool) -> None:
         """Notice feedback that comes too seldom to guard a shaft by."""
         recent = self._recent
-        if not (self._in_operation and self._wish is Wish.ENABLED):
+        if not (self._in_operation and self._wish is PowerRequest.ENABLED):
             recent.clear()
             return
         recent.append(fresh)
@@ -605,16 +615,16 @@ class Cia402Drive:
         has brought the shaft to rest. Quick stop keeps each of them where it is, and does no harm to one that is still
         in operation because the frame that said otherwise wasn't its own.
         """
-        if self._wish is not Wish.ENABLED:
+        if self._wish is not PowerRequest.ENABLED:
             return
         if self._reported.state is State.OPERATION_ENABLED:
             self._in_operation = True
         elif self._in_operation or self._reported.state in _OUT_OF_OPERATION:
-            self._wish = Wish.QUICK_STOP
+            self._wish = PowerRequest.QUICK_STOP
 
     def _follow_remote(self, status: int) -> None:
         """In operation bit 9 of the statusword stays set, where it has been: else another place has taken control."""
-        if not (self._in_operation and self._wish is Wish.ENABLED):
+        if not (self._in_operation and self._wish is PowerRequest.ENABLED):
             self._local = 0
         elif status & REMOTE:
             self._was_remote, self._local = True, 0
@@ -738,7 +748,7 @@ class Cia402Drive:
             if shown is not None:
                 self._show(shown)
 
-    def _show(self, shown: Shown) -> None:
+    def _show(self, shown: ModeAndDemand) -> None:
         self._shown_s = self.clock.now_s()
         self._reported.take_slow(*shown)
 

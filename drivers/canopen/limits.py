@@ -10,7 +10,7 @@ from drivers.canopen.sdo import Objects, name
 from drivers.drive import Check, DriveLimits, Outcome
 from drivers.errors import ObjectRefused, PreflightRefused
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from profiles import Require
 from profiles.canopen import CanopenProfile, Parameter
 
@@ -21,7 +21,7 @@ from profiles.canopen import CanopenProfile, Parameter
 _UNITS = {"rpm": " rpm", "rpm_s": " rpm/s", "nm": " N·m", "rated": " x rated torque", "s": " s", "hz": " Hz"}
 
 
-class Settings:
+class DriveSettings:
     """The drive's settings by name, in their units, read when they are asked for."""
 
     def __init__(self, objects: Objects, profile: CanopenProfile) -> None:
@@ -48,9 +48,9 @@ class Settings:
         return one.per_lsb * factor
 
 
-def check_parameters(table: Table, objects: Objects, profile: CanopenProfile) -> None:
+def check_parameters(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
     """One row for each setting that must stand by hand; this program writes none of them."""
-    settings = Settings(objects, profile)
+    settings = DriveSettings(objects, profile)
     for one in profile.parameters:
         if one.require is None:
             continue
@@ -105,7 +105,8 @@ _TITLES = {
 
 
 def set_limits(
-    table: Table, objects: Objects, profile: CanopenProfile, limits: DriveLimits, rated_nm: float, own: OwnLimits
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, limits: DriveLimits, rated_nm: float,
+    own: OwnLimits
 ) -> None:
     """The drive's own torque limit, speed limit and quick stop, written and read back; ``own`` says which may be."""
     elsewhere = {one.set_to for one in profile.parameters}
@@ -121,7 +122,7 @@ def set_limits(
         _limit(table, objects, own, SPEED, "speed limit", 0x6080, limits.speed_rad_s, lsb, 32, "rad/s", math.ceil)
     elif "speed_limit" not in elsewhere:
         table.note("speed limit", "the drive has no 6080h: set its own speed limit by hand")
-    settings = Settings(objects, profile)
+    settings = DriveSettings(objects, profile)
     for one in profile.parameters:
         # What a ramp begins at is itself a limit: it has to stand before the ramp is worked out.
         if one.set_to is not None and one.from_speed is None:
@@ -140,7 +141,7 @@ def set_limits(
         )
 
 
-def note_temperature(table: Table, limit_c: float | None) -> None:
+def note_temperature(table: PreflightTable, limit_c: float | None) -> None:
     """CiA 402 has no object for one: nobody watches it here, and a limit would not be held."""
     if limit_c is None:
         text = "nobody watches it: CiA 402 has no object for one; the drive itself reports it by an EMCY"
@@ -151,7 +152,8 @@ def note_temperature(table: Table, limit_c: float | None) -> None:
 
 
 def _set(
-    table: Table, objects: Objects, settings: Settings, one: Parameter, limits: DriveLimits, rated_nm: float,
+    table: PreflightTable, objects: Objects, settings: DriveSettings, one: Parameter, limits: DriveLimits,
+    rated_nm: float,
     own: OwnLimits
 ) -> None:
     """One parameter of the profile that holds a limit; the row's numbers are in the parameter's unit."""
@@ -192,7 +194,7 @@ def _set(
         )
 
 
-def _count(settings: Settings, one: Parameter, limits: DriveLimits, rated_nm: float) -> float:
+def _count(settings: DriveSettings, one: Parameter, limits: DriveLimits, rated_nm: float) -> float:
     """The limit in the parameter's unit, rounded to its counts: torque down, speed and braking up."""
     per_lsb = settings.per_lsb(one)
     nm = 1.0 if one.unit == "nm" else 1.0 / rated_nm
@@ -223,7 +225,7 @@ def _rounded(one: Parameter, value: float, per_lsb: float, rounding: Callable[[f
 
 
 def _limit(
-    table: Table,
+    table: PreflightTable,
     objects: Objects,
     own: OwnLimits,
     limit: str,

@@ -8,8 +8,8 @@ What only this host sends to this drive, and comes in all the same, isn't ours::
     RPDOs            setpoints
     600h + node      SDO requests: a tool reads, which does no harm, or writes
 
-A frame or two by mistake is told (`remarks`); the second of a kind, however late in the run, ends it (`Watch`). A tool
-that writes what drives the shaft (6040h, 6060h, 6071h, 60FFh) again and again is a second master too.
+A frame or two by mistake is told (`remarks`); the second of a kind, however late in the run, ends it (`NodeWatch`). A
+tool that writes what drives the shaft (6040h, 6060h, 6071h, 60FFh) again and again is a second master too.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from functools import partial
 
 from drivers.canopen.bus import CanLink, Handler
 from drivers.canopen.sdo import name
-from drivers.canopen.supervision import Watch
+from drivers.canopen.supervision import NodeWatch
 from drivers.clock import Clock
 from drivers.errors import PreflightRefused
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 
 LISTEN_S = 3.0
 """Before motion the bus is listened to for so long: heartbeats come every second, or sooner."""
@@ -38,7 +38,7 @@ _DOWNLOAD, _EXPEDITED, _SIZED = 1, 0x02, 0x01
 class ForeignTraffic:
     """Listens from the beginning. ``number`` is the host's node number; ``on_write`` is told of written objects."""
 
-    def __init__(self, link: CanLink, watch: Watch, clock: Clock, *, node: int, number: int) -> None:
+    def __init__(self, link: CanLink, watch: NodeWatch, clock: Clock, *, node: int, number: int) -> None:
         self._link = link
         self._watch = watch
         self._clock = clock
@@ -75,7 +75,7 @@ class ForeignTraffic:
 
     # -- the host's number -----------------------------------------------------------------------------------
 
-    def settle_number(self, table: Table) -> int:
+    def settle_number(self, table: PreflightTable) -> int:
         """Listen until it has been long enough, and take a number that nobody bears; the number.
 
         In stepped time none goes by while nothing is sent: there what has come so far decides, and what comes later is

@@ -1,4 +1,4 @@
-"""What the cyclic frames of a drive hold, where it departs from CiA 402's usual objects (see `objects`).
+"""What the cyclic frames of a drive hold, where it departs from CiA 402's usual objects.
 
 - A drive without torque mode is sent 6040h and 60FFh only; where its 6060h can't be mapped, there is no RPDO2.
 - One whose speed mode is vl (2) is told its speed in 6042h and tells it in 6044h, 16 bits each.
@@ -41,7 +41,8 @@ from profiles.canopen import CanopenProfile, ObjectType, Position
 #     RPDO2  6060h modes of operation i8 [| 60B2h torque offset i16 ‰, then in every cycle]
 #     TPDO2  6061h modes of operation display i8 [| 6074h torque demand i16 ‰] [| 6064h angle of the motor i32]
 #
-# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in `shape`.
+# ‰ is of the rated torque (6076h); the velocity's LSB is the profile's. What a drive has differently is in
+# `FrameShape`.
 
 
 RPDO1 = struct.Struct("<Hhi")
@@ -234,7 +235,7 @@ _FEEDBACK_VL = {"i16": Struct("<Hhh"), "i32": Struct("<Hih"), "f32": Struct("<Hf
 
 
 @dataclass(frozen=True)
-class Shape:
+class FrameShape:
     """Which frames a drive is sent and sends."""
 
     target_torque: bool = True                         # is 6071h in RPDO1?
@@ -297,7 +298,7 @@ class Slow:
     wide: bool = False
 
     @classmethod
-    def fitting(cls, demand: bool, position: Position | None, shape: Shape) -> Slow:
+    def fitting(cls, demand: bool, position: Position | None, shape: FrameShape) -> Slow:
         """Return what fits into the frame."""
         whole = cls(demand, position, shape.wide)
         return whole if whole.size + 2 * shape.wide <= PDO_BYTES else cls(False, position, shape.wide)
@@ -328,17 +329,17 @@ class Slow:
         )
 
 
-STANDARD = Shape()
+STANDARD = FrameShape()
 
 
-def shape_of(profile: CanopenProfile) -> Shape:
+def shape_of(profile: CanopenProfile) -> FrameShape:
     """What the profile says of it."""
     torque, target, vl = profile.torque.actual, bool(profile.modes.torque), profile.speed.vl
     feedback = _FEEDBACK_VL if vl else _FEEDBACK
     if torque is None:
-        return Shape(target, profile.modes.mapped, vl=vl, feedback=feedback["i16"])
+        return FrameShape(target, profile.modes.mapped, vl=vl, feedback=feedback["i16"])
     place = (torque.index, torque.sub, _BITS[torque.type])
-    return Shape(target, profile.modes.mapped, place, vl=vl, feedback=feedback[torque.type])
+    return FrameShape(target, profile.modes.mapped, place, vl=vl, feedback=feedback[torque.type])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -347,7 +348,7 @@ def shape_of(profile: CanopenProfile) -> Shape:
 # A drive answers a SYNC once, and in the order in which they came. So there are never more answers than SYNCs, ours
 # and those of others; one more is a frame that was doubled on its way, or sent by somebody else: a duplicate node-ID,
 # a recording that is played back. The first of a cycle is then taken; which of the two is the drive's can't be told,
-# and while a shaft is being stopped none of several counts (`Feedback.doubted`): old frames of a shaft at rest must
+# and while a shaft is being stopped none of several counts (`PdoFeedback.doubted`): old frames of a shaft at rest must
 # not end a stop. One too many that says something else than the first contradicts it.
 #
 # A host or an adapter that was late finds a burst: the answers of all the SYNCs that went out meanwhile. In stepped
@@ -368,10 +369,10 @@ _USUAL_SHARE, _QUICKEST_SHARE = 0.25, 0.5
 _RECENT = 1000
 
 
-class Feedback:
+class PdoFeedback:
     """Of the cycle under way; `begin` starts the next. ``now_s``: control time, in real time; None: nothing is late."""
 
-    def __init__(self, shape: Shape, now_s: Callable[[], float] | None = None, period_s: float = 0.0) -> None:
+    def __init__(self, shape: FrameShape, now_s: Callable[[], float] | None = None, period_s: float = 0.0) -> None:
         self._wide = shape.wide
         self._size = shape.data_size()
         self._now_s = now_s
@@ -387,9 +388,9 @@ class Feedback:
         self._doubtful = False         # an answer was given up in the cycle before: it may come in this one
         self._quickest_s: float | None = None
         self._usual_s = 0.0            # from a SYNC to its answer
-        self._extra = False            # since `believed` was asked last
+        self._extra = False            # since `doubted` was asked last
         self._ends_cycles = False      # a simulated peer says where a cycle ends
-        self.data = _NO_WORD           # statusword, torque, speed; as `Shape.feedback` packs them
+        self.data = _NO_WORD           # statusword, torque, speed; as `FrameShape.feedback` packs them
         self.over = False              # the peer said so of this cycle
         self.arrived = 0               # TPDO1s, all told
         self.second = 0                # of them, a second one of a cycle that the peer had not ended yet

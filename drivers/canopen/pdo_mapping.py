@@ -12,7 +12,7 @@ from drivers.canopen.pdo import (
     STANDARD,
     STATUSWORD,
     TARGET_TORQUE,
-    Shape,
+    FrameShape,
     Slow,
     mapping_entry,
 )
@@ -30,7 +30,7 @@ more."""
 
 
 @dataclass(frozen=True)
-class Pdo:
+class PdoMapping:
     """One PDO as it shall be: ``number`` counts from 1, ``sync_type`` is its transmission type (1 = every SYNC)."""
 
     receive: bool                  # as the drive sees it
@@ -56,23 +56,23 @@ def slow_syncs(period_s: float) -> int:
     return max(1, min(SLOW_SYNCS, round(SLOW_S / period_s)))
 
 
-def layout(carried: Slow, shape: Shape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[Pdo, ...]:
-    """RPDO1, TPDO1, RPDO2 (`Shape.second`), TPDO2 with what is ``carried``; ``slow``: see `slow_syncs`."""
+def layout(carried: Slow, shape: FrameShape = STANDARD, slow: int = SLOW_SYNCS) -> tuple[PdoMapping, ...]:
+    """RPDO1, TPDO1, RPDO2 (`FrameShape.second`), TPDO2 with what is ``carried``; ``slow``: see `slow_syncs`."""
     targets = (TARGET_TORQUE, shape.target_speed) if shape.target_torque else (shape.target_speed,)
     first = (STATUSWORD,) * (not shape.wide) + (shape.torque, shape.actual_speed)
-    modes = (Pdo(True, 2, 1, shape.second),) if shape.second else ()
+    modes = (PdoMapping(True, 2, 1, shape.second),) if shape.second else ()
     return (
-        Pdo(True, 1, 1, (CONTROLWORD, *targets)), Pdo(False, 1, 1, first), *modes,
-        Pdo(False, 2, 1 if shape.wide else slow, carried.mapped),
+        PdoMapping(True, 1, 1, (CONTROLWORD, *targets)), PdoMapping(False, 1, 1, first), *modes,
+        PdoMapping(False, 2, 1 if shape.wide else slow, carried.mapped),
     )
 
 
-def written(pdo: Pdo) -> str:
+def written(pdo: PdoMapping) -> str:
     """The objects in it, as people write them: 6040+6071+60FF."""
     return "+".join(f"{index:04X}:{sub}" if sub else f"{index:04X}" for index, sub, _ in pdo.mapped)
 
 
-def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
+def write_pdo(objects: Objects, node: int, pdo: PdoMapping) -> None:
     """Map one PDO and read it back; `Objects.restore` gives the former mapping back.
 
     Raises ObjectRefused, or PreflightRefused if it doesn't read back.
@@ -99,7 +99,7 @@ def write_pdo(objects: Objects, node: int, pdo: Pdo) -> None:
         )
 
 
-def switch_off_others(objects: Objects, ours: tuple[Pdo, ...]) -> dict[int, int]:
+def switch_off_others(objects: Objects, ours: tuple[PdoMapping, ...]) -> dict[int, int]:
     """Every enabled RPDO that isn't ours is switched off (bit 31 of its COB-ID), and comes back with the rest.
 
     Its number and the COB-ID that it had. Through it another master's setpoints would act beside ours (CiA 301, 1400h).
@@ -123,12 +123,12 @@ def switch_off_others(objects: Objects, ours: tuple[Pdo, ...]) -> dict[int, int]
     return found
 
 
-def _entries(objects: Objects, pdo: Pdo) -> list[int]:
+def _entries(objects: Objects, pdo: PdoMapping) -> list[int]:
     """What is mapped; entries beyond the count are nobody's business."""
     return [objects.read(pdo.mapping, 1 + k) for k in range(objects.read(pdo.mapping, 0))]
 
 
-def _write(objects: Objects, pdo: Pdo, entries: list[int], sync_type: int, cob_id: int) -> None:
+def _write(objects: Objects, pdo: PdoMapping, entries: list[int], sync_type: int, cob_id: int) -> None:
     objects.write(pdo.communication, 1, DISABLED | cob_id, 32)
     objects.write(pdo.mapping, 0, 0, 8)
     for position, entry in enumerate(entries, start=1):

@@ -15,7 +15,7 @@ from drivers.canopen.sdo import Objects, name
 from drivers.clock import Clock
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, ObjectRefused
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from profiles.canopen import CanopenProfile, Position
 
 TURN_RAD = 60.0 * RPM
@@ -31,7 +31,7 @@ _TITLE = "angle of the motor"
 _ASKED = "whether the shaft turns as fast as the drive says is asked of the operator"
 
 
-class Angle(NamedTuple):
+class AngleObject(NamedTuple):
     """An object that counts the angle, and what it counts in."""
 
     entry: Position
@@ -62,7 +62,7 @@ class Angle(NamedTuple):
         return PositionReading(begun_s + half_s, half_s, counts * self.rad_per_count, self.wraps_rad, self.where)
 
 
-def find_angle(table: Table, objects: Objects, profile: CanopenProfile) -> Angle | None:
+def find_angle(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> AngleObject | None:
     """What the profile says, or the standard's objects where the drive has them and a turn is known; else a note."""
     entry = profile.position
     if entry is None:
@@ -76,7 +76,7 @@ def find_angle(table: Table, objects: Objects, profile: CanopenProfile) -> Angle
         table.note(_TITLE, f"not told: {error.what}; {_ASKED}", error.where or where)
         return None
     table.note(_TITLE, f"{counts:.10g} counts a turn, held against the speed in stage 2", where)
-    return Angle(entry, TURN_RAD / counts, where)
+    return AngleObject(entry, TURN_RAD / counts, where)
 
 
 def _standard_counts(objects: Objects) -> float:

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from drivers.canopen.limits import Settings
+from drivers.canopen.limits import DriveSettings
 from drivers.canopen.pdo import (
     MODE_NAMES,
     RPM,
@@ -27,7 +27,7 @@ from drivers.canopen.state_machine import State, decode
 from drivers.drive import DriveLimits, Identity, Mode, Preflight, ReportingFilters
 from drivers.errors import CommunicationLost, ObjectRefused, PreflightRefused
 from drivers.own_limits import SPEED, TORQUE
-from drivers.preflight import Table, agreed_rated_torque, check_nothing_held
+from drivers.preflight import PreflightTable, agreed_rated_torque, check_nothing_held
 from drivers.undo_journal import UndoJournal
 from profiles import MARKER_INDEX, MARKER_TEXT, visible
 from profiles.canopen import CanopenProfile, ReportingFilter
@@ -77,7 +77,7 @@ SI_UNIT_VELOCITY = 0x60A9
 
 
 def find_units(
-    table: Table, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_torque_nm: float | None
 ) -> tuple[Units, float]:
     """Scaling of speed and torque; and the rated torque, N·m."""
     where = name(profile.torque.rated.index, profile.torque.rated.sub)
@@ -103,7 +103,7 @@ def _told(objects: Objects, profile: CanopenProfile) -> float | None:
     return raw * per_lsb if raw > 0.0 else None
 
 
-def speed_unit(table: Table, objects: Objects, profile: CanopenProfile) -> float:
+def speed_unit(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> float:
     """Rad/s for one count. A drive whose unit can be set is believed only where it reads back what it is set to."""
     speed = profile.speed
     if speed.si_unit is not None:
@@ -120,7 +120,7 @@ def speed_unit(table: Table, objects: Objects, profile: CanopenProfile) -> float
     per_lsb = speed.rpm_per_lsb * RPM
     if not (speed.times or speed.over):
         return per_lsb
-    settings = Settings(objects, profile)
+    settings = DriveSettings(objects, profile)
     found = per_lsb
 
     def work() -> tuple[str, bool]:
@@ -156,7 +156,7 @@ STILL_LSB, STILL_RAD_S = 5, 0.05
 """Velocity counts, or speed where a count is less, that are the noise of a shaft at rest."""
 
 
-def check_identity(table: Table, identity: Identity, profile: CanopenProfile) -> None:
+def check_identity(table: PreflightTable, identity: Identity, profile: CanopenProfile) -> None:
     """Vendor, product and revision (1018h) against the profile's; None there = not checked."""
     wanted = profile.identity
     pairs = (
@@ -182,7 +182,7 @@ def check_identity(table: Table, identity: Identity, profile: CanopenProfile) ->
         )
 
 
-def restore_from(table: Table, objects: Objects, journal: UndoJournal, identity: Identity) -> None:
+def restore_from(table: PreflightTable, objects: Objects, journal: UndoJournal, identity: Identity) -> None:
     """What an earlier run has left in the drive, since its host died: given back where it still stands so."""
     given, others = [], []
     for one in journal.opened(identity):
@@ -204,7 +204,7 @@ def restore_from(table: Table, objects: Objects, journal: UndoJournal, identity:
 
 
 def check_state(
-    table: Table, objects: Objects, units: Units, profile: CanopenProfile, limits: DriveLimits
+    table: PreflightTable, objects: Objects, units: Units, profile: CanopenProfile, limits: DriveLimits
 ) -> bool:
     """A drive in fault is refused, and never reset silently; so is one that still brakes after an earlier stop.
 
@@ -245,7 +245,7 @@ def refuse_if_driven(objects: Objects) -> None:
 
 
 def choose_modes(
-    table: Table, objects: Objects, profile: CanopenProfile, with_offset: bool = False
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, with_offset: bool = False
 ) -> dict[Mode, int]:
     """The first of the profile's modes that the drive says it supports (6502h), for speed and for torque.
 
@@ -268,7 +268,7 @@ def choose_modes(
     return chosen
 
 
-def check_mode_display(table: Table, objects: Objects, code: int, wait: Callable[[], None]) -> None:
+def check_mode_display(table: PreflightTable, objects: Objects, code: int, wait: Callable[[], None]) -> None:
     """6060h is written while nothing is enabled; 6061h must follow."""
 
     def work() -> tuple[str, bool]:
@@ -286,7 +286,7 @@ def check_mode_display(table: Table, objects: Objects, code: int, wait: Callable
     )
 
 
-def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> None:
+def clear_targets(table: PreflightTable, objects: Objects, profile: CanopenProfile) -> None:
     """No setpoint of an earlier run may act when the drive is enabled."""
     index, _, bits = VL_TARGET if profile.speed.vl else TARGET_VELOCITY
     targets = ((0x6071, 16), (index, bits)) if profile.modes.torque else ((index, bits),)
@@ -303,7 +303,7 @@ def clear_targets(table: Table, objects: Objects, profile: CanopenProfile) -> No
 
 
 def find_torque_offset(
-    table: Table, objects: Objects, profile: CanopenProfile, rated_nm: float
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, rated_nm: float
 ) -> tuple[tuple[int, int, int], float] | None:
     """Index, subindex and bits of the torque offset, and N·m for one count; None: refused, with the reason."""
     entry = profile.torque_offset
@@ -348,7 +348,7 @@ class AngleComing(NamedTuple):
 
 
 def report(
-    table: Table,
+    table: PreflightTable,
     identity: Identity,
     profile: CanopenProfile,
     objects: Objects,

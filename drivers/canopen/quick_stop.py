@@ -27,15 +27,14 @@ from drivers.canopen.state_machine import (
     QUICK_STOP,
     TARGET_REACHED,
     State,
-    Wish,
     controlword_towards,
     decode,
     power_state,
 )
 from drivers.clock import Clock
-from drivers.drive import Identity, PowerState
+from drivers.drive import Identity, PowerRequest, PowerState
 from drivers.errors import CommunicationLost, DriveFault, ObjectRefused
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from drivers.quick_stop import BLANK_WORDS, Seen
 from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile
@@ -107,7 +106,7 @@ class Standing:
                     done += 1
         return done
 
-    def push(self, state: State, wish: Wish) -> None:
+    def push(self, state: State, wish: PowerRequest) -> None:
         """Towards ``wish`` by SDO, one request a cycle: the controlword, and zero setpoints in between.
 
         A torque offset goes first, whatever the state.
@@ -116,9 +115,9 @@ class Standing:
             self._turn = 1
             self._write(_EXPEDITED_2, self.offset[0], 0, self.offset[1])
             return
-        if wish is Wish.QUICK_STOP and state in _LEFT_ALONE:
+        if wish is PowerRequest.QUICK_STOP and state in _LEFT_ALONE:
             return
-        if wish is Wish.OFF and state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
+        if wish is PowerRequest.OFF and state in (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY):
             return
         self._turn += 1
         if self._turn % 4 == 0:
@@ -197,7 +196,7 @@ class Cia402Target:
         raw = self._objects.read(self._speed_at, signed=True)
         state = decode(status)
         if self._rad_s_per_lsb is None:                # where the drive's own settings scale it, from there
-            self._rad_s_per_lsb = speed_unit(Table(), self._objects, self._profile)
+            self._rad_s_per_lsb = speed_unit(PreflightTable(), self._objects, self._profile)
         speed = raw * self._rad_s_per_lsb
         enabled = power_state(state) is PowerState.ENABLED
         return Seen(

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from drivers.canopen.pdo import VELOCITY_ACTUAL, VL_ACTUAL, decode_value
 from drivers.canopen.sdo import Objects, name
-from drivers.canopen.state_machine import State, Wish, controlword_towards
+from drivers.canopen.state_machine import State, controlword_towards
+from drivers.drive import PowerRequest
 from drivers.errors import CommunicationLost, ObjectRefused
 from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, ObjectType
@@ -22,8 +23,8 @@ WATCHDOG_SHARE = 0.15
 """An answer is waited for no longer than this share of the watchdog's time, which goes on being fed in between."""
 _I16: ObjectType = "i16"
 _AT_REST = {
-    Wish.QUICK_STOP: tuple(state for state in State if state not in (State.OPERATION_ENABLED, State.UNKNOWN)),
-    Wish.OFF: (State.NOT_READY, State.SWITCH_ON_DISABLED, State.FAULT_REACTION_ACTIVE, State.FAULT),
+    PowerRequest.QUICK_STOP: tuple(state for state in State if state not in (State.OPERATION_ENABLED, State.UNKNOWN)),
+    PowerRequest.OFF: (State.NOT_READY, State.SWITCH_ON_DISABLED, State.FAULT_REACTION_ACTIVE, State.FAULT),
 }
 """States in which a drive that was asked for this needs no other word."""
 
@@ -70,13 +71,13 @@ def keep_stepping(objects: Objects, profile: CanopenProfile, period_s: float) ->
 
 
 def push(
-    objects: Objects, state: State, wish: Wish, watchdog_s: float, offset: tuple[int, int, int] | None = None
+    objects: Objects, state: State, wish: PowerRequest, watchdog_s: float, offset: tuple[int, int, int] | None = None
 ) -> None:
     """The controlword towards ``wish`` by SDO, where the drive isn't there; never one that enables.
 
     A torque ``offset`` that is in use is taken away first.
     """
-    if wish is Wish.ENABLED or state in _AT_REST[wish]:
+    if wish is PowerRequest.ENABLED or state in _AT_REST[wish]:
         return
     with objects.answered_within(min(ANSWER_S, WATCHDOG_SHARE * watchdog_s) if watchdog_s else ANSWER_S):
         try:

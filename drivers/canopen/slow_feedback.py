@@ -16,7 +16,7 @@ FORGOTTEN = 3
 """After so many that were due and didn't come nobody waits for the next: it is not known when that would be."""
 
 
-class Shown(NamedTuple):
+class ModeAndDemand(NamedTuple):
     """Mode display 6061h, and the torque demand 6074h in counts where it is carried."""
 
     code: int
@@ -33,7 +33,7 @@ class SlowFeedback:
         self._came_at: int | None = None           # the SYNC that the last one belongs to
         self._counts: float | None = None          # of the angle, of this cycle's SYNC
         self._waited_for = False
-        self._held: Shown | None = None
+        self._held: ModeAndDemand | None = None
 
     def begin(self) -> None:
         """Note that a SYNC is about to go out."""
@@ -52,7 +52,7 @@ class SlowFeedback:
         """From now on this cycle waits for nothing else; what comes is shown with the next cycle."""
         self._waited_for = True
 
-    def take(self, data: bytes, behind_feedback: bool) -> Shown | None:
+    def take(self, data: bytes, behind_feedback: bool) -> ModeAndDemand | None:
         """Take one frame, without a wide shape's statusword; what is to be shown at once.
 
         ``behind_feedback``: this cycle's TPDO1 has come, so it is of the same SYNC; otherwise it is of the one before.
@@ -61,13 +61,13 @@ class SlowFeedback:
         self._came_at = self._syncs if behind_feedback else self._syncs - 1
         if behind_feedback:
             self._counts = counts
-        shown = Shown(code, demand)
+        shown = ModeAndDemand(code, demand)
         if self._waited_for:
             self._held = shown
             return None
         return shown
 
-    def end(self) -> Shown | None:
+    def end(self) -> ModeAndDemand | None:
         """End the cycle; what came while it was waited for, and is to be shown now."""
         shown, self._held = self._held, None
         self._waited_for = False

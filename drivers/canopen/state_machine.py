@@ -12,7 +12,7 @@ Source: CiA 402-2, power drive state machine; objects 6040h (controlword) and 60
 
 from enum import Enum
 
-from drivers.drive import PowerState
+from drivers.drive import PowerRequest, PowerState
 
 
 class State(Enum):
@@ -27,14 +27,6 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = "fault reaction active"
     FAULT = "fault"
     UNKNOWN = "no valid state"     # no pattern of the standard's: a gateway without its drive, or a dead TPDO
-
-
-class Wish(Enum):
-    """Where the caller wants the drive to be."""
-
-    OFF = "off"
-    ENABLED = "enabled"
-    QUICK_STOP = "quick stop"
 
 
 # Statusword bits (6041h).
@@ -112,7 +104,7 @@ _TOWARDS_OFF = {
 }
 
 
-def controlword_towards(state: State, wish: Wish) -> int:
+def controlword_towards(state: State, wish: PowerRequest) -> int:
     """The controlword that brings the drive one transition nearer to the wish.
 
     A fault is never reset here, and a quick stop never ended by enabling again: both must be asked for, and
@@ -124,8 +116,8 @@ def controlword_towards(state: State, wish: Wish) -> int:
     """
     if state is State.UNKNOWN:
         return QUICK_STOP
-    if wish is Wish.ENABLED:
+    if wish is PowerRequest.ENABLED:
         return _TOWARDS_ENABLED.get(state, QUICK_STOP if state is State.QUICK_STOP_ACTIVE else DISABLE_VOLTAGE)
-    if wish is Wish.QUICK_STOP:
+    if wish is PowerRequest.QUICK_STOP:
         return QUICK_STOP
     return _TOWARDS_OFF.get(state, DISABLE_VOLTAGE)

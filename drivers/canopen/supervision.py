@@ -79,7 +79,7 @@ def emcy_text(code: int) -> str:
     return f"EMCY {code:04X}h, {meaning}"
 
 
-class Watch:
+class NodeWatch:
     """Follows one node. ``allowed_silence_s`` is how long its heartbeat may fail to come (0 = not watched).
 
     Where the drive is guarded instead, `Guarding` hands on its answers as if they were heartbeats.
@@ -278,13 +278,13 @@ class Watch:
 #
 # The questions are asked by the control loop itself, so that a frozen or dead host falls silent and the drive acts.
 # An answer that doesn't toggle is no answer: it is an old one come again, or another station's. The state goes to
-# `Watch`, which knows what it may be and how long it may fail to come.
+# `NodeWatch`, which knows what it may be and how long it may fail to come.
 
 
 class Guarding:
     """``ask`` puts the remote frame on the bus."""
 
-    def __init__(self, watch: Watch, ask: Callable[[], None]) -> None:
+    def __init__(self, watch: NodeWatch, ask: Callable[[], None]) -> None:
         self._watch = watch
         self._ask = ask
         self._toggle: int | None = None
@@ -358,7 +358,7 @@ class Group(Enum):
 
 
 @dataclass(eq=False)
-class _Watched:
+class _WatchedObject:
     """``data``: what must stand there; None: one of the setpoints sent last."""
 
     index: int
@@ -373,17 +373,17 @@ class _Watched:
 class ReadBack:
     """``ask`` puts an upload request on the bus; `step` is called once a cycle, `take` for each SDO answer."""
 
-    def __init__(self, watch: Watch, ask: Callable[[bytes], None], tell: Callable[[str], None], node: int) -> None:
+    def __init__(self, watch: NodeWatch, ask: Callable[[bytes], None], tell: Callable[[str], None], node: int) -> None:
         self._watch = watch
         self._ask = ask
         self._tell = tell
         self._node = node
-        self._groups: dict[Group, list[_Watched]] = {group: [] for group in Group}
+        self._groups: dict[Group, list[_WatchedObject]] = {group: [] for group in Group}
         self.on_changed: Callable[[int, int], None] = lambda index, sub: None
         """Index and sub-index of what was changed by somebody else, before that is raised."""
-        self._next: deque[_Watched] = deque()      # before their turn
+        self._next: deque[_WatchedObject] = deque()      # before their turn
         self._turn = 0
-        self._asked: _Watched | None = None
+        self._asked: _WatchedObject | None = None
         self._asked_s = 0.0
         self._due_s: float | None = None
         self._silent = 0
@@ -400,7 +400,7 @@ class ReadBack:
 
     def watch(self, title: str, index: int, sub: int, data: bytes, group: Group) -> None:
         """One object that must stay as it is."""
-        self._groups[group].append(_Watched(index, sub, title, data))
+        self._groups[group].append(_WatchedObject(index, sub, title, data))
 
     def stands(self, index: int, sub: int, data: bytes) -> None:
         """Note that this host has written a watched object itself."""
@@ -411,7 +411,7 @@ class ReadBack:
     def watch_setpoint(self, title: str, index: int) -> None:
         """One object that must show what was sent (`sent`)."""
         self._sent[index] = deque(maxlen=REMEMBERED)
-        self._groups[Group.REST].append(_Watched(index, 0, title, None))
+        self._groups[Group.REST].append(_WatchedObject(index, 0, title, None))
 
     def sent(self, index: int, value: int) -> None:
         """A setpoint went out in this cycle."""
@@ -464,7 +464,7 @@ class ReadBack:
             self._asked, self._silent, self._answered = None, 0, True
             self._compare(one, data[4 : 8 - (data[0] >> 2 & 3 if data[0] & 1 else 0)])
 
-    def _choose(self) -> _Watched:
+    def _choose(self) -> _WatchedObject:
         if self._next:
             return self._next.popleft()
         groups = [group for group in self._groups.values() if group]
@@ -472,10 +472,10 @@ class ReadBack:
         group = groups[turn % len(groups)]
         return group[turn // len(groups) % len(group)]
 
-    def _all(self) -> list[_Watched]:
+    def _all(self) -> list[_WatchedObject]:
         return [one for group in self._groups.values() for one in group]
 
-    def _compare(self, one: _Watched, found: bytes) -> None:
+    def _compare(self, one: _WatchedObject, found: bytes) -> None:
         if one.data is not None:
             good = found[: len(one.data)] == one.data
         else:
@@ -521,13 +521,13 @@ class ReadBack:
                 "Is a gateway between, or the drive overloaded? Look at the log's frames", kind="read back",
             )
 
-    def _drop(self, one: _Watched) -> None:
+    def _drop(self, one: _WatchedObject) -> None:
         for those in self._groups.values():
             if one in those:
                 those.remove(one)
 
     @staticmethod
-    def _head(one: _Watched) -> bytes:
+    def _head(one: _WatchedObject) -> bytes:
         return one.index.to_bytes(2, "little") + bytes((one.sub,))
 
 
@@ -552,7 +552,7 @@ class SignOfLife:
     """Of ``host_node`` towards ``node``; the answers of a guarded drive are taken from the link too."""
 
     def __init__(
-        self, link: CanLink, watch: Watch, clock: Clock, profile: CanopenProfile, *, node: int, host_node: int
+        self, link: CanLink, watch: NodeWatch, clock: Clock, profile: CanopenProfile, *, node: int, host_node: int
     ) -> None:
         self._link = link
         self._clock = clock

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from drivers.canopen.pdo import Shape, Slow, consumer_heartbeat
+from drivers.canopen.pdo import FrameShape, Slow, consumer_heartbeat
 from drivers.canopen.pdo_mapping import layout, slow_syncs, switch_off_others, write_pdo, written
 from drivers.canopen.sdo import Objects, name
 from drivers.errors import ObjectRefused, PreflightRefused
-from drivers.preflight import DIES, Table, settle
+from drivers.preflight import DIES, PreflightTable, settle
 from profiles import MARKER_INDEX
 from profiles.canopen import CanopenProfile, Position, Watchdog
 
@@ -19,7 +19,7 @@ LEAST_CYCLES = 5
 
 
 def map_pdos(
-    table: Table, objects: Objects, node: int, profile: CanopenProfile, shape: Shape, period_s: float,
+    table: PreflightTable, objects: Objects, node: int, profile: CanopenProfile, shape: FrameShape, period_s: float,
     position: Position | None,
 ) -> tuple[Slow, dict[int, int]]:
     """Map both pairs of PDOs, and switch off what other RPDOs the drive has.
@@ -96,7 +96,7 @@ def set_slow_syncs(objects: Objects, period_s: float) -> bytes:
 
 
 def set_timing(
-    table: Table, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
+    table: PreflightTable, objects: Objects, profile: CanopenProfile, period_s: float, heartbeat_s: float, stepped: bool
 ) -> bool:
     """Cycle period 1006h, stepped time of a simulated peer, heartbeat 1017h; whether the drive produces one."""
     period_us = round(period_s * 1e6)
@@ -126,7 +126,7 @@ def set_timing(
 
 
 def arm_watchdog(
-    table: Table,
+    table: PreflightTable,
     objects: Objects,
     entry: Watchdog,
     *,
@@ -143,7 +143,7 @@ def arm_watchdog(
     read-back; ``answered`` waits for the drive's answer to a question. 0 where it is not armed: refused, unless
     ``accept_none`` and it is known to be off.
     """
-    tried = Table()
+    tried = PreflightTable()
     if entry.kind == "none":
         tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
         settle(table, tried, accept_none, lambda: True)
@@ -172,7 +172,7 @@ def arm_watchdog(
 
 
 def _arm_heartbeat(
-    table: Table, objects: Objects, entry: Watchdog, host_node: int, time_ms: int, beat: Callable[[], None]
+    table: PreflightTable, objects: Objects, entry: Watchdog, host_node: int, time_ms: int, beat: Callable[[], None]
 ) -> float:
     """The consumer heartbeat time, 1016h in the standard: the drive acts where the host's heartbeat isn't heard."""
     value = consumer_heartbeat(host_node, time_ms)
@@ -190,7 +190,8 @@ def _arm_heartbeat(
 
 
 def _arm_guarding(
-    table: Table, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None], answered: Callable[[], bool]
+    table: PreflightTable, objects: Objects, time_ms: int, factor: int, ask: Callable[[], None],
+    answered: Callable[[], bool]
 ) -> float:
     """100Ch guard time in ms x 100Dh factor = life time (CiA 301): the drive acts where it isn't asked for so long."""
     factor = min(factor, time_ms)

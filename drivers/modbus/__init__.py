@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
-    from drivers.modbus.access import Access as Access
+    from drivers.modbus.access import RegisterAccess as RegisterAccess
     from drivers.modbus.codec import from_words as from_words, settle as settle
     from drivers.modbus.drive import ModbusDrive as ModbusDrive
     from drivers.modbus.identity import read_marker as read_marker

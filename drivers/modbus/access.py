@@ -22,7 +22,7 @@ BUSY_TRIES, BUSY_PAUSE_S = 5, 0.05
 """Of a request that the drive put off with exception 6, and the pause in between."""
 
 
-class Answer(NamedTuple):
+class RegisterAnswer(NamedTuple):
     """The registers that a request brought, and when it was under way (control time)."""
 
     words: tuple[int, ...]
@@ -30,7 +30,7 @@ class Answer(NamedTuple):
     received_s: float
 
 
-class Access:
+class RegisterAccess:
     """Reads and writes registers of one unit; ``tap`` sees every PDU.
 
     Raises RegisterRefused for an exception reply and CommunicationLost (NoReply, BadReply, LinkLost) otherwise.
@@ -52,7 +52,7 @@ class Access:
         """Control time."""
         return self._link.clock
 
-    def once(self, pdu: bytes, timeout_s: float, where: str = "") -> Answer:
+    def once(self, pdu: bytes, timeout_s: float, where: str = "") -> RegisterAnswer:
         """One transaction, as it comes."""
         if self._tap is not None:
             self._tap(RawFrame(self.clock.now_s(), True, self._unit, pdu))
@@ -60,7 +60,7 @@ class Access:
         reply = self._link.transact(self._unit, pdu, timeout_s)
         if self._tap is not None:
             self._tap(RawFrame(reply.received_s, False, self._unit, reply.pdu))
-        return Answer(requests.words_of(pdu, reply.pdu, where), reply.sent_s, reply.received_s)
+        return RegisterAnswer(requests.words_of(pdu, reply.pdu, where), reply.sent_s, reply.received_s)
 
     def ask(self, pdu: bytes, where: str = "") -> tuple[int, ...]:
         """A request before motion: silence and garbage are asked again, and so is a drive that is busy."""

@@ -1,7 +1,7 @@
 """The pure register codec: whole numbers in 16-bit registers, and counts of a unit as whole numbers.
 
-A 32-bit number takes two registers; which half comes first is the drive's choice (`Line.word_order`). Within a
-register the high byte comes first on the wire (Modbus Application Protocol, section 4.2); `requests` does that.
+A 32-bit number takes two registers; which half comes first is the drive's choice (`BusLine.word_order`). Within a
+register the high byte comes first on the wire (Modbus Application Protocol, section 4.2); `access.requests` does that.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from drivers.errors import CommandRejected
-from profiles.modbus import Echo, ModbusProfile, Parameter, Register, Signal
+from profiles.modbus import CyclicSignal, Echo, ModbusProfile, Parameter, Register
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What one count means, in SI at the motor shaft: parameters' values first, then every signal's scale. Pure.
@@ -59,7 +59,7 @@ def settle(profile: ModbusProfile, counts: Mapping[str, int], given: Mapping[str
     return values
 
 
-def si_per_count(signal: Signal | Echo, values: Mapping[str, float], rated_nm: float) -> float:
+def si_per_count(signal: CyclicSignal | Echo, values: Mapping[str, float], rated_nm: float) -> float:
     """Rad/s or N·m for one count. Raises KeyError if a parameter that it needs isn't known."""
     unit = {"rpm": RPM, "nm": 1.0, "rated": rated_nm}[signal.unit]
     factor = values[signal.times] if signal.times is not None else 1.0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from drivers.drive import Command, Mode
 from drivers.errors import CommandRejected, PreflightRefused
 from drivers.modbus import pdu
-from drivers.modbus.access import Access, Answer
+from drivers.modbus.access import RegisterAccess, RegisterAnswer
 from drivers.modbus.codec import Scales, WordOrder, from_words, register_name, to_counts, to_words
 from drivers.modbus.pdu import BUSY, NoisyReply, RegisterRefused
 from profiles.modbus import ModbusProfile, Position, Register
@@ -31,7 +31,7 @@ Words = Mapping[tuple[str, int], int]
 """Registers by (table, address)."""
 
 
-class Span(NamedTuple):
+class RegisterSpan(NamedTuple):
     """Neighbouring registers of one table."""
 
     table: str
@@ -48,8 +48,8 @@ class Transaction(NamedTuple):
     """One request and its reply: a write, a read, or both."""
 
     function: int
-    write: Span | None
-    read: Span | None
+    write: RegisterSpan | None
+    read: RegisterSpan | None
 
     def request(self, image: Mapping[int, int]) -> bytes:
         """The PDU; ``image`` has the word of every holding register that is written."""
@@ -100,10 +100,10 @@ def plan_cycle(profile: ModbusProfile, *, position: bool = False) -> CyclePlan:
     if 16 not in cycle.functions:
         most_written = min(most_written, pdu.MOST_WRITTEN_WITH_READ) if 23 in cycle.functions else 1
 
-    def write_spans(registers: Sequence[Register]) -> list[Span]:
+    def write_spans(registers: Sequence[Register]) -> list[RegisterSpan]:
         return spans(registers, 0, most_written)
 
-    def read_spans(registers: Sequence[Register]) -> list[Span]:
+    def read_spans(registers: Sequence[Register]) -> list[RegisterSpan]:
         return spans(registers, cycle.largest_gap, cycle.largest_read)
 
     if mode_writes and len(write_spans([*written, *mode_writes])) == len(write_spans(written)):
@@ -146,9 +146,9 @@ def only_reads(transactions: Sequence[Transaction], functions: frozenset[int]) -
     return tuple(found)
 
 
-def spans(registers: Iterable[Register], gap: int, most: int) -> list[Span]:
+def spans(registers: Iterable[Register], gap: int, most: int) -> list[RegisterSpan]:
     """Registers gathered into as few spans as possible, none cut in two. Raises PreflightRefused if one is too long."""
-    found: list[Span] = []
+    found: list[RegisterSpan] = []
     for register in sorted(registers, key=lambda one: (one.table, one.address, one.count)):
         if register.count > most:
             raise PreflightRefused(
@@ -161,13 +161,14 @@ def spans(registers: Iterable[Register], gap: int, most: int) -> list[Span]:
             last = found[-1]
             near = register.table == last.table and register.address <= last.address + last.length + gap
             if near and end - last.address <= most:
-                found[-1] = Span(last.table, last.address, max(last.length, end - last.address))
+                found[-1] = RegisterSpan(last.table, last.address, max(last.length, end - last.address))
                 continue
-        found.append(Span(register.table, register.address, register.count))
+        found.append(RegisterSpan(register.table, register.address, register.count))
     return found
 
 
-def _pair(writes: Sequence[Span], reads: Sequence[Span], functions: frozenset[int]) -> tuple[Transaction, ...]:
+def _pair(writes: Sequence[RegisterSpan], reads: Sequence[RegisterSpan],
+          functions: frozenset[int]) -> tuple[Transaction, ...]:
     """One transaction for a write and a read where function 23 is known; the order of the writes is kept."""
     pairable = [span for span in reads if span.table == "holding"] if pdu.READ_WRITE in functions else []
     fit = [span.length <= pdu.MOST_WRITTEN_WITH_READ for span in writes]
@@ -183,7 +184,7 @@ def _pair(writes: Sequence[Span], reads: Sequence[Span], functions: frozenset[in
     )
 
 
-def _write(span: Span, functions: frozenset[int]) -> Transaction:
+def _write(span: RegisterSpan, functions: frozenset[int]) -> Transaction:
     if span.length == 1 and pdu.WRITE_ONE in functions:
         return Transaction(pdu.WRITE_ONE, span, None)
     if pdu.WRITE_MANY in functions:
@@ -194,14 +195,14 @@ def _write(span: Span, functions: frozenset[int]) -> Transaction:
     raise _unable("written", span)
 
 
-def _read(span: Span, functions: frozenset[int]) -> Transaction:
+def _read(span: RegisterSpan, functions: frozenset[int]) -> Transaction:
     function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
     if function not in functions:
         raise _unable("read", span)
     return Transaction(function, None, span)
 
 
-def _unable(verb: str, span: Span) -> PreflightRefused:
+def _unable(verb: str, span: RegisterSpan) -> PreflightRefused:
     return PreflightRefused(
         f"register {span.address} can't be {verb}: the profile names no function for it",
         where="profile, cycle.functions",
@@ -227,7 +228,7 @@ class Round(NamedTuple):
 
 
 def go_round(
-    access: Access,
+    access: RegisterAccess,
     transactions: Sequence[Transaction],
     image: Mapping[int, int],
     timeout_s: float,
@@ -256,7 +257,7 @@ def go_round(
     return Round(words, sent_s or 0.0, received_s, longest_s)
 
 
-def _patiently(access: Access, pdu: bytes, timeout_s: float, what: str, again_until_s: float) -> Answer:
+def _patiently(access: RegisterAccess, pdu: bytes, timeout_s: float, what: str, again_until_s: float) -> RegisterAnswer:
     tries, noisy = 1, False
     while True:
         try:
@@ -283,7 +284,7 @@ class Setpoints(NamedTuple):
     reverse: bool
 
 
-class Feedback(NamedTuple):
+class CycleFeedback(NamedTuple):
     """What a cycle read, in SI at the motor shaft. ``mode_word``: None where the display wasn't read along."""
 
     status: int
@@ -344,11 +345,11 @@ class Codec:
         image[self._cycle.control.register_.address] = controlword
         return image
 
-    def feedback(self, words: Words) -> Feedback:
+    def feedback(self, words: Words) -> CycleFeedback:
         """What was read. Raises KeyError if a register is missing."""
         demand = self._cycle.torque_demand if self._has_demand else None
         display, position = self._modes.display, self._position
-        return Feedback(
+        return CycleFeedback(
             self._number(words, self._cycle.status.register_) & 0xFFFF,
             self._number(words, self._cycle.speed.register_) * self.scales.speed,
             self._number(words, self._cycle.torque.register_) * self.scales.torque,

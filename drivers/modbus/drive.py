@@ -26,17 +26,18 @@ from drivers.drive import (
     Mode,
     Outcome,
     PositionReading,
+    PowerRequest,
     PowerState,
     Preflight,
     Sample,
 )
 from drivers.errors import CommandRejected, CommunicationLost, DriveFault, PreflightRefused
 from drivers.modbus import preflight as checks
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import Scales, register_name
 from drivers.modbus.cycle import (
     Codec,
-    Feedback,
+    CycleFeedback,
     Round,
     Setpoints,
     Transaction,
@@ -50,13 +51,20 @@ from drivers.modbus.link import Link, late_replies
 from drivers.modbus.other_master import OtherMaster
 from drivers.modbus.parameters import find_filters, own_speed_limits, set_limits
 from drivers.modbus.pdu import BUSY, CycleRefused, LinkLost, RegisterRefused
-from drivers.modbus.position import Angle, find_angle
+from drivers.modbus.position import AngleRegister, find_angle
 from drivers.modbus.preflight import check_setpoints, clear_setpoints
-from drivers.modbus.state_machine import Standstill, Wish, controlword_towards, decode, decode_after, power_state, seen
+from drivers.modbus.state_machine import (
+    ZeroSpeed,
+    controlword_towards,
+    decode,
+    decode_after,
+    power_state,
+    seen,
+)
 from drivers.modbus.temperature import Heat
 from drivers.modbus.watchdog import arm_watchdog, check_who_feeds, measure_pace
 from drivers.own_limits import SPEED, TORQUE, OwnLimits
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from profiles.modbus import ModbusProfile, Register, StatusState
 
 REPEAT_MODE_CYCLES = 25
@@ -81,7 +89,7 @@ PRESS_EVERY_S = 0.1
 """How often the drive's own speed limit is lowered against another master."""
 
 _NO_SETPOINTS = Setpoints(0, 0, False)
-_NOTHING_YET = Feedback(0, 0.0, 0.0, None, None)
+_NOTHING_YET = CycleFeedback(0, 0.0, 0.0, None, None)
 _DRIVEN = (PowerState.ENABLED, PowerState.QUICK_STOP)
 _MAY_DRIVE = (PowerState.ENABLED, PowerState.UNKNOWN)
 _NOT_DRIVEN = (PowerState.OFF, PowerState.FAULT)
@@ -111,7 +119,7 @@ class ModbusDrive:
         self.period_s = round(1e6 / self._asked_hz) * 1e-6
         self._link = link
         self._profile = profile
-        self._access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
+        self._access = RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
         self._where = f"{link.description}, unit {unit}"
         self._rated_torque_nm = rated_torque_nm
         self._given = dict(given or {})
@@ -119,14 +127,14 @@ class ModbusDrive:
         self._reads = only_reads(self._plan.cycle, frozenset(profile.cycle.functions))
         self._moving = (profile.cycle.speed.register_, profile.cycle.torque.register_)
         self._codec = Codec(profile, Scales(1.0, 1.0, 1.0, 1.0, 1.0), has_demand=self._plan.has_demand)
-        self._standstill = Standstill(1.0, 1.0, self.period_s)
+        self._standstill = ZeroSpeed(1.0, 1.0, self.period_s)
         self._identity: Identity | None = None
         self._stage = ""               # as announced
         self._modes: frozenset[Mode] = frozenset()
         self._watchdog_s = self._timeout_s = 0.0
-        self._angle: Angle | None = None
+        self._angle: AngleRegister | None = None
         self._unwrapped: Unwrapped | None = None
-        self._wish = Wish.OFF
+        self._wish = PowerRequest.OFF
         self._was_enabled = self._told_fault = self._reverse = self._at_rest = self._removes_torque = False
         self._ever_asked = False       # to be enabled
         self._ever_enabled = False     # seen so
@@ -176,7 +184,7 @@ class ModbusDrive:
         """Check, set and read back; leaves the drive disabled, with setpoints of zero, and watched."""
         if self._identity is None:
             raise PreflightRefused("preflight before connect", where="driver")
-        table, access, profile = Table(), self._access, self._profile
+        table, access, profile = PreflightTable(), self._access, self._profile
         table.note("identity", f"not told over Modbus; taken for {profile.name}, as --profile says", self._where)
         if limits.torque_offset:
             table.row(
@@ -223,7 +231,7 @@ class ModbusDrive:
             self._watchdog_s, self._quick_stop_rad_s2 = limits.watchdog_s, limits.quick_stop_rad_s2
             self._modes = frozenset(Mode) if profile.modes.torque else frozenset((Mode.SPEED,))
         scales = self._codec.scales
-        self._standstill = Standstill(scales.speed, limits.speed_rad_s, self.period_s)
+        self._standstill = ZeroSpeed(scales.speed, limits.speed_rad_s, self.period_s)
         self._ticks = Ticks(self.clock, self.period_s, BUDGET_SHARE * self._watchdog_s)
         self._late_before = late_replies(self._link)
         target = profile.cycle.torque_setpoint
@@ -251,7 +259,7 @@ class ModbusDrive:
         )
 
     def _off_word(self) -> int:
-        return controlword_towards(self._profile.control, None, Wish.OFF, Mode.SPEED)
+        return controlword_towards(self._profile.control, None, PowerRequest.OFF, Mode.SPEED)
 
     def _idle_round(self) -> Round:
         """A whole cycle that asks for nothing: disabled, setpoints of zero; with the mode display's own read."""
@@ -267,12 +275,12 @@ class ModbusDrive:
                 f"the drive has no {mode.value} mode, or was not prepared for it", where="profile, modes",
                 next_step="Use --mode speed",
             )
-        self._wish, self._was_enabled, self._told_fault = Wish.ENABLED, False, False
+        self._wish, self._was_enabled, self._told_fault = PowerRequest.ENABLED, False, False
         self._ever_asked = True
 
     def quick_stop(self) -> None:
         """From the next cycle on the profile's quick-stop word; it isn't ended by enabling."""
-        self._wish = Wish.QUICK_STOP
+        self._wish = PowerRequest.QUICK_STOP
 
     def stop_feeding(self) -> None:
         """See `drivers.drive.StopsFeeding`; where reading feeds the watchdog, nothing is asked until it had its time.
@@ -291,11 +299,11 @@ class ModbusDrive:
 
     def disable(self) -> None:
         """From the next cycle on off; a shaft that still turns under power is braked first."""
-        self._wish = Wish.OFF
+        self._wish = PowerRequest.OFF
 
     def remove_torque(self) -> None:
         """From the next cycle on off, whatever the reported speed is; see `drivers.drive.RemovesTorque`."""
-        self._wish, self._removes_torque = Wish.OFF, True
+        self._wish, self._removes_torque = PowerRequest.OFF, True
 
     def reset_fault(self) -> None:
         """The profile's words one after the other, between connect and preflight; only on an operator's word.
@@ -327,7 +335,7 @@ class ModbusDrive:
         if not self._may_write():
             return self._watch()
         self._poll_other_masters()
-        if self._wish is Wish.ENABLED:
+        if self._wish is PowerRequest.ENABLED:
             self._heat.poll(self._timeout_s)
         turning = not self._standstill.near(self._feedback.speed_rad_s)
         # Nothing is disabled that was enabled and shows no valid state: it is braked, whatever its speed is said to be.
@@ -356,17 +364,17 @@ class ModbusDrive:
         self._ticks.done()
         self._failing_since_s, self._told_loss = None, False
         self._take(self._codec.feedback(got.words), command.mode)
-        if self._other.seen and self._wish is not Wish.ENABLED:
+        if self._other.seen and self._wish is not PowerRequest.ENABLED:
             got = self._insist(got, setpoints, command.mode, begun_s)
         self._follow_state()
-        if self._wish is Wish.ENABLED:
+        if self._wish is PowerRequest.ENABLED:
             self._heat.see(self._feedback.status)
         half_s = 0.5 * (got.received_s - got.sent_s)
         return self._sample(got.sent_s + half_s, half_s, half_s, fresh=True)
 
     def _poll_other_masters(self) -> None:
         """Raises CommunicationLost once; the stop that follows goes on exchanging."""
-        if self._other.seen and self._wish is not Wish.ENABLED:
+        if self._other.seen and self._wish is not PowerRequest.ENABLED:
             return                     # known, and the line is needed for the stop
         try:
             self._other.poll(self._timeout_s)
@@ -425,7 +433,7 @@ class ModbusDrive:
         """Not once the drive is left to its watchdog; but a shaft at rest that nothing drives may be disabled."""
         if self._silent_since_s is None:
             return True
-        return self._wish is Wish.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
+        return self._wish is PowerRequest.OFF and self._at_rest and power_state(self._state) not in _MAY_DRIVE
 
     def _watch(self) -> Sample:
         """A cycle that only reads, or not even that while reading feeds the watchdog."""
@@ -459,7 +467,7 @@ class ModbusDrive:
             return None
         self._take(self._codec.feedback(got.words), self._sent_mode)
         if (
-            self._silent_since_s is None and self._wish is not Wish.ENABLED
+            self._silent_since_s is None and self._wish is not PowerRequest.ENABLED
             and power_state(self._state) in _MAY_DRIVE
         ):
             self._push()
@@ -491,7 +499,7 @@ class ModbusDrive:
         """The control word of a quick stop alone, in the shortest request that the drive knows."""
         control = self._profile.cycle.control.register_
         word = controlword_towards(
-            self._profile.control, self._state, Wish.QUICK_STOP, self._sent_mode, reverse=self._reverse
+            self._profile.control, self._state, PowerRequest.QUICK_STOP, self._sent_mode, reverse=self._reverse
         )
         try:
             self._access.once(self._access.write_request(control.address, (word,)), self._timeout_s)
@@ -538,15 +546,15 @@ class ModbusDrive:
 
     def _stay_out(self) -> None:
         """Whatever comes back on the line must not find an enable and a setpoint: a new enable is needed."""
-        if self._wish is Wish.ENABLED:
-            self._wish = Wish.QUICK_STOP
+        if self._wish is PowerRequest.ENABLED:
+            self._wish = PowerRequest.QUICK_STOP
 
     def _decoded(self, status: int) -> StatusState | None:
         state = (decode_after if self._ever_enabled else decode)(self._profile.control, status)
         self._ever_enabled = self._ever_enabled or power_state(state) is PowerState.ENABLED
         return state
 
-    def _take(self, feedback: Feedback, sent: Mode) -> None:
+    def _take(self, feedback: CycleFeedback, sent: Mode) -> None:
         self._state = self._decoded(feedback.status)
         if self._profile.modes.display is None:
             self._shown = sent
@@ -562,15 +570,15 @@ class ModbusDrive:
         """A drive that fell out of operation stays out until it is asked in again. Raises DriveFault, once."""
         power = power_state(self._state)
         if power is PowerState.FAULT:
-            asked, self._wish = self._wish, Wish.OFF
-            if asked is not Wish.OFF and not self._told_fault:
+            asked, self._wish = self._wish, PowerRequest.OFF
+            if asked is not PowerRequest.OFF and not self._told_fault:
                 self._told_fault = True
                 raise DriveFault(
                     f"the drive went into fault, status {self._feedback.status:04X}h",
                     where=f"{self._where}, {register_name(self._profile.cycle.status.register_)}",
                     next_step="See the drive's own fault list, mend the cause, then start with --reset-fault",
                 )
-        elif self._wish is not Wish.ENABLED:
+        elif self._wish is not PowerRequest.ENABLED:
             out, self._out_of_operation = self._out_of_operation, self._out_of_operation + 1
             if power is PowerState.ENABLED:
                 self._out_of_operation = 0
@@ -584,12 +592,12 @@ class ModbusDrive:
                         where=f"{self._where}, {register_name(self._profile.cycle.control.register_)}",
                         next_step="Take the other master off the drive (PLC, panel, gateway)",
                     )
-        elif self._wish is Wish.ENABLED:
+        elif self._wish is PowerRequest.ENABLED:
             if power is PowerState.ENABLED:
                 self._was_enabled, self._out_of_operation = True, 0
                 self._follow_remote()
             elif self._was_enabled or power is PowerState.QUICK_STOP:
-                self._wish = Wish.QUICK_STOP       # it may be in operation after all: one word can be wrong
+                self._wish = PowerRequest.QUICK_STOP       # it may be in operation after all: one word can be wrong
 
     def _follow_remote(self) -> None:
         """Raises CommunicationLost, once, where the bus has lost control of an enabled drive."""
@@ -638,7 +646,7 @@ class ModbusDrive:
         try:
             if power in _NOT_DRIVEN or (power in _NONE_YET and not self._ever_asked):
                 if self._modes:
-                    clear_setpoints(Table(), self._access, self._profile, self._off_word())
+                    clear_setpoints(PreflightTable(), self._access, self._profile, self._off_word())
                 left = self._access.restore()
             else:
                 left = tuple(

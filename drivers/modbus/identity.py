@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from drivers.drive import PowerState
 from drivers.errors import CommunicationLost, PreflightRefused
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import register_name
 from drivers.modbus.pdu import NoReply, RegisterRefused
 from drivers.modbus.state_machine import decode, power_state
@@ -29,7 +29,7 @@ _LONGEST_S = 0.05
 """For the reply, in the middle of a run: a rehearsal must not cost the run its beat."""
 
 
-def tell_stage(access: Access, stage: str) -> None:
+def tell_stage(access: RegisterAccess, stage: str) -> None:
     """One request, asked once; whether it gets through is the peer's concern. Anything but a stage is not told."""
     number = STAGE_NUMBERS.get(stage)
     if number is None:
@@ -48,7 +48,7 @@ class Marker(NamedTuple):
     stepped: bool
 
 
-def read_marker(access: Access) -> Marker:
+def read_marker(access: RegisterAccess) -> Marker:
     """The marker block and the register after it. A drive that refuses these addresses, or is silent there, is real."""
     where = f"register {MARKER_REGISTER}"
     try:
@@ -60,7 +60,7 @@ def read_marker(access: Access) -> Marker:
     return Marker(simulated, simulated and words[MARKER_REGISTERS] == 1)
 
 
-def refuse_if_driven(access: Access, profile: ModbusProfile, where: str) -> None:
+def refuse_if_driven(access: RegisterAccess, profile: ModbusProfile, where: str) -> None:
     """Before anything is sent that could change what a turning shaft does. Raises PreflightRefused."""
     register = profile.cycle.status.register_
     where = f"{where}, {register_name(register)}"

@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 from drivers.errors import CommunicationLost
 from drivers.modbus import pdu
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import from_words, per_count, register_name, si_per_count
-from drivers.modbus.cycle import CyclePlan, Span, spans
+from drivers.modbus.cycle import CyclePlan, RegisterSpan, spans
 from drivers.modbus.parameters import show
 from drivers.modbus.pdu import LinkLost, RegisterRefused
-from profiles.modbus import ModbusProfile, Parameter, Register, Signal
+from profiles.modbus import CyclicSignal, ModbusProfile, Parameter, Register
 
 REMEMBERED_S = 0.5
 EVERY_S, EVERY_TIGHT_S = 0.1, 0.5
@@ -34,7 +34,7 @@ ROOM = 0.8
 _TAKE_OFF = "Take the other master off the drive (PLC, panel, commissioning tool, gateway)"
 
 
-class _Word(NamedTuple):
+class _WrittenRegister(NamedTuple):
     """One register that the cycle writes."""
 
     name: str
@@ -45,17 +45,17 @@ class _Word(NamedTuple):
 class OtherMaster:
     """Knows what this host has sent and what the settings were; `poll` is to be called before a cycle writes."""
 
-    def __init__(self, access: Access, profile: ModbusProfile, plan: CyclePlan) -> None:
+    def __init__(self, access: RegisterAccess, profile: ModbusProfile, plan: CyclePlan) -> None:
         self._access = access
         self._profile = profile
         self._order = profile.line.word_order
         self._functions = profile.cycle.functions
         self._written = [one.write for one in plan.cycle if one.write is not None]
-        self._words: list[_Word] = []
-        self._spans: list[Span] = []
+        self._words: list[_WrittenRegister] = []
+        self._spans: list[RegisterSpan] = []
         self._believed: set[str] = set()
         self._sent: dict[int, deque[int]] = {}
-        self._settings: list[tuple[Span, list[tuple[Parameter, int]]]] = []
+        self._settings: list[tuple[RegisterSpan, list[tuple[Parameter, int]]]] = []
         self._values: Mapping[str, float] = {}
         self._keep = self._polls = self._settings_polls = 0
         self._tight = False
@@ -89,7 +89,7 @@ class OtherMaster:
             except RegisterRefused:
                 if len(inside) > 1:    # one of them, or what lies between: each by itself, then
                     registers = [one.register_ for one in inside if one.register_ is not None]
-                    open_ones += [Span(one.table, one.address, one.count) for one in registers]
+                    open_ones += [RegisterSpan(one.table, one.address, one.count) for one in registers]
                 continue               # what the drive doesn't show was told, or refused, where it was needed
             self._settings.append((span, [(one, self._number(one.register_, span, found)) for one in inside]))
         self._next_s = self._access.clock.now_s()
@@ -122,7 +122,7 @@ class OtherMaster:
             if found is not None:
                 self._compare_words(span, found)
 
-    def _read(self, span: Span, timeout_s: float) -> tuple[int, ...] | None:
+    def _read(self, span: RegisterSpan, timeout_s: float) -> tuple[int, ...] | None:
         function = pdu.READ_HOLDING if span.table == "holding" else pdu.READ_INPUT
         try:
             return self._access.once(pdu.read(function, span.address, span.length), timeout_s).words
@@ -131,7 +131,7 @@ class OtherMaster:
         except (CommunicationLost, RegisterRefused):
             return None
 
-    def _compare_words(self, span: Span, found: tuple[int, ...]) -> None:
+    def _compare_words(self, span: RegisterSpan, found: tuple[int, ...]) -> None:
         for word in self._words:
             register = word.register
             if not span.covers(register):
@@ -152,7 +152,8 @@ class OtherMaster:
                     next_step=f"{_TAKE_OFF}; one master only may write control word and setpoints",
                 )
 
-    def _compare_settings(self, span: Span, found: tuple[int, ...], parameters: list[tuple[Parameter, int]]) -> None:
+    def _compare_settings(self, span: RegisterSpan, found: tuple[int, ...],
+                          parameters: list[tuple[Parameter, int]]) -> None:
         for parameter, before in parameters:
             register = parameter.register_
             assert register is not None
@@ -173,14 +174,14 @@ class OtherMaster:
         own = {watchdog.parameter, watchdog.reaction_parameter} | scaling
         return parameter.set_to is not None or parameter.require is not None or parameter.name in own
 
-    def _readable_spans(self, registers: list[Register]) -> list[Span]:
+    def _readable_spans(self, registers: list[Register]) -> list[RegisterSpan]:
         tables = {"holding": pdu.READ_HOLDING, "input": pdu.READ_INPUT}
         asked = [one for one in registers if one.table == "holding" or tables[one.table] in self._functions]
         if pdu.READ_HOLDING not in self._functions:
             asked = [one for one in asked if one.table != "holding"]
         return spans(asked, self._profile.cycle.largest_gap, self._profile.cycle.largest_read)
 
-    def _number(self, register: Register | None, span: Span, found: tuple[int, ...]) -> int:
+    def _number(self, register: Register | None, span: RegisterSpan, found: tuple[int, ...]) -> int:
         assert register is not None
         at = register.address - span.address
         return from_words(found[at : at + register.count], register.type, self._order)
@@ -190,19 +191,19 @@ class OtherMaster:
         return f"{counts} counts" if scale is None else show(counts * scale, parameter)
 
 
-def _words_of(profile: ModbusProfile, values: Mapping[str, float], rated_nm: float) -> list[_Word]:
+def _words_of(profile: ModbusProfile, values: Mapping[str, float], rated_nm: float) -> list[_WrittenRegister]:
     """Control word and setpoints, shown in SI."""
     cycle = profile.cycle
 
-    def in_si(signal: Signal, unit: str) -> Callable[[int], str]:
+    def in_si(signal: CyclicSignal, unit: str) -> Callable[[int], str]:
         scale = si_per_count(signal, values, rated_nm)
         return lambda counts: f"{counts * scale:.4g} {unit}"
 
     found = [
-        _Word("control word", cycle.control.register_, lambda word: f"{word & 0xFFFF:04X}h"),
-        _Word("speed setpoint", cycle.speed_setpoint.register_, in_si(cycle.speed_setpoint, "rad/s")),
+        _WrittenRegister("control word", cycle.control.register_, lambda word: f"{word & 0xFFFF:04X}h"),
+        _WrittenRegister("speed setpoint", cycle.speed_setpoint.register_, in_si(cycle.speed_setpoint, "rad/s")),
     ]
     torque = cycle.torque_setpoint
     if torque is not None and profile.modes.torque and torque.register_ != cycle.speed_setpoint.register_:
-        found.append(_Word("torque setpoint", torque.register_, in_si(torque, "N·m")))
+        found.append(_WrittenRegister("torque setpoint", torque.register_, in_si(torque, "N·m")))
     return found

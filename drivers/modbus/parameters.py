@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from drivers.drive import DriveLimits, ReportingFilters
 from drivers.errors import CommandRejected, PreflightRefused
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import RANGES, RPM, per_count, register_name, settle, to_counts
 from drivers.own_limits import QUICK_STOP, SPEED, TORQUE, OwnLimits
-from drivers.preflight import Table, agreed_rated_torque, spare
+from drivers.preflight import PreflightTable, agreed_rated_torque, spare
 from profiles import Require
 from profiles.modbus import ModbusProfile, Parameter, Register
 
@@ -31,7 +31,7 @@ class Parameters:
 
 
 def read_parameters(
-    table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float],
+    table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float],
     spared: Collection[str] = (),
 ) -> Parameters:
     """Read every parameter that has a register; what is needed and can't be told is a refused row.
@@ -86,7 +86,7 @@ def needed(profile: ModbusProfile, parameter: Parameter) -> bool:
 
 
 def check_required(
-    table: Table, profile: ModbusProfile, found: Parameters, spared: Collection[str] = ()
+    table: PreflightTable, profile: ModbusProfile, found: Parameters, spared: Collection[str] = ()
 ) -> None:
     """The checklist: parameters that must stand as the profile says; they are set at the drive, never from here."""
     for parameter in profile.parameters:
@@ -117,7 +117,7 @@ def satisfied(require: Require, value: float, lsb: float) -> bool:
 
 
 def find_rated_torque(
-    table: Table, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
+    table: PreflightTable, profile: ModbusProfile, found: Parameters, rated_torque_nm: float | None
 ) -> float | None:
     """N·m that are 100 %: rig.yaml's, which the drive must not contradict, else its own; None where neither tells."""
     name = profile.rated_torque
@@ -131,7 +131,7 @@ def find_rated_torque(
     return agreed_rated_torque(table, from_drive, rated_torque_nm, where)
 
 
-def check_name_plate(table: Table, profile: ModbusProfile, found: Parameters, rated_nm: float) -> None:
+def check_name_plate(table: PreflightTable, profile: ModbusProfile, found: Parameters, rated_nm: float) -> None:
     """P = T·ω: a wrong address, scale, sign or word order in one of the three doesn't fit."""
     plate = profile.name_plate
     if plate is None:
@@ -154,7 +154,7 @@ def check_name_plate(table: Table, profile: ModbusProfile, found: Parameters, ra
     )
 
 
-def find_filters(table: Table, profile: ModbusProfile, found: Parameters) -> ReportingFilters:
+def find_filters(table: PreflightTable, profile: ModbusProfile, found: Parameters) -> ReportingFilters:
     """First-order lags of the reported signals; None where the drive doesn't tell. A cut-off f_c is 1/(2π f_c)."""
     lags: dict[str, float] = {}
     sources = []
@@ -231,7 +231,7 @@ _SLACK = 1e-9
 """One part in 10^9: a limit that is a whole number of counts must not lose or gain one to the last bit."""
 
 
-class Setting(NamedTuple):
+class RegisterSetting(NamedTuple):
     """Counts that are to stand in a parameter's register, and the unit for one count."""
 
     counts: int
@@ -244,7 +244,8 @@ _LIMIT = {
 }
 
 
-def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, rated_nm: float,
+def set_limits(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
+               rated_nm: float,
                found: Parameters, own: OwnLimits) -> None:
     """Every parameter with `set_to` but the watchdog, which comes last of all; a row each. ``own``: which may be."""
     kinds = set()
@@ -265,7 +266,7 @@ def set_limits(table: Table, access: Access, profile: ModbusProfile, limits: Dri
 
 
 def _write_limit(
-    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float,
+    table: PreflightTable, access: RegisterAccess, parameter: Parameter, limits: DriveLimits, rated_nm: float,
     values: Mapping[str, float],
     own: OwnLimits,
 ) -> None:
@@ -323,7 +324,7 @@ def own_speed_limits(profile: ModbusProfile, found: Parameters) -> list[tuple[Re
 
 
 def write_setting(
-    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float,
+    table: PreflightTable, access: RegisterAccess, parameter: Parameter, limits: DriveLimits, rated_nm: float,
     values: Mapping[str, float],
 ) -> bool:
     """Write one parameter and read it back; whether it stands as wanted."""
@@ -347,7 +348,8 @@ def write_setting(
     return table.attempt(parameter.title, wanted, where, work, advice)
 
 
-def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float, values: Mapping[str, float]) -> Setting:
+def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float,
+                   values: Mapping[str, float]) -> RegisterSetting:
     """The counts that say what rig.yaml wants. Raises CommandRejected where the unit or the register can't hold it."""
     register, kind, where = parameter.register_, parameter.set_to, where_of(parameter)
     assert register is not None
@@ -383,7 +385,7 @@ def wanted_setting(parameter: Parameter, limits: DriveLimits, rated_nm: float, v
             next_step="The drive can't hold so low a limit: is its scale right, and the limit in rig.yaml?",
         )
     # A limit of no count at all would switch it off on many drives.
-    return Setting(int(sign) * max(1, counts), lsb)
+    return RegisterSetting(int(sign) * max(1, counts), lsb)
 
 
 def _unit(parameter: Parameter, known: Mapping[str, float]) -> float:

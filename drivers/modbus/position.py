@@ -7,11 +7,11 @@ from typing import NamedTuple
 from drivers.drive import PositionReading
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import WordOrder, from_words, register_name
 from drivers.modbus.cycle import rad_per_count
 from drivers.modbus.pdu import RegisterRefused
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from profiles.modbus import ModbusProfile, Position
 
 _TITLE = "angle of the motor"
@@ -19,7 +19,7 @@ _ASKED = "whether the shaft turns as fast as the drive says is asked of the oper
 _WIDTHS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
 
 
-class Angle(NamedTuple):
+class AngleRegister(NamedTuple):
     """The register that counts the angle."""
 
     entry: Position
@@ -35,7 +35,7 @@ class Angle(NamedTuple):
         """The angle after which it starts over, rad."""
         return (self.entry.wrap_counts or float(1 << _WIDTHS[self.entry.register_.type])) * self.rad_per_count
 
-    def read(self, access: Access, timeout_s: float) -> PositionReading | None:
+    def read(self, access: RegisterAccess, timeout_s: float) -> PositionReading | None:
         """One transaction; None without a good reply."""
         register = self.entry.register_
         function = pdu.READ_HOLDING if register.table == "holding" else pdu.READ_INPUT
@@ -49,7 +49,7 @@ class Angle(NamedTuple):
         return PositionReading(answer.sent_s + half_s, half_s, counts * self.rad_per_count, self.wraps_rad, where)
 
 
-def find_angle(table: Table, access: Access, profile: ModbusProfile) -> Angle | None:
+def find_angle(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile) -> AngleRegister | None:
     """The profile's register, where the drive gives it; a note says what there is."""
     entry = profile.position
     if entry is None:
@@ -62,4 +62,4 @@ def find_angle(table: Table, access: Access, profile: ModbusProfile) -> Angle | 
         table.note(_TITLE, f"not told: {error.what}; {_ASKED}", where)
         return None
     table.note(_TITLE, f"{entry.counts_per_turn:.10g} counts a turn, held against the speed in stage 2", where)
-    return Angle(entry, profile.line.word_order)
+    return AngleRegister(entry, profile.line.word_order)

@@ -11,14 +11,14 @@ from collections.abc import Mapping
 
 from drivers.drive import DriveLimits, Mode, Outcome, PowerState
 from drivers.errors import PreflightRefused
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import RANGES, Scales, find_scales, from_words, register_name, si_per_count, to_counts
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.parameters import Parameters, check_name_plate, check_required, find_rated_torque, read_parameters
 from drivers.modbus.state_machine import decode, power_state, seen
 from drivers.modbus.watchdog import counts_of, is_off
-from drivers.preflight import Table, check_nothing_held
-from profiles.modbus import Echo, ModbusProfile, Signal
+from drivers.preflight import PreflightTable, check_nothing_held
+from profiles.modbus import CyclicSignal, Echo, ModbusProfile
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Setpoints written at standstill, disabled, and read again: from their own registers and where the drive echoes them.
@@ -33,7 +33,7 @@ ECHO_POLLS, ECHO_POLL_S = 12, 0.05
 """At an echo: drives renew what they display every few ten milliseconds, field bus adapters more slowly still."""
 
 
-def clear_setpoints(table: Table, access: Access, profile: ModbusProfile, off: int) -> bool:
+def clear_setpoints(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, off: int) -> bool:
     """The control word's off and setpoints of zero: no word of an earlier run may act when the drive is enabled."""
     cycle = profile.cycle
     entries = [entry for entry in (cycle.speed_setpoint, cycle.torque_setpoint) if entry is not None]
@@ -51,7 +51,7 @@ def clear_setpoints(table: Table, access: Access, profile: ModbusProfile, off: i
 
 
 def check_setpoints(
-    table: Table, access: Access, profile: ModbusProfile, scales: Scales, rated_nm: float,
+    table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales, rated_nm: float,
     values: Mapping[str, float], limits: DriveLimits,
 ) -> frozenset[str]:
     """A row for each setpoint: several values written, read back, and compared with the drive's echo if any.
@@ -60,7 +60,7 @@ def check_setpoints(
     """
     read_back = set[str]()
     cycle = profile.cycle
-    pairs: list[tuple[str, Signal, float, float, str]] = [
+    pairs: list[tuple[str, CyclicSignal, float, float, str]] = [
         ("speed", cycle.speed_setpoint, scales.speed_setpoint, limits.speed_rad_s, "rad/s")
     ]
     if cycle.torque_setpoint is not None and profile.modes.torque:
@@ -80,7 +80,8 @@ def check_setpoints(
 
 
 def _check_one(
-    table: Table, access: Access, name: str, signal: Signal, lsb: float, tests: list[float], unit: str,
+    table: PreflightTable, access: RegisterAccess, name: str, signal: CyclicSignal, lsb: float, tests: list[float],
+    unit: str,
     echo: Echo | None, rated_nm: float, values: Mapping[str, float],
 ) -> bool:
     register = signal.register_
@@ -133,7 +134,8 @@ MODE_POLLS, MODE_POLL_S = 20, 0.05
 
 
 def read_only_checks(
-    table: Table, access: Access, profile: ModbusProfile, given: Mapping[str, float], rated_torque_nm: float | None,
+    table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float],
+    rated_torque_nm: float | None,
     speed_limit_rad_s: float, torque_limit_nm: float, accept_no_watchdog: bool = False, *, string: bool = False,
 ) -> tuple[Parameters, Scales | None, float]:
     """All that can be known without writing; no scales where something is refused."""
@@ -160,7 +162,7 @@ def read_only_checks(
     return found, None if refused else scales, rated_nm or 1.0
 
 
-def watchdogs_own(access: Access, profile: ModbusProfile, given: Mapping[str, float]) -> frozenset[str]:
+def watchdogs_own(access: RegisterAccess, profile: ModbusProfile, given: Mapping[str, float]) -> frozenset[str]:
     """Parameters that don't matter where the operator accepts a drive without a watchdog, and this one's is off.
 
     None where it can be armed from here: that is tried, and what it needs must be right.
@@ -177,7 +179,7 @@ def watchdogs_own(access: Access, profile: ModbusProfile, given: Mapping[str, fl
 
 
 def check_resolution(
-    table: Table, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float, torque_limit_nm: float
+    table: PreflightTable, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float, torque_limit_nm: float
 ) -> None:
     """Counts far too coarse for the limits: a parameter that scales them was read in the wrong order or place."""
     cycle = profile.cycle
@@ -195,7 +197,8 @@ def check_resolution(
             )
 
 
-def check_state(table: Table, access: Access, profile: ModbusProfile, scales: Scales, speed_limit_rad_s: float) -> None:
+def check_state(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales,
+                speed_limit_rad_s: float) -> None:
     """A drive in fault is refused, and never reset silently.
 
     So is a shaft that still turns, and a drive that the field bus has no say over.
@@ -223,7 +226,8 @@ def check_state(table: Table, access: Access, profile: ModbusProfile, scales: Sc
         )
 
 
-def check_string(table: Table, access: Access, profile: ModbusProfile, scales: Scales, torque_limit_nm: float) -> None:
+def check_string(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, scales: Scales,
+                 torque_limit_nm: float) -> None:
     """A drive that holds a wound-up drill string after an earlier stop is refused: `off` would let go of it."""
     cycle = profile.cycle
     if power_state(decode(profile.control, access.read(cycle.status.register_) & 0xFFFF)) is PowerState.QUICK_STOP:
@@ -232,7 +236,7 @@ def check_string(table: Table, access: Access, profile: ModbusProfile, scales: S
         check_nothing_held(table, held_nm, torque_limit_nm, scales.torque, register_name(register))
 
 
-def check_modes(table: Table, access: Access, profile: ModbusProfile) -> None:
+def check_modes(table: PreflightTable, access: RegisterAccess, profile: ModbusProfile) -> None:
     """The mode is written while nothing is enabled, and its display must follow; left in speed mode.
 
     A drive that switches by bits of its control word is only looked at: many show the mode while they run only.
@@ -271,7 +275,7 @@ def check_modes(table: Table, access: Access, profile: ModbusProfile) -> None:
             table.note("mode display", text, register_name(display.register_))
 
 
-def _poll_mode(access: Access, profile: ModbusProfile, mode: Mode) -> int:
+def _poll_mode(access: RegisterAccess, profile: ModbusProfile, mode: Mode) -> int:
     display = profile.modes.display
     assert display is not None
     register, clock = display.register_, access.clock

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from drivers.drive import FrameTap, Mode, PowerState
 from drivers.errors import PreflightRefused, TdhilError
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import si_per_count
 from drivers.modbus.cycle import shown_mode
 from drivers.modbus.link import Link
@@ -33,7 +33,7 @@ class ModbusTarget:
 
     def __init__(self, link: Link, profile: ModbusProfile, *, unit: int, tap: FrameTap | None = None) -> None:
         self._profile = profile
-        self._access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
+        self._access = RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions), tap)
         self._scale: float | None = None
         self._scale_sought = False
         self._first = 0

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from enum import Enum
 
-from drivers.drive import Mode, PowerState
+from drivers.drive import Mode, PowerRequest, PowerState
 from profiles.modbus import Bits, Control, StatusState
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -23,7 +22,7 @@ MEAN_COUNTS, MEAN_SHARE = 1, 0.001
 """… and their mean within this: noise averages out, a shaft that still creeps doesn't."""
 
 
-class Standstill:
+class ZeroSpeed:
     """At rest once the speed has stayed at zero for `STILL_S` and `LEAST_SAMPLES` samples without a longer gap."""
 
     def __init__(self, count_rad_s: float, limit_rad_s: float, period_s: float) -> None:
@@ -66,14 +65,6 @@ _POWER = {
 _ALL_ONES = 0xFFFF
 
 
-class Wish(Enum):
-    """Where the caller wants the drive to be."""
-
-    OFF = "off"
-    ENABLED = "enabled"
-    QUICK_STOP = "quick stop"
-
-
 def seen(bits: Bits | None, status: int) -> bool:
     """Does the status word show these bits? False where the profile names none."""
     return bits is not None and status & bits.mask == bits.value
@@ -106,7 +97,8 @@ def power_state(state: StatusState | None) -> PowerState:
 
 
 def controlword_towards(
-    control: Control, state: StatusState | None, wish: Wish, mode: Mode, *, reverse: bool = False, turning: bool = False
+    control: Control, state: StatusState | None, wish: PowerRequest, mode: Mode, *, reverse: bool = False,
+    turning: bool = False
 ) -> int:
     """The control word that brings the drive one step nearer to the wish.
 
@@ -116,14 +108,14 @@ def controlword_towards(
     """
     power = power_state(state)
     under_power = power in (PowerState.ENABLED, PowerState.QUICK_STOP, PowerState.NOT_READY, PowerState.UNKNOWN)
-    if wish is Wish.ENABLED:
+    if wish is PowerRequest.ENABLED:
         if power is PowerState.QUICK_STOP:
             word = control.quick_stop
         elif state is not None and state.onward is not None and power is not PowerState.FAULT:
             word = state.onward
         else:
             word = control.off
-    elif wish is Wish.QUICK_STOP:
+    elif wish is PowerRequest.QUICK_STOP:
         # Also while it is merely ready: some drives show that while they still brake, and `off` would let them coast.
         word = control.quick_stop if under_power or power is PowerState.READY else control.off
     else:

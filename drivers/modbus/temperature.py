@@ -5,11 +5,11 @@ from __future__ import annotations
 from drivers.drive import Outcome
 from drivers.errors import CommunicationLost, LimitHit, PreflightRefused
 from drivers.modbus import pdu
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import from_words, register_name
 from drivers.modbus.pdu import LinkLost, RegisterRefused
 from drivers.modbus.state_machine import seen
-from drivers.preflight import Table
+from drivers.preflight import PreflightTable
 from profiles.modbus import ModbusProfile, Temperature
 
 EVERY_S = 2.0
@@ -19,7 +19,7 @@ UNWATCHED = "nobody watches it: this profile names no register for one; the driv
 class Heat:
     """Looks at one after the other. Each that is too hot is told once."""
 
-    def __init__(self, access: Access, profile: ModbusProfile) -> None:
+    def __init__(self, access: RegisterAccess, profile: ModbusProfile) -> None:
         self._access = access
         self._order = profile.line.word_order
         self._status = profile.cycle.status.register_
@@ -31,7 +31,7 @@ class Heat:
         self._next_s = 0.0
         self._polls = 0
 
-    def prepare(self, table: Table, limit_c: float | None) -> None:
+    def prepare(self, table: PreflightTable, limit_c: float | None) -> None:
         """A row each, as it is now; one that is too hot already is refused. ``limit_c``: rig.yaml's, °C, if any."""
         self._limit_c = limit_c
         if not self._numbers and not self._in_status:
@@ -51,7 +51,7 @@ class Heat:
                 table.note(one.title, f"nobody watches it: {error.what}", register_name(one.register_))
         self._next_s = self._access.clock.now_s()
 
-    def _row(self, table: Table, one: Temperature, counts: int) -> None:
+    def _row(self, table: PreflightTable, one: Temperature, counts: int) -> None:
         limit = self._limit_of(one)
         where = register_name(one.register_)
         if one.too_hot is None and limit is None:

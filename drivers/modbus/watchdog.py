@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from drivers.drive import DriveLimits
 from drivers.errors import CommunicationLost, PreflightRefused
 from drivers.modbus import pdu
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.cycle import Round
 from drivers.modbus.parameters import Parameters, show, where_of, write_setting
-from drivers.preflight import ANY_CLIENT, DIES, SHARED_FLAG, Table, settle
+from drivers.preflight import ANY_CLIENT, DIES, SHARED_FLAG, PreflightTable, settle
 from profiles.modbus import ModbusProfile, Parameter
 
 LEAST_CYCLES = 5
@@ -28,7 +28,7 @@ LEAST_TIMEOUT_S = 0.05
 
 
 @dataclass(frozen=True)
-class Pace:
+class CyclePace:
     """How fast the cycle goes. ``timeout_s`` is for one transaction; ``usual_s`` is what a whole round takes."""
 
     period_s: float
@@ -37,9 +37,9 @@ class Pace:
 
 
 def measure_pace(
-    table: Table, line: str, asked_hz: float, watchdog_s: float, plan_text: str, go: Callable[[], Round],
+    table: PreflightTable, line: str, asked_hz: float, watchdog_s: float, plan_text: str, go: Callable[[], Round],
     now_s: Callable[[], float],
-) -> Pace:
+) -> CyclePace:
     """The longer of the asked period and what the line carries, measured over some rounds as they will be."""
     took_s: list[float] = []
     longest_s, failed = 0.0, 0
@@ -56,7 +56,7 @@ def measure_pace(
             "cycle rate", f"{asked_hz:g} Hz", f"{failed} of {failed + len(took_s)} cycles failed", False, line,
             "The line is not good enough: check wiring, shielding, termination and baud rate",
         )
-        return Pace(1.0 / asked_hz, LEAST_TIMEOUT_S, 1.0 / asked_hz)
+        return CyclePace(1.0 / asked_hz, LEAST_TIMEOUT_S, 1.0 / asked_hz)
     # Four in five are faster: a few hiccups of the host must not slow the whole run down.
     usual_s = sorted(took_s)[4 * len(took_s) // 5]
     # To the µs; carried periods are rounded up, so that the line does carry them.
@@ -69,18 +69,19 @@ def measure_pace(
     else:
         table.row("cycle rate", f"{asked_hz:g} Hz", text, True, line)
     timeout_s = min(max(4.0 * longest_s, LEAST_TIMEOUT_S), 0.25 * watchdog_s)
-    return Pace(period_s, timeout_s, usual_s)
+    return CyclePace(period_s, timeout_s, usual_s)
 
 
 def arm_watchdog(
-    table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, rated_nm: float, found: Parameters,
+    table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits, rated_nm: float,
+    found: Parameters,
     period_s: float, feed: Callable[[], object],
 ) -> bool:
     """Set or check the drive's time-out on the host's silence; one feeding write, then it is read back.
 
     Whether it is armed. If not, that is refused, unless the operator accepts it and it is known to be off.
     """
-    entry, accepted, tried = profile.watchdog, limits.accept_no_watchdog, Table()
+    entry, accepted, tried = profile.watchdog, limits.accept_no_watchdog, PreflightTable()
     if entry.kind == "none":
         tried.row("watchdog", "armed", "this drive has none", False, "profile", DIES)
         return settle(table, tried, accepted, lambda: True)
@@ -114,7 +115,8 @@ def arm_watchdog(
 
 
 def check_who_feeds(
-    table: Table, access: Access, profile: ModbusProfile, limits: DriveLimits, feed: Callable[[], object], *,
+    table: PreflightTable, access: RegisterAccess, profile: ModbusProfile, limits: DriveLimits,
+    feed: Callable[[], object], *,
     simulated: bool
 ) -> bool:
     """A row of what feeds an armed watchdog; whether any other client does.
@@ -151,7 +153,7 @@ def check_who_feeds(
 
 
 def _others_requests(
-    access: Access, profile: ModbusProfile, every_s: float, feed: Callable[[], object]
+    access: RegisterAccess, profile: ModbusProfile, every_s: float, feed: Callable[[], object]
 ) -> int | None:
     """How many requests of others came in `COUNT_S`; None where the drive doesn't count them."""
     def count() -> int:
@@ -172,7 +174,8 @@ def _others_requests(
 
 
 def _write(
-    table: Table, access: Access, parameter: Parameter, limits: DriveLimits, rated_nm: float, found: Parameters,
+    table: PreflightTable, access: RegisterAccess, parameter: Parameter, limits: DriveLimits, rated_nm: float,
+    found: Parameters,
     feed: Callable[[], object],
 ) -> None:
     if not write_setting(table, access, parameter, limits, rated_nm, found.values):
@@ -190,7 +193,7 @@ def _write(
     table.attempt("watchdog", wanted, where_of(parameter), fed, parameter.advice or DIES)
 
 
-def is_off(access: Access, parameter: Parameter, told: Mapping[str, float]) -> bool:
+def is_off(access: RegisterAccess, parameter: Parameter, told: Mapping[str, float]) -> bool:
     """Does the time-out stand at 0, which switches it off, or does the drive refuse to tell it at all?
 
     ``told``: values by name, for a time-out that has no register: a 0 that somebody has stated.
@@ -198,7 +201,7 @@ def is_off(access: Access, parameter: Parameter, told: Mapping[str, float]) -> b
     return told.get(parameter.name) == 0.0 if parameter.register_ is None else not counts_of(access, parameter)
 
 
-def counts_of(access: Access, parameter: Parameter) -> int | None:
+def counts_of(access: RegisterAccess, parameter: Parameter) -> int | None:
     """What stands in its register; None without one, or where the drive refuses to tell."""
     try:
         return None if parameter.register_ is None else access.read(parameter.register_)

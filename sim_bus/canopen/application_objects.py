@@ -21,7 +21,7 @@ from canopen.sdo import SdoAbortedError
 
 from profiles.canopen import CanopenProfile
 from sim_bus.canopen.objects import ABORT_VALUE, ObjectStore, key_of
-from sim_bus.cia402 import Application, Settings
+from sim_bus.cia402 import Application, ApplicationSettings
 from sim_bus.inverter import RPM
 from sim_bus.params import DriveParams
 from sim_bus.reports import Feedback
@@ -210,7 +210,7 @@ class ApplicationObjects:
         store.hooks[key_of(0x6080)] = speed
 
     def _setting(self, index: int, name: str, allowed: set[int]) -> None:
-        settings: Settings = self._application.settings
+        settings: ApplicationSettings = self._application.settings
 
         def write(value: int) -> None:
             if value not in allowed:
@@ -221,7 +221,7 @@ class ApplicationObjects:
 
     def _scaled(self, index: int, name: str, unit: float, usual: float) -> None:
         """One rate or window; its default is that of our own EDS, in another unit another number, at least 1."""
-        settings: Settings = self._application.settings
+        settings: ApplicationSettings = self._application.settings
         if unit != usual:
             counts = self._store.default(key_of(index)) * usual / unit
             self._store.set_default(index, 0, max(1, min(0xFFFF, round(counts))))

@@ -18,7 +18,7 @@ from profiles import CYCLE_ID, CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 from sim_bus.canopen import services as emcy
 from sim_bus.canopen.node import SYNC, Cia402Node
 from sim_bus.canopen.sender import Sender
-from sim_bus.fault_script import STOP, Cast, Kind, Kinds, Passing, Scripted, plain, seconds, share
+from sim_bus.fault_script import STOP, Cast, FaultKind, Kinds, Passing, Scripted, plain, seconds, share
 from sim_bus.reports import Lie, lying
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -74,7 +74,7 @@ class Emcy(Misbehaviour):
         self.scene.node.emergency.report(self._code, emcy.GENERIC)
 
 
-class DriveFault(Emcy):
+class FaultReaction(Emcy):
     """The drive finds a fault: emergency message, its own fault reaction (605Eh), fault state."""
 
     def begin(self) -> None:
@@ -252,7 +252,7 @@ class Reordered(Misbehaviour):
         return ((can_id, data),)
 
 
-class Frozen(Misbehaviour):
+class FrozenTpdos(Misbehaviour):
     """The TPDOs go on coming, and say what they last said: a gateway that repeats its process image."""
 
     def __init__(self) -> None:
@@ -481,62 +481,64 @@ def _written(text: str) -> tuple[int, int, int, int]:
 _LONG, _SHORT = {0x1006, 0x1016, 0x6080, 0x6085, 0x60FF}, {0x100D, 0x6060}
 
 KINDS: Kinds[Misbehaviour] = Kinds({
-    "bus-dead": Kind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(Dead)),
-    "frame-loss": Kind(17, "this share of all frames is lost, either way",
-                       lambda v: Lossy(share(v)), "5%", "SHARE"),
-    "duplicate-frames": Kind(18, "this share of the feedback comes twice",
-                             lambda v: Doubled(share(v)), "10%", "SHARE"),
-    "reordered-frames": Kind(18, "this share of the feedback comes after that of the next cycle",
-                             lambda v: Reordered(share(v)), "10%", "SHARE"),
-    "frozen-feedback": Kind(19, "the feedback repeats its last values", plain(Frozen)),
-    "feedback-lost": Kind(19, "no TPDO comes any more; the heartbeat goes on",
-                          plain(lambda: Without(0x180, 0x280))),
-    "heartbeat-lost": Kind(20, "the drive's heartbeat ends", plain(lambda: Without(0x700))),
-    "node-reset": Kind(21, "the drive restarts (boot-up message); its torque is off, the shaft coasts",
-                       plain(Restart)),
-    "foreign-nmt-stop": Kind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
-    "foreign-nmt-preop": Kind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
-    "emcy": Kind(23, "an emergency message, with the drive still enabled",
-                 lambda v: Emcy(_code(v)), "7305h", "CODE"),
-    "drive-fault": Kind(23, "emergency message and fault state, after the drive's own fault reaction",
-                        lambda v: DriveFault(_code(v)), "3210h", "CODE"),
-    "sdo-abort": Kind(24, "the drive aborts every transfer of an object",
-                      lambda v: Aborted(*_object(v)), "6072h", "OBJECT"),
-    "sdo-timeout": Kind(25, "the drive doesn't answer when asked for an object",
-                        lambda v: Unanswered(*_object(v)), "6072h", "OBJECT"),
-    "second-master": Kind(26, "another host: from the start the drive is enabled already; later, foreign setpoints",
+    "bus-dead": FaultKind(12, "nothing gets through any more: adapter unplugged, cable cut", plain(Dead)),
+    "frame-loss": FaultKind(17, "this share of all frames is lost, either way",
+                            lambda v: Lossy(share(v)), "5%", "SHARE"),
+    "duplicate-frames": FaultKind(18, "this share of the feedback comes twice",
+                                  lambda v: Doubled(share(v)), "10%", "SHARE"),
+    "reordered-frames": FaultKind(18, "this share of the feedback comes after that of the next cycle",
+                                  lambda v: Reordered(share(v)), "10%", "SHARE"),
+    "frozen-feedback": FaultKind(19, "the feedback repeats its last values", plain(FrozenTpdos)),
+    "feedback-lost": FaultKind(19, "no TPDO comes any more; the heartbeat goes on",
+                               plain(lambda: Without(0x180, 0x280))),
+    "heartbeat-lost": FaultKind(20, "the drive's heartbeat ends", plain(lambda: Without(0x700))),
+    "node-reset": FaultKind(21, "the drive restarts (boot-up message); its torque is off, the shaft coasts",
+                            plain(Restart)),
+    "foreign-nmt-stop": FaultKind(22, "a third party sends NMT stop", plain(lambda: ForeignNmt(2))),
+    "foreign-nmt-preop": FaultKind(22, "a third party sends NMT pre-operational", plain(lambda: ForeignNmt(128))),
+    "emcy": FaultKind(23, "an emergency message, with the drive still enabled",
+                      lambda v: Emcy(_code(v)), "7305h", "CODE"),
+    "drive-fault": FaultKind(23, "emergency message and fault state, after the drive's own fault reaction",
+                             lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
+    "sdo-abort": FaultKind(24, "the drive aborts every transfer of an object",
+                           lambda v: Aborted(*_object(v)), "6072h", "OBJECT"),
+    "sdo-timeout": FaultKind(25, "the drive doesn't answer when asked for an object",
+                             lambda v: Unanswered(*_object(v)), "6072h", "OBJECT"),
+    "second-master": FaultKind(26,
+                               "another host: from the start the drive is enabled already; later, foreign setpoints",
                           plain(SecondMaster)),
-    "duplicate-node": Kind(26, "a second drive answers under the same node ID", plain(SecondNode)),
-    "replayed-feedback": Kind(26, "so many frames of a recording, taken at rest, go before each of the drive's own",
+    "duplicate-node": FaultKind(26, "a second drive answers under the same node ID", plain(SecondNode)),
+    "replayed-feedback": FaultKind(26,
+                                   "so many frames of a recording, taken at rest, go before each of the drive's own",
                               lambda v: Replayed(_frames(v)), "1", "FRAMES"),
-    "foreign-heartbeat": Kind(56, "another node bears the host's number: its heartbeat comes so often",
-                              lambda v: ForeignHeartbeat(seconds(v)), "1s", "TIME"),
-    "tool-writes": Kind(57, "a tool writes an object by SDO, once",
-                        lambda v: ToolWrites(*_written(v)), "1016h:1=0", "OBJECT=VALUE"),
-    "setting-changed": Kind(58, "an object is changed at the drive's own panel",
-                            lambda v: SettingChanged(*_written(v)[:3]), "6007h=0", "OBJECT=VALUE"),
-    "foreign-setpoints": Kind(59, "another master sends setpoints in RPDO4, or switches that on again and again",
-                              lambda v: ForeignSetpoints(_again(v)), "once", "once|again"),
-    "sdo-master": Kind(60, "another master writes controlword and speed by SDO, in every cycle",
-                       plain(SdoMaster)),
-    "wrong-identity": Kind(29, "1018h:1, the vendor, is another one",
-                           plain(lambda: Otherwise(0x1018, 1))),
-    "fault-at-start": Kind(30, "the drive is in fault when the host comes",
-                           lambda v: DriveFault(_code(v)), "3210h", "CODE"),
-    "stuck-state": Kind(31, "the controlword is ignored", plain(Deaf)),
-    "mode-not-followed": Kind(32, "6061h doesn't follow 6060h", plain(ModeKept)),
-    "mode-lost": Kind(82, "the drive goes over to mode 3 by itself, and stays there", plain(ModeLost)),
-    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(SafeTorqueOff)),
-    "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
-                           lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
-    "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
-                      lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
-    "write-not-kept": Kind(45, "a write to an object is answered and not kept",
-                           lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
-    "reads-back-otherwise": Kind(45, "an object reads back as something else",
-                                 lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
-    "watchdog-not-armed": Kind(50, "the write to 1016h:1 is answered and not kept",
-                               plain(lambda: NotKept(0x1016, 1))),
+    "foreign-heartbeat": FaultKind(56, "another node bears the host's number: its heartbeat comes so often",
+                                   lambda v: ForeignHeartbeat(seconds(v)), "1s", "TIME"),
+    "tool-writes": FaultKind(57, "a tool writes an object by SDO, once",
+                             lambda v: ToolWrites(*_written(v)), "1016h:1=0", "OBJECT=VALUE"),
+    "setting-changed": FaultKind(58, "an object is changed at the drive's own panel",
+                                 lambda v: SettingChanged(*_written(v)[:3]), "6007h=0", "OBJECT=VALUE"),
+    "foreign-setpoints": FaultKind(59, "another master sends setpoints in RPDO4, or switches that on again and again",
+                                   lambda v: ForeignSetpoints(_again(v)), "once", "once|again"),
+    "sdo-master": FaultKind(60, "another master writes controlword and speed by SDO, in every cycle",
+                            plain(SdoMaster)),
+    "wrong-identity": FaultKind(29, "1018h:1, the vendor, is another one",
+                                plain(lambda: Otherwise(0x1018, 1))),
+    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes",
+                                lambda v: FaultReaction(_code(v)), "3210h", "CODE"),
+    "stuck-state": FaultKind(31, "the controlword is ignored", plain(Deaf)),
+    "mode-not-followed": FaultKind(32, "6061h doesn't follow 6060h", plain(ModeKept)),
+    "mode-lost": FaultKind(82, "the drive goes over to mode 3 by itself, and stays there", plain(ModeLost)),
+    "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive", plain(SafeTorqueOff)),
+    "internal-limit": FaultKind(33, "an internal limit leaves this share of the torque",
+                                lambda v: LimitedTorque(share(v)), "10%", "SHARE"),
+    "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
+                           lambda v: LoadLost(max(0.001, share(v))), "10%", "SHARE"),
+    "write-not-kept": FaultKind(45, "a write to an object is answered and not kept",
+                                lambda v: NotKept(*_object(v)), "6080h", "OBJECT"),
+    "reads-back-otherwise": FaultKind(45, "an object reads back as something else",
+                                      lambda v: Otherwise(*_object(v)), "6072h", "OBJECT"),
+    "watchdog-not-armed": FaultKind(50, "the write to 1016h:1 is answered and not kept",
+                                    plain(lambda: NotKept(0x1016, 1))),
 })
 KINDS.update(lying(Lying))
 make, parse_all, listed, listing = KINDS.make, KINDS.parse_all, KINDS.listed, KINDS.listing

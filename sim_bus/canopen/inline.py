@@ -95,9 +95,9 @@ def _stamped(message: can.Message) -> can.Message:
 class InlineSimulator(Embedded):
     """A stepped simulator that acts whenever a station sends; ``bus`` is one, and `station` makes more.
 
-    What fails in it leaves it silent, as a thread is that has ended, and is raised by `check` and `close`. An exception
-    from outside (KeyboardInterrupt) goes on its way, and nothing more is taken then: it may have come in the middle of
-    a step.
+    What fails in it leaves it silent, as a thread is that has ended, and is raised by `Embedded.check` and
+    `Embedded.close`. An exception from outside (KeyboardInterrupt) goes on its way, and nothing more is taken then: it
+    may have come in the middle of a step.
     """
 
     def __init__(self, params: RigParams | None = None, *, node_id: int = 1, seed: int = 0, trace: Path | None = None,

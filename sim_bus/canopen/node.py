@@ -33,7 +33,7 @@ from sim_bus.canopen.services import (
 from sim_bus.cia402 import Application
 from sim_bus.inverter import Inverter
 from sim_bus.params import RigParams
-from sim_bus.trace import ROW_PERIOD_US, Trace
+from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
 SYNC = 0x080
 COMMUNICATION_AREA = (0x1000, 0x1FFF)
@@ -54,7 +54,7 @@ def generic_eds() -> str:
 class Cia402Node:
     """A CiA 402 slave over a simulated inverter; of our own EDS, or wearing a ``profile``."""
 
-    def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: Trace,
+    def __init__(self, sender: Sender, params: RigParams, *, node_id: int, seed: int, trace: ShaftTrace,
                  stepped: bool, profile: CanopenProfile | None = None) -> None:
         self.id = node_id
         self.time_us = 0

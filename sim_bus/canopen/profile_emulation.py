@@ -14,13 +14,13 @@ from profiles.canopen import CanopenProfile, Parameter
 from sim_bus.canopen.application_objects import TURN, ObjectUnits, clamped, counts_per_turn, profile_units, wrapped
 from sim_bus.canopen.objects import ObjectStore, key_of
 from sim_bus.canopen.services import LifeGuard
-from sim_bus.cia402 import Application, Mode
+from sim_bus.cia402 import Application, OperationMode
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The manufacturer's settings of a worn profile: their objects, what they stand at, and what those that limit do.
 #
-# A simulated drive is delivered ready: what a profile requires to be set by hand is set. `Settings.spoil` undoes one.
+# A simulated drive is delivered ready: what a profile requires to be set by hand is set.
 
 
 DATA_TYPES = {
@@ -164,7 +164,7 @@ class WornProfile:
         self.settings = WornSettings(profile, application)
         self.units: ObjectUnits = profile_units(application.inverter.params.drive, profile, self.settings.scales())
         wanted = (*profile.modes.speed, *profile.modes.torque)
-        application.modes = frozenset(Mode(code) for code in wanted if code in list(Mode))
+        application.modes = frozenset(OperationMode(code) for code in wanted if code in list(OperationMode))
         application.mode = application.first_mode
 
     def apply(self, store: ObjectStore, guard: LifeGuard, set_period: Callable[[int], None]) -> None:

@@ -55,7 +55,7 @@ class Sender:
 
 
 class PassiveNetwork(canopen.Network):  # type: ignore[misc, unused-ignore]
-    """A network that is never connected: it is fed by `notify` and sends through our sender, in one thread."""
+    """A network that is never connected: it is fed by ``notify`` and sends through our sender, in one thread."""
 
     def __init__(self, sender: Sender) -> None:
         super().__init__()

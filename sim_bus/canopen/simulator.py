@@ -23,7 +23,7 @@ from sim_bus.canopen.node import Cia402Node
 from sim_bus.canopen.sender import BUS_ERRORS, Sender
 from sim_bus.fault_script import Scripted
 from sim_bus.params import RigParams
-from sim_bus.trace import Trace
+from sim_bus.trace import ShaftTrace
 
 _CHUNK_US = 2_000
 _POLL_OWN_TIME_S = 0.005
@@ -43,7 +43,7 @@ class Simulator:
         self._bus = bus
         self._silence_s = silence_s
         self._sender = Sender(bus, self._on_send_failed)
-        self._trace = Trace(trace)
+        self._trace = ShaftTrace(trace)
         self.node = Cia402Node(
             self._sender, params, node_id=node_id, seed=seed, trace=self._trace, stepped=stepped, profile=profile,
         )

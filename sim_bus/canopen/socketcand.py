@@ -87,7 +87,7 @@ _MOST_PENDING_BYTES = 1 << 20
 _BACKLOG = 16
 
 
-class _Client:
+class _SocketcandClient:
     """One connection and what is under way on it."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -104,7 +104,7 @@ class Hub:
     def __init__(self, host: str = "127.0.0.1", port: int = 0, channel: str = "can0") -> None:
         self.host, self.channel = host, channel
         self._selector = selectors.DefaultSelector()
-        self._clients: list[_Client] = []
+        self._clients: list[_SocketcandClient] = []
         self._taps: list[Callable[[WireFrame], None]] = []
         self.all_gone = False
         """The last client has just left; whoever acts on it sets it back."""
@@ -166,12 +166,12 @@ class Hub:
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = _Client(connection)
+        client = _SocketcandClient(connection)
         self._clients.append(client)
         self._selector.register(connection, selectors.EVENT_READ, client)
         self._tell(client, HI)
 
-    def _read(self, client: _Client) -> None:
+    def _read(self, client: _SocketcandClient) -> None:
         try:
             data = client.socket.recv(65536)
         except BlockingIOError:
@@ -187,7 +187,7 @@ class Hub:
         if len(client.received) > LONGEST_WORD:
             self._drop(client)
 
-    def _obey(self, client: _Client, word: str) -> None:
+    def _obey(self, client: _SocketcandClient, word: str) -> None:
         if word.startswith("send ") and client.raw:
             frame = parse_send(word)
             if frame is not None:
@@ -205,7 +205,7 @@ class Hub:
         else:
             self._tell(client, b"< error unknown command >")
 
-    def _spread(self, frame: WireFrame, sender: _Client | None) -> None:
+    def _spread(self, frame: WireFrame, sender: _SocketcandClient | None) -> None:
         if frame.remote_length is not None:
             return
         word = b""
@@ -214,7 +214,7 @@ class Hub:
                 word = word or frame_word(frame, time.time())
                 self._tell(client, word)
 
-    def _tell(self, client: _Client, word: bytes) -> None:
+    def _tell(self, client: _SocketcandClient, word: bytes) -> None:
         busy = bool(client.pending) or client.hold_until_s
         client.pending += word
         if not busy:
@@ -222,7 +222,7 @@ class Hub:
         elif len(client.pending) > _MOST_PENDING_BYTES:
             self._drop(client)
 
-    def _flush(self, client: _Client) -> None:
+    def _flush(self, client: _SocketcandClient) -> None:
         """Sends what the socket takes; the rest waits until it takes more."""
         if client.pending and not client.hold_until_s:
             try:
@@ -239,7 +239,7 @@ class Hub:
         if self._selector.get_key(client.socket).events != wanted:
             self._selector.modify(client.socket, wanted, client)
 
-    def _drop(self, client: _Client) -> None:
+    def _drop(self, client: _SocketcandClient) -> None:
         if client not in self._clients:
             return
         self._clients.remove(client)

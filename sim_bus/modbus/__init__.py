@@ -1,7 +1,7 @@
 """The Modbus face of the simulated drive: it wears a profile, over the same inverter and shaft as the CANopen face.
 
-`families` says what words do, from the manuals · `layout`, `bank`: which number stands where · `machine`: the drive
-without its bus · `embedded`: in the host's own time · `server`: on TCP or a serial line, in real time.
+`control_words` says what words do, from the manuals · `codec`, `registers`: which number stands where · `machine`: the
+drive without its bus · `embedded`: in the host's own time · `server`: on TCP or a serial line, in real time.
 """
 
 from typing import TYPE_CHECKING

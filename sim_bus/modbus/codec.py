@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 # What comes back on the line for one request: as a rule the drive's reply, and what a scripted fault made of it.
 
 
-class Reply(NamedTuple):
+class DriveReply(NamedTuple):
     """``pdu`` None: nothing comes. What TCP or RTU alone has is left alone by the other."""
 
     pdu: bytes | None
@@ -25,7 +25,7 @@ class Reply(NamedTuple):
     """TCP: what becomes of the connection on which the request came."""
 
 
-NONE = Reply(None)
+NONE = DriveReply(None)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -34,7 +34,7 @@ _BITS = {"u16": 16, "i16": 16, "u32": 32, "i32": 32}
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class RegisterLayout:
     """Where a number stands and how."""
 
     address: int

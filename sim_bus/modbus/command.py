@@ -50,9 +50,9 @@ def run(namespace: argparse.Namespace) -> int:
     def simulate(stop: threading.Event) -> None:
         from profiles import load_modbus_profile
         from sim_bus.modbus.faults import Faults, parse_all, wrongs_of
-        from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
+        from sim_bus.modbus.lines import RequestListener, RtuListener, TcpListener
         from sim_bus.modbus.machine import Machine
-        from sim_bus.modbus.server import Server
+        from sim_bus.modbus.server import DriveServer
         from sim_bus.modbus.wrong_maps import parse
 
         if namespace.tcp is None and namespace.rtu is None:
@@ -68,7 +68,7 @@ def run(namespace: argparse.Namespace) -> int:
             raise Unusable(f"{profile.name} leaves the factory without a unit number. Give --unit")
         with Machine(params, profile, seed=namespace.seed, trace=namespace.trace, wrongs=wrongs,
                      stepped=False) as machine:
-            listener: Listener
+            listener: RequestListener
             if namespace.tcp is not None:
                 listener = TcpListener(*namespace.tcp)
             else:
@@ -76,7 +76,7 @@ def run(namespace: argparse.Namespace) -> int:
                                        stop_bits=line.stop_bits)
             faults = Faults(machine, profile, script, namespace.seed)
             try:
-                server = Server(machine, unit, listener, gateway=namespace.tcp is not None, faults=faults)
+                server = DriveServer(machine, unit, listener, gateway=namespace.tcp is not None, faults=faults)
                 ready(f"modbus {listener.reached_by} unit {unit} profile {profile.name}")
                 server.run(stop)
                 never_came(faults.waiting)

@@ -11,9 +11,9 @@ from typing import Self
 
 import numpy as np
 
-from profiles.modbus import Line, ModbusProfile
+from profiles.modbus import BusLine, ModbusProfile
 from sim_bus.fault_script import Scripted
-from sim_bus.modbus.codec import Reply
+from sim_bus.modbus.codec import DriveReply
 from sim_bus.modbus.faults import Faults, tells_stage, wrongs_of
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong
@@ -67,7 +67,7 @@ class LineTiming:
         return cls(turn_around_s=turn_around_s, latency_s=latency_s, jitter_s=jitter_s)
 
     @classmethod
-    def of(cls, line: Line) -> Self:
+    def of(cls, line: BusLine) -> Self:
         """The line that a profile describes: TCP where it has that."""
         if "tcp" in line.transports:
             return cls.tcp(line.turn_around_s)
@@ -190,6 +190,6 @@ class EmbeddedModbusDrive:
         self.close()
 
 
-def _heard(reply: Reply) -> bytes | None:
+def _heard(reply: DriveReply) -> bytes | None:
     """What a host's receiver passes on."""
     return None if reply.crc_bits else reply.pdu

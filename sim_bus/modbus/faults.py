@@ -16,12 +16,12 @@ import numpy as np
 
 from profiles import MARKER_STAGE_REGISTER
 from profiles.modbus import ModbusProfile
-from sim_bus.cia402 import Mode
+from sim_bus.cia402 import OperationMode
 from sim_bus.fault_script import (
     STOP,
     Cast,
+    FaultKind,
     FaultRefused,
-    Kind,
     Kinds,
     KnownFault,
     Moment,
@@ -30,7 +30,7 @@ from sim_bus.fault_script import (
     plain,
     share,
 )
-from sim_bus.modbus.codec import NONE, Reply
+from sim_bus.modbus.codec import NONE, DriveReply
 from sim_bus.modbus.machine import Machine
 from sim_bus.modbus.wrong_maps import Wrong, parse
 from sim_bus.reports import Lie, lying
@@ -39,7 +39,7 @@ from sim_bus.reports import Lie, lying
 # What a scripted fault of a Modbus drive may do: come between request and reply, and lay hands on the drive itself.
 
 
-Ask = Callable[[bytes], Reply]
+Ask = Callable[[bytes], DriveReply]
 """A request PDU → what comes back for it."""
 
 
@@ -57,7 +57,7 @@ class Misbehaviour(Passing):
 
     scene: Scene
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         """A request comes; ``ask`` is what would happen to it without this fault."""
         return ask(pdu)
 
@@ -78,49 +78,49 @@ class _Some(Misbehaviour):
     def __init__(self, share: float) -> None:
         self._share = share
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         return self._spoilt(pdu, ask) if self.scene.rng.random() < self._share else ask(pdu)
 
-    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+    def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         raise NotImplementedError
 
 
-class NoReply(_Some):
+class LostExchange(_Some):
     """Neither request nor reply gets through; the drive doesn't act."""
 
-    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+    def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return NONE
 
 
 class WrongTransaction(_Some):
     """The drive acts, and its reply bears the transaction of another request."""
 
-    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+    def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return ask(pdu)._replace(transaction_bits=_OTHER_TRANSACTION)
 
 
 class BadCrc(_Some):
     """The drive acts, and its reply has a wrong CRC."""
 
-    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+    def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         return ask(pdu)._replace(crc_bits=_OTHER_CRC)
 
 
 class Short(_Some):
     """The drive acts, and says half of its reply."""
 
-    def _spoilt(self, pdu: bytes, ask: Ask) -> Reply:
+    def _spoilt(self, pdu: bytes, ask: Ask) -> DriveReply:
         reply = ask(pdu)
         return reply if reply.pdu is None else reply._replace(pdu=reply.pdu[: (len(reply.pdu) + 1) // 2])
 
 
-class Late(Misbehaviour):
+class LateReply(Misbehaviour):
     """The drive acts at once, and its reply comes so much later, s."""
 
     def __init__(self, late_s: float) -> None:
         self._late_s = late_s
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         reply = ask(pdu)
         return reply._replace(late_s=reply.late_s + self._late_s)
 
@@ -131,25 +131,25 @@ class Refusing(Misbehaviour):
     def __init__(self, code: int) -> None:
         self._code = code
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
-        return Reply(self.scene.machine.refuse(pdu, self._code))
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
+        return DriveReply(self.scene.machine.refuse(pdu, self._code))
 
 
-class Connection(Misbehaviour):
+class LostConnection(Misbehaviour):
     """The connection on which the next request comes is lost, once; a new one works."""
 
     def __init__(self, how: Literal["reset", "half-open"]) -> None:
         self._how: Literal["reset", "half-open"] = how
         self._done = False
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         if self._done:
             return ask(pdu)
         self._done = True
         return NONE._replace(connection=self._how)
 
 
-class Frozen(Misbehaviour):
+class FrozenReads(Misbehaviour):
     """What is read of the feedback is what was read of it first: a gateway that repeats its process image.
 
     What is written goes through.
@@ -161,7 +161,7 @@ class Frozen(Misbehaviour):
     def end(self) -> None:
         self._kept.clear()
 
-    def asked(self, pdu: bytes, ask: Ask) -> Reply:
+    def asked(self, pdu: bytes, ask: Ask) -> DriveReply:
         reply = ask(pdu)
         if reply.pdu is None or reply.pdu[0] != pdu[0] or not self._is_feedback(pdu):
             return reply
@@ -240,7 +240,7 @@ def mode_kept() -> Act:
 def mode_lost() -> Act:
     """The drive regulates speed from then on, whatever is chosen, and shows it."""
     def lose(machine: Machine) -> None:
-        machine.application.set_mode(Mode.CYCLIC_VELOCITY.value)
+        machine.application.set_mode(OperationMode.CYCLIC_VELOCITY.value)
         machine.application.keeps_mode = True
 
     def over(machine: Machine) -> None:
@@ -317,50 +317,50 @@ def _name(text: str) -> Misbehaviour:
     return Misbehaviour()
 
 
-def _wiring(summary: str, row: int = 44) -> Kind[Misbehaviour]:
-    return Kind(row, summary, plain(Misbehaviour))
+def _wiring(summary: str, row: int = 44) -> FaultKind[Misbehaviour]:
+    return FaultKind(row, summary, plain(Misbehaviour))
 
 
 KINDS: Kinds[Misbehaviour] = Kinds({
-    "frozen-feedback": Kind(19, "speed and torque read as they last did; what is written goes through",
-                            plain(Frozen)),
-    "drive-fault": Kind(23, "fault state, after the drive's own fault reaction", plain(drive_fault)),
-    "fault-at-start": Kind(30, "the drive is in fault when the host comes", plain(drive_fault)),
-    "stuck-state": Kind(31, "the control word is ignored", plain(stuck)),
-    "mode-not-followed": Kind(32, "the drive stays with speed or torque as it is", plain(mode_kept)),
-    "mode-lost": Kind(88, "the drive goes over to regulating speed by itself, and stays there",
-                      plain(mode_lost)),
-    "sto": Kind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
-                plain(safe_torque_off)),
-    "internal-limit": Kind(33, "an internal limit leaves this share of the torque",
-                           lambda v: limited_torque(share(v)), "10%", "SHARE"),
-    "load-lost": Kind(34, "the load comes off: this share of inertia and friction is left",
-                      lambda v: load_lost(max(0.001, share(v))), "10%", "SHARE"),
-    "hot": Kind(35, "motor and drive become so hot, °C", lambda v: hot(_celsius(v)), "150", "CELSIUS"),
-    "exception": Kind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
-                      lambda v: Refusing(_code(v)), "4", "CODE"),
-    "no-reply": Kind(39, "this share of the requests doesn't get through, and nothing comes back",
-                     lambda v: NoReply(share(v)), "100%", "SHARE"),
-    "late-reply": Kind(40, "every reply comes so late", lambda v: Late(_delay_s(v)), "1s", "TIME"),
-    "wrong-transaction-id": Kind(41, "this share of the replies bears another transaction (TCP only)",
-                                 lambda v: WrongTransaction(share(v)), "100%", "SHARE"),
-    "bad-crc": Kind(42, "this share of the replies has a wrong CRC (not on TCP; embedded: such a reply is lost)",
-                    lambda v: BadCrc(share(v)), "100%", "SHARE"),
-    "short-reply": Kind(42, "this share of the replies is cut to half", lambda v: Short(share(v)), "100%",
-                        "SHARE"),
-    "reset": Kind(43, "the connection is reset, once (TCP only)", plain(lambda: Connection("reset"))),
-    "half-open": Kind(43, "the connection is silent from then on, and stays open (TCP only)",
-                      plain(lambda: Connection("half-open"))),
+    "frozen-feedback": FaultKind(19, "speed and torque read as they last did; what is written goes through",
+                                 plain(FrozenReads)),
+    "drive-fault": FaultKind(23, "fault state, after the drive's own fault reaction", plain(drive_fault)),
+    "fault-at-start": FaultKind(30, "the drive is in fault when the host comes", plain(drive_fault)),
+    "stuck-state": FaultKind(31, "the control word is ignored", plain(stuck)),
+    "mode-not-followed": FaultKind(32, "the drive stays with speed or torque as it is", plain(mode_kept)),
+    "mode-lost": FaultKind(88, "the drive goes over to regulating speed by itself, and stays there",
+                           plain(mode_lost)),
+    "sto": FaultKind(33, "safe torque off: the shaft coasts, and nothing enables the drive",
+                     plain(safe_torque_off)),
+    "internal-limit": FaultKind(33, "an internal limit leaves this share of the torque",
+                                lambda v: limited_torque(share(v)), "10%", "SHARE"),
+    "load-lost": FaultKind(34, "the load comes off: this share of inertia and friction is left",
+                           lambda v: load_lost(max(0.001, share(v))), "10%", "SHARE"),
+    "hot": FaultKind(35, "motor and drive become so hot, °C", lambda v: hot(_celsius(v)), "150", "CELSIUS"),
+    "exception": FaultKind(38, "every request is answered by this exception and not done: 1 to 4, 6 busy",
+                           lambda v: Refusing(_code(v)), "4", "CODE"),
+    "no-reply": FaultKind(39, "this share of the requests doesn't get through, and nothing comes back",
+                          lambda v: LostExchange(share(v)), "100%", "SHARE"),
+    "late-reply": FaultKind(40, "every reply comes so late", lambda v: LateReply(_delay_s(v)), "1s", "TIME"),
+    "wrong-transaction-id": FaultKind(41, "this share of the replies bears another transaction (TCP only)",
+                                      lambda v: WrongTransaction(share(v)), "100%", "SHARE"),
+    "bad-crc": FaultKind(42, "this share of the replies has a wrong CRC (not on TCP; embedded: such a reply is lost)",
+                         lambda v: BadCrc(share(v)), "100%", "SHARE"),
+    "short-reply": FaultKind(42, "this share of the replies is cut to half", lambda v: Short(share(v)), "100%",
+                             "SHARE"),
+    "reset": FaultKind(43, "the connection is reset, once (TCP only)", plain(lambda: LostConnection("reset"))),
+    "half-open": FaultKind(43, "the connection is silent from then on, and stays open (TCP only)",
+                           plain(lambda: LostConnection("half-open"))),
     "word-order": _wiring("32-bit numbers stand with their halves exchanged"),
     "scale-10": _wiring("every scaled register counts in tenths"),
     "address-off-by-one": _wiring("every register stands one address higher"),
     "sign": _wiring("what is reported of signed registers has the opposite sign"),
     "unsigned": _wiring("signed registers have no sign"),
     "write-not-kept": _wiring("parameters are written without an error, and keep what they had", 45),
-    "reads-back-otherwise": Kind(45, "a parameter, as the profile calls it, reads as something else", _name,
-                                 "torque_limit", "PARAMETER"),
-    "watchdog-not-armed": Kind(50, "the watchdog's time is written without an error, and keeps what it was",
-                               plain(NotArmed)),
+    "reads-back-otherwise": FaultKind(45, "a parameter, as the profile calls it, reads as something else", _name,
+                                      "torque_limit", "PARAMETER"),
+    "watchdog-not-armed": FaultKind(50, "the watchdog's time is written without an error, and keeps what it was",
+                                    plain(NotArmed)),
 })
 KINDS.update(lying(lying_drive))
 make, listing = KINDS.make, KINDS.listing
@@ -440,7 +440,7 @@ class Faults:
         if self._cast.moved(now_us, self._machine.note):
             self._machine.application.regulate()
 
-    def request(self, pdu: bytes, connection: int = 0) -> Reply:
+    def request(self, pdu: bytes, connection: int = 0) -> DriveReply:
         """A request for the drive, at the time that it is: what comes back."""
         ask: Ask = partial(self._ask, connection=connection)
         if tells_stage(pdu):
@@ -449,8 +449,8 @@ class Faults:
             ask = partial(fault.asked, ask=ask)
         return ask(pdu)
 
-    def _ask(self, pdu: bytes, connection: int) -> Reply:
-        return Reply(self._machine.request(pdu, connection))
+    def _ask(self, pdu: bytes, connection: int) -> DriveReply:
+        return DriveReply(self._machine.request(pdu, connection))
 
     def _on_stage(self, number: int) -> None:
         now_us = round(1e6 * self._machine.time_s)

@@ -10,7 +10,7 @@ from struct import Struct
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from profiles import TdhilError
-from sim_bus.modbus.codec import Reply
+from sim_bus.modbus.codec import DriveReply
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Modbus frames around PDUs, as the drive sees them. Pure.
@@ -34,7 +34,7 @@ _COUNTED = {15: (6, 9), 16: (6, 9), 23: (10, 13)}
 """function: (where its byte count stands, length without what it counts)."""
 
 
-class Request(NamedTuple):
+class ReceivedRequest(NamedTuple):
     """To whom, what, and the transaction that the reply repeats; ``connection`` tells clients apart."""
 
     unit: int
@@ -47,7 +47,7 @@ class NotModbus(Exception):
     """The peer doesn't speak Modbus."""
 
 
-def tcp_requests(buffer: bytearray) -> Iterator[Request]:
+def tcp_requests(buffer: bytearray) -> Iterator[ReceivedRequest]:
     """Takes whole frames off ``buffer``. NotModbus for anything else."""
     while len(buffer) >= _MBAP.size:
         transaction, protocol, length, unit = _MBAP.unpack_from(buffer)
@@ -57,10 +57,10 @@ def tcp_requests(buffer: bytearray) -> Iterator[Request]:
             return
         pdu = bytes(buffer[_MBAP.size : 6 + length])
         del buffer[: 6 + length]
-        yield Request(unit, pdu, transaction)
+        yield ReceivedRequest(unit, pdu, transaction)
 
 
-def tcp_reply(request: Request, pdu: bytes, wrong_bits: int = 0) -> bytes:
+def tcp_reply(request: ReceivedRequest, pdu: bytes, wrong_bits: int = 0) -> bytes:
     """The frame that answers; ``wrong_bits`` of its transaction are another's."""
     return _MBAP.pack(request.transaction ^ wrong_bits, 0, len(pdu) + 1, request.unit) + pdu
 
@@ -72,7 +72,7 @@ class RtuReceiver:
         self._buffer = bytearray()
         self._heard_s = 0.0
 
-    def feed(self, data: bytes, now_s: float) -> Iterator[Request]:
+    def feed(self, data: bytes, now_s: float) -> Iterator[ReceivedRequest]:
         """``now_s`` on any clock that doesn't go back."""
         if now_s - self._heard_s > _SILENCE_S:
             self._buffer.clear()
@@ -86,7 +86,7 @@ class RtuReceiver:
             if crc(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
                 self._buffer.clear()        # out of step: silence will tell where the next frame begins
                 return
-            yield Request(frame[0], bytes(frame[1:-2]))
+            yield ReceivedRequest(frame[0], bytes(frame[1:-2]))
 
     def _length(self) -> int:
         """Of the frame at the beginning; 0 while it isn't there."""
@@ -104,7 +104,7 @@ class RtuReceiver:
         return length if len(buffer) >= length else 0
 
 
-def rtu_reply(request: Request, pdu: bytes, wrong_bits: int = 0) -> bytes:
+def rtu_reply(request: ReceivedRequest, pdu: bytes, wrong_bits: int = 0) -> bytes:
     """The frame that answers; ``wrong_bits`` of its CRC are wrong."""
     body = bytes((request.unit,)) + pdu
     return body + (crc(body) ^ wrong_bits).to_bytes(2, "little")
@@ -127,7 +127,7 @@ def crc(data: bytes | bytearray) -> int:
 To = TypeVar("To")
 
 
-class Late(Generic[To]):
+class LateQueue(Generic[To]):
     """Each with whom it is for, until it is due."""
 
     def __init__(self) -> None:
@@ -153,11 +153,11 @@ _CLIENTS = 16
 _SEND_TIMEOUT_S = 1.0
 _AT_ONCE = struct.pack("ii", 1, 0)
 """SO_LINGER: closing sends a reset."""
-Serve = Callable[[Request], Reply]
+Serve = Callable[[ReceivedRequest], DriveReply]
 """A request → what comes back."""
 
 
-class Listener(Protocol):
+class RequestListener(Protocol):
     """A line on which requests come."""
 
     @property
@@ -191,7 +191,7 @@ class TcpListener:
         self._clients: dict[int, tuple[socket.socket, bytearray, int]] = {}
         self._accepted = 0             # so many clients so far: the last one's number
         self._silent: list[socket.socket] = []     # half open: never looked at again
-        self._late: Late[socket.socket] = Late()
+        self._late: LateQueue[socket.socket] = LateQueue()
 
     @property
     def reached_by(self) -> str:
@@ -288,7 +288,7 @@ class RtuListener:
             ) from error
         os.set_blocking(self._fd, False)
         self._receiver = RtuReceiver()
-        self._late: Late[int] = Late()
+        self._late: LateQueue[int] = LateQueue()
 
     def sources(self) -> list[int]:
         return [self._fd]
@@ -319,7 +319,7 @@ class RtuListener:
                 os.close(fd)
         self._fd = self._slave = -1
 
-    def _requests(self, data: bytes) -> Iterator[Request]:
+    def _requests(self, data: bytes) -> Iterator[ReceivedRequest]:
         return self._receiver.feed(data, time.monotonic())
 
 

@@ -11,14 +11,14 @@ from typing import Self
 import numpy as np
 
 from profiles.modbus import ModbusProfile, ModbusWatchdog
-from sim_bus.cia402 import Application, Mode
+from sim_bus.cia402 import Application, OperationMode
 from sim_bus.inverter import Inverter
 from sim_bus.modbus.control_words import FAMILIES, Wiring
-from sim_bus.modbus.parameters import Parameters, reporting_lag_s
+from sim_bus.modbus.parameters import ParameterStore, reporting_lag_s
 from sim_bus.modbus.registers import Answer, Bank, Map
 from sim_bus.modbus.wrong_maps import Wrong
 from sim_bus.params import RigParams
-from sim_bus.trace import ROW_PERIOD_US, Trace
+from sim_bus.trace import ROW_PERIOD_US, ShaftTrace
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The drive's supervision of its host: begins with the first message that feeds it, acts once when none comes. Pure.
@@ -27,7 +27,7 @@ from sim_bus.trace import ROW_PERIOD_US, Trace
 _OWN = "_of_this_connection"
 
 
-class Watchdog:
+class SimulatedWatchdog:
     """What feeds it, and for how long it waits."""
 
     def __init__(self, watchdog: ModbusWatchdog) -> None:
@@ -74,19 +74,19 @@ class Machine:
     def __init__(self, params: RigParams, profile: ModbusProfile, *, seed: int = 0, trace: Path | None = None,
                  wrongs: tuple[Wrong, ...] = (), stepped: bool = True) -> None:
         self._profile = profile
-        self.parameters = Parameters(profile, params, wrongs)
+        self.parameters = ParameterStore(profile, params, wrongs)
         self.inverter = Inverter(self._worn(params), np.random.default_rng(seed))
         self.application = application = Application(self.inverter)
         wiring = _wiring(profile)
-        application.set_mode((Mode.PROFILE_VELOCITY if wiring.ramps else Mode.CYCLIC_VELOCITY).value)
+        application.set_mode((OperationMode.PROFILE_VELOCITY if wiring.ramps else OperationMode.CYCLIC_VELOCITY).value)
         application.settings.accel_rad_s2 = application.settings.decel_rad_s2 = RAMP_RAD_S2
         self.words = FAMILIES[profile.control.family](application, wiring)
         self._map = Map(profile, self.parameters, self.words, wrongs, stepped=stepped, on_stage=self._told_stage)
         cycle = profile.cycle
         self._bank = Bank(self._map.slots, cycle.functions, self._written, largest_read=cycle.largest_read,
                           largest_write=cycle.largest_write)
-        self.watchdog = Watchdog(profile.watchdog)
-        self._trace = Trace(trace)
+        self.watchdog = SimulatedWatchdog(profile.watchdog)
+        self._trace = ShaftTrace(trace)
         self._period_s = params.drive.control_period_s
         self._steps = 0
         self._next_row_us = 0

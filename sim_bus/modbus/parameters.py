@@ -1,4 +1,4 @@
-"""The simulated drive's parameters: what each counts in, and what it does. What they start with: `starting`."""
+"""The simulated drive's parameters: what each counts in, and what it does. What they start with: `start`."""
 
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from math import inf, pi
 from profiles import Require, TdhilError
 from profiles.modbus import ModbusProfile, Parameter
 from sim_bus.inverter import RPM
-from sim_bus.modbus.codec import Layout
+from sim_bus.modbus.codec import RegisterLayout
 from sim_bus.modbus.wrong_maps import Wrong, something_else
 from sim_bus.params import RigParams
 
@@ -52,7 +52,7 @@ _TIME_OUT_S = 0.5
 """Of a watchdog that the host can't set."""
 
 
-def start(store: Parameters, profile: ModbusProfile, rig: RigParams) -> float:
+def start(store: ParameterStore, profile: ModbusProfile, rig: RigParams) -> float:
     """Gives every parameter its first value; returns the rated speed, rpm. TdhilError where the rig doesn't fit."""
     plate = profile.name_plate
     torque_names = {name for name in (profile.rated_torque, plate and plate.torque) if name}
@@ -71,7 +71,7 @@ def start(store: Parameters, profile: ModbusProfile, rig: RigParams) -> float:
     return rated_rpm
 
 
-def _put_exactly(store: Parameters, profile: ModbusProfile, name: str, value: float) -> None:
+def _put_exactly(store: ParameterStore, profile: ModbusProfile, name: str, value: float) -> None:
     store.put(name, value)
     told = store.value(name)
     if abs(told - value) > _NEAR_ENOUGH * value:
@@ -91,14 +91,14 @@ def _fitting_rated_rpm(profile: ModbusProfile, rig: RigParams) -> float:
     kw_per_rpm = rig.drive.rated_torque_nm * RPM / 1000.0
     if power.register_ is not None:
         rpm = max(rpm, _FEWEST_POWER_COUNTS * power.per_lsb / kw_per_rpm)
-        rpm = min(rpm, Layout(0, power.register_.type).highest * power.per_lsb / kw_per_rpm)
+        rpm = min(rpm, RegisterLayout(0, power.register_.type).highest * power.per_lsb / kw_per_rpm)
     if speed.register_ is not None and speed.times is None:
-        rpm = min(rpm, Layout(0, speed.register_.type).highest * speed.per_lsb)
+        rpm = min(rpm, RegisterLayout(0, speed.register_.type).highest * speed.per_lsb)
     return rpm
 
 
 def _initial(
-    store: Parameters, profile: ModbusProfile, rig: RigParams, parameter: Parameter, rated_rpm: float
+    store: ParameterStore, profile: ModbusProfile, rig: RigParams, parameter: Parameter, rated_rpm: float
 ) -> float:
     lag_s = _lag_s(profile, rig, parameter.name)
     if lag_s is not None:
@@ -122,7 +122,7 @@ def _lag_s(profile: ModbusProfile, rig: RigParams, name: str) -> float | None:
     return None
 
 
-def _of_rig(store: Parameters, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
+def _of_rig(store: ParameterStore, rig: RigParams, parameter: Parameter, rated_rpm: float) -> float:
     drive = rig.drive
     kind = parameter.register_.type if parameter.register_ is not None else "i32"
     sign = -1.0 if kind[0] == "i" else 1.0
@@ -151,7 +151,7 @@ _BEYOND = 1e12
 """More than any register holds; finite."""
 
 
-class Parameters:
+class ParameterStore:
     """Numbers as they stand in the drive's registers, and their values."""
 
     def __init__(self, profile: ModbusProfile, rig: RigParams, wrongs: tuple[Wrong, ...] = ()) -> None:
@@ -205,7 +205,7 @@ class Parameters:
             self._stored[name] = value
         else:
             counts = min(max(value / self._scale_of(parameter), -_BEYOND), _BEYOND)
-            self._stored[name] = Layout(0, parameter.register_.type).saturated(counts)
+            self._stored[name] = RegisterLayout(0, parameter.register_.type).saturated(counts)
 
     def _scale_of(self, parameter: Parameter) -> float:
         # The time of a ramp names the speed at its upper end, which doesn't multiply it.
@@ -263,7 +263,7 @@ class Parameters:
         return self.value(parameter.times) if parameter.times is not None else self.rated_rpm
 
 
-def reporting_lag_s(profile: ModbusProfile, parameters: Parameters, signal: str) -> float | None:
+def reporting_lag_s(profile: ModbusProfile, parameters: ParameterStore, signal: str) -> float | None:
     """The smoothing that the drive itself tells or documents for a signal; None where the profile says nothing."""
     for one in profile.filters:
         if one.signal != signal:

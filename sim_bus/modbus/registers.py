@@ -22,12 +22,19 @@ from struct import Struct
 from typing import NamedTuple
 
 from profiles import MARKER_REGISTER, MARKER_REGISTERS, MARKER_STAGE_REGISTER, MARKER_TEXT
-from profiles.modbus import Echo, ModbusProfile, Register, Signal, Temperature
+from profiles.modbus import CyclicSignal, Echo, ModbusProfile, Register, Temperature
 from sim_bus.cia402 import Application
-from sim_bus.modbus.codec import Layout
-from sim_bus.modbus.control_words import Words
-from sim_bus.modbus.parameters import Parameters
-from sim_bus.modbus.wrong_maps import DeviceFailure, IllegalAddress, IllegalFunction, IllegalValue, Refused, Wrong
+from sim_bus.modbus.codec import RegisterLayout
+from sim_bus.modbus.control_words import ControlWords
+from sim_bus.modbus.parameters import ParameterStore
+from sim_bus.modbus.wrong_maps import (
+    DeviceFailure,
+    IllegalAddress,
+    IllegalFunction,
+    IllegalValue,
+    RequestRefused,
+    Wrong,
+)
 from sim_bus.reports import Feedback
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -45,7 +52,7 @@ HOT_C = 120.0
 class Slot:
     """One number in its registers. ``refuses`` raises what `sim_bus.modbus.wrong_maps` has; nothing is written then."""
 
-    layout: Layout
+    layout: RegisterLayout
     read: Callable[[], int]
     write: Callable[[int], None] | None = None
     refuses: Callable[[int], None] | None = None
@@ -56,7 +63,8 @@ class Slot:
 class Map:
     """All slots; of two on one register the first counts."""
 
-    def __init__(self, profile: ModbusProfile, parameters: Parameters, words: Words, wrongs: tuple[Wrong, ...],
+    def __init__(self, profile: ModbusProfile, parameters: ParameterStore, words: ControlWords,
+                 wrongs: tuple[Wrong, ...],
                  *, stepped: bool, on_stage: Callable[[int], None] = lambda _number: None) -> None:
         self._profile = profile
         self._parameters = parameters
@@ -76,7 +84,7 @@ class Map:
             self._lay(slot)
         self._stage = 0
         self._on_stage = on_stage
-        self._lay(Slot(Layout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
+        self._lay(Slot(RegisterLayout(MARKER_STAGE_REGISTER), lambda: self._stage, self._set_stage))
 
     def act(self) -> None:
         """Setpoints take effect; where the drive isn't listening, they keep."""
@@ -159,7 +167,7 @@ class Map:
                 slots.append(Slot(layout, partial(self._temperature, layout, one)))
         return slots
 
-    def _temperature(self, layout: Layout, one: Temperature) -> int:
+    def _temperature(self, layout: RegisterLayout, one: Temperature) -> int:
         """Its number, or a word with its bits as they must stand."""
         if one.too_hot is not None:
             return one.too_hot.value if self._is_hot else ~one.too_hot.value & one.too_hot.mask
@@ -171,7 +179,8 @@ class Map:
         return self.temperature_c > HOT_C
 
     def _families(self) -> list[Slot]:
-        return [Slot(Layout(address), extra.read, extra.write) for address, extra in self._words.extras().items()]
+        return [Slot(RegisterLayout(address), extra.read, extra.write) for address,
+                extra in self._words.extras().items()]
 
     def _settings(self) -> list[Slot]:
         """Parameters: what preflight sets, or a person at the drive, may be written."""
@@ -194,7 +203,7 @@ class Map:
 
     # -- helpers -------------------------------------------------------------------------------------------
 
-    def _reported(self, signal: Signal | Echo, quantity: Callable[[], float]) -> Slot:
+    def _reported(self, signal: CyclicSignal | Echo, quantity: Callable[[], float]) -> Slot:
         echo = isinstance(signal, Echo)
         layout = self._layout(signal.register_, echo=echo)
         parameters = self._parameters
@@ -205,10 +214,10 @@ class Map:
 
         return Slot(layout, read)
 
-    def _told(self, layout: Layout, name: str) -> int:
+    def _told(self, layout: RegisterLayout, name: str) -> int:
         return self._signed(layout, layout.saturated(self._parameters.number(name)))
 
-    def _to_si(self, signal: Signal, counts: int) -> float:
+    def _to_si(self, signal: CyclicSignal, counts: int) -> float:
         scale = self._parameters.scale(signal.per_lsb, signal.unit, signal.times)
         return self._parameters.si(counts * scale, signal.unit)
 
@@ -240,19 +249,19 @@ class Map:
             return 0
         return (display.torque if self._words.torque else display.speed) & display.mask
 
-    def _signed(self, layout: Layout, number: int) -> int:
+    def _signed(self, layout: RegisterLayout, number: int) -> int:
         """As the drive reports it."""
         if "sign" in self._wrongs and layout.signed:
             return layout.saturated(-number)
         return number
 
-    def _layout(self, register: Register, *, echo: bool = False) -> Layout:
+    def _layout(self, register: Register, *, echo: bool = False) -> RegisterLayout:
         signless = "unsigned" in self._wrongs and not echo
         kind = register.type.replace("i", "u") if signless else register.type
         high_first = self._profile.line.word_order == "high_first"
-        return Layout(register.address, kind, register.table, high_first is not ("word_order" in self._wrongs))
+        return RegisterLayout(register.address, kind, register.table, high_first is not ("word_order" in self._wrongs))
 
-    def _moved(self, layout: Layout) -> Layout:
+    def _moved(self, layout: RegisterLayout) -> RegisterLayout:
         return replace(layout, address=layout.address + 1) if "address_off_by_one" in self._wrongs else layout
 
     def _lay(self, slot: Slot) -> None:
@@ -267,14 +276,14 @@ class Map:
             for low, high in pairwise(taken):
                 if high - low - 1 <= largest:
                     for address in range(low + 1, high):
-                        self._lay(Slot(Layout(address, table=table), lambda: 0))
+                        self._lay(Slot(RegisterLayout(address, table=table), lambda: 0))
 
 
 def _marker(stepped: bool) -> Iterable[Slot]:
     text = MARKER_TEXT.encode("ascii").ljust(2 * MARKER_REGISTERS, b"\0")
     words = [int.from_bytes(text[at : at + 2], "big") for at in range(0, len(text), 2)]
     for number, word in enumerate([*words, int(stepped)]):
-        yield Slot(Layout(MARKER_REGISTER + number), lambda word=word: word)  # type: ignore[misc]
+        yield Slot(RegisterLayout(MARKER_REGISTER + number), lambda word=word: word)  # type: ignore[misc]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -322,7 +331,7 @@ class Bank:
             if code not in self._known:
                 raise IllegalFunction
             answer = self._known[code](pdu[1:])
-        except Refused as refused:
+        except RequestRefused as refused:
             return Answer(bytes((code | 0x80, refused.code)))
         return answer._replace(pdu=pdu[:1] + answer.pdu)
 

@@ -4,9 +4,9 @@ import select
 import threading
 import time
 
-from sim_bus.modbus.codec import NONE, Reply
+from sim_bus.modbus.codec import NONE, DriveReply
 from sim_bus.modbus.faults import Faults
-from sim_bus.modbus.lines import Listener, Request
+from sim_bus.modbus.lines import ReceivedRequest, RequestListener
 from sim_bus.modbus.machine import Machine
 
 _POLL_S = 0.005
@@ -15,16 +15,16 @@ _ANY_UNIT = 255
 """What a TCP host names where there is no gateway (messaging guide, section 4.4.1.2)."""
 
 
-class Server:
+class DriveServer:
     """One drive on one line, with what happens to its requests; `run` is the only thread."""
 
-    def __init__(self, machine: Machine, unit: int, listener: Listener, *, gateway: bool,
+    def __init__(self, machine: Machine, unit: int, listener: RequestListener, *, gateway: bool,
                  faults: Faults | None = None) -> None:
         self._machine = machine
         self._unit = unit
         self._listener = listener
         self._ask = (
-            (lambda pdu, connection: Reply(machine.request(pdu, connection))) if faults is None else faults.request
+            (lambda pdu, connection: DriveReply(machine.request(pdu, connection))) if faults is None else faults.request
         )
         self._whole = (unit, _BROADCAST, _ANY_UNIT) if gateway else (unit,)
         self._began_s = time.monotonic()
@@ -40,7 +40,7 @@ class Server:
             self._catch_up()
             self._machine.flush()
 
-    def _serve(self, request: Request) -> Reply:
+    def _serve(self, request: ReceivedRequest) -> DriveReply:
         self._catch_up()
         if request.unit in self._whole:
             return self._ask(request.pdu, request.connection)

@@ -12,6 +12,6 @@ if TYPE_CHECKING:
     from sim_bus.plant.kinds import (
         AnyPlantParams as AnyPlantParams, MotorState as MotorState, PLANTS as PLANTS, build as build,
     )
-    from sim_bus.plant.rigid import Params as Params, State as State
+    from sim_bus.plant.rigid import Params as Params, ShaftState as ShaftState
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from profiles import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import Shaft, advance_of
+from sim_bus.plant.friction import ShaftParams, advance_of
 from sim_bus.plant.two_mass import Bottom
 
 LONGEST_TICK_S = 0.002
@@ -41,7 +41,7 @@ MOST_CELLS = 20_000
 Wave = NDArray[np.float64]
 
 
-class StringParams(Shaft):
+class StringParams(ShaftParams):
     """The motor's end, as a rigid shaft has it, the pipe (5 inch, 19.5 lb/ft), and the bottom."""
 
     kind: Literal["string"] = "string"
@@ -178,6 +178,6 @@ class DrillString:
             self.tick_s)
         return speed, angle + travel, bristle, travel
 
-    def _with_string(self, shaft: Shaft) -> Shaft:
+    def _with_string(self, shaft: ShaftParams) -> ShaftParams:
         seen = shaft.viscous_nm_s_rad + self.impedance_nm_s_rad + 0.5 * self._drag
         return shaft.model_copy(update={"viscous_nm_s_rad": seen})

@@ -49,7 +49,7 @@ class Rigid:
     """`sim_bus.plant.rigid` as a `Plant`."""
 
     def __init__(self, params: Params) -> None:
-        self.rest = rigid.State
+        self.rest = rigid.ShaftState
         self.step = partial(rigid.step, params)
 
 

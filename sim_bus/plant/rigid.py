@@ -10,16 +10,16 @@ is in `sim_bus.plant.two_mass` and `sim_bus.plant.drill_string`; `sim_bus.plant.
 
 from typing import Literal, NamedTuple
 
-from sim_bus.plant.friction import Shaft, advance_of, torque
+from sim_bus.plant.friction import ShaftParams, advance_of, torque
 
 
-class Params(Shaft):
+class Params(ShaftParams):
     """What the shaft is. The defaults are the field-like rig of the identification study."""
 
     kind: Literal["rigid"] = "rigid"
 
 
-class State(NamedTuple):
+class ShaftState(NamedTuple):
     """Where the shaft is: speed, angle, and the deflection of the bristle (0 without one)."""
 
     speed_rad_s: float = 0.0
@@ -27,7 +27,7 @@ class State(NamedTuple):
     bristle_rad: float = 0.0
 
 
-def step(params: Params, state: State, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> State:
+def step(params: Params, state: ShaftState, torque_nm: float, dt_s: float, load_nm: float = 0.0) -> ShaftState:
     """The state ``dt_s`` later, under constant torque.
 
     ``load_nm`` acts against positive speed, on top of the constant load.
@@ -36,9 +36,9 @@ def step(params: Params, state: State, torque_nm: float, dt_s: float, load_nm: f
     drive = torque_nm - load_nm - params.load_nm
     move = advance_of(params)
     speed, bristle, travel = move(params, speed, bristle, drive, dt_s)
-    return State(speed, angle + travel, bristle)
+    return ShaftState(speed, angle + travel, bristle)
 
 
-def friction_torque(params: Params, state: State, drive_nm: float = 0.0) -> float:
+def friction_torque(params: Params, state: ShaftState, drive_nm: float = 0.0) -> float:
     """Dry friction in N·m, as it acts against motion; where the model sticks, at rest it balances ``drive_nm``."""
     return torque(params, state.speed_rad_s, state.bristle_rad, drive_nm)

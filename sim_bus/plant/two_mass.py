@@ -23,14 +23,14 @@ from typing import Literal, NamedTuple, Self
 from pydantic import model_validator
 
 from profiles import NonNegative, Positive, refuse_if
-from sim_bus.plant.friction import Shaft, advance_of
+from sim_bus.plant.friction import ShaftParams, advance_of
 
 FASTEST_RAD_S = 1000.0
 """Swings beyond this would take hundreds of pieces per step."""
 _CUT = 0.1
 
 
-class Bottom(Shaft):
+class Bottom(ShaftParams):
     """What turns at the lower end."""
 
     inertia_kg_m2: Positive = 374.0
@@ -39,7 +39,7 @@ class Bottom(Shaft):
     static_nm: NonNegative = 40.0
 
 
-class TwoMassParams(Shaft):
+class TwoMassParams(ShaftParams):
     """The motor's end, as a rigid shaft has it, the spring, and the bottom."""
 
     kind: Literal["two_mass"] = "two_mass"

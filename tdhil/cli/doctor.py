@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drivers import DataFileError, TdhilError
-from tdhil.cli.doctor_finding import Finding, bad, note, of_error, ok
+from tdhil.cli.doctor_finding import DoctorFinding, bad, note, of_error, ok
 from tdhil.cli.results import print_json
 from tdhil.cli.scan_common import bus_commands
 from tdhil.session.real_time import HOW, allowed
@@ -44,7 +44,7 @@ LATE_S = 0.002
 NAPS, NAP_S = 50, 0.002
 
 
-def host_findings(log: Path) -> Iterator[Finding]:
+def host_findings(log: Path) -> Iterator[DoctorFinding]:
     """All of it; ``log`` says on which disk a run would write."""
     yield ok("computer", f"{platform.system()} {platform.release()}, Python {platform.python_version()}")
     yield from library_findings(_version)
@@ -54,7 +54,7 @@ def host_findings(log: Path) -> Iterator[Finding]:
     yield disk_finding(log)
 
 
-def library_findings(version_of: Callable[[str], str | None]) -> Iterator[Finding]:
+def library_findings(version_of: Callable[[str], str | None]) -> Iterator[DoctorFinding]:
     """Is each library there, and not older than this program needs?"""
     pip = f"{shlex.quote(sys.executable or 'python')} -m pip"      # of this environment, whichever is active
     for name, least in LIBRARIES.items():
@@ -68,7 +68,7 @@ def library_findings(version_of: Callable[[str], str | None]) -> Iterator[Findin
             yield ok(name, version)
 
 
-def timer_finding(resolution_s: float) -> Finding:
+def timer_finding(resolution_s: float) -> DoctorFinding:
     """How finely the monotonic clock counts."""
     text = f"resolution {resolution_s * 1e9:.3g} ns"
     if resolution_s <= TIMER_RESOLUTION_S:
@@ -76,7 +76,7 @@ def timer_finding(resolution_s: float) -> Finding:
     return note("timer", f"{text}: coarse", "Lower --rate, so that a cycle is at least ten ticks")
 
 
-def jitter_finding(late_s: Sequence[float]) -> Finding:
+def jitter_finding(late_s: Sequence[float]) -> DoctorFinding:
     """How late a sleeping process wakes up, from some naps."""
     ordered = sorted(late_s)
     typical, worst = ordered[len(ordered) // 2], ordered[-1]
@@ -86,7 +86,7 @@ def jitter_finding(late_s: Sequence[float]) -> Finding:
     return note("scheduling", text, "Close other programs, plug the laptop in; or run at a lower --rate")
 
 
-def priority_finding(why_no_priority: str, why_not_locked: str) -> Finding:
+def priority_finding(why_no_priority: str, why_not_locked: str) -> DoctorFinding:
     """May the control loop go before everything else, and is its memory its own?"""
     both = (("priority", why_no_priority), ("locked memory", why_not_locked))
     missing = [f"{name}: {why}" for name, why in both if why]
@@ -106,7 +106,7 @@ def naps(now_s: Callable[[], float], sleep: Callable[[float], None]) -> list[flo
     return late
 
 
-def disk_finding(log: Path) -> Finding:
+def disk_finding(log: Path) -> DoctorFinding:
     """Room for a log, where it would be written."""
     folder = log.absolute().parent
     try:
@@ -161,7 +161,7 @@ def run(namespace: argparse.Namespace) -> int:
     if options.json is True:
         namespace.json = True
     registers: list[ValueSeen] = []
-    found: list[Finding] = []
+    found: list[DoctorFinding] = []
     for one in findings(vars(namespace), rig, options, registers):
         found.append(one)
         if not namespace.json:
@@ -178,7 +178,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def findings(
     cli: Mapping[str, Any], rig: Rig | None, options: RunOptions, registers: list[ValueSeen]
-) -> Iterator[Finding]:
+) -> Iterator[DoctorFinding]:
     """From the computer to the drive; ``registers`` is filled with what a person may compare."""
     from tdhil.session import connection_of, plan_peer
 
@@ -200,7 +200,7 @@ def findings(
         )
 
 
-def _left(folder: Path) -> Iterator[Finding]:
+def _left(folder: Path) -> Iterator[DoctorFinding]:
     """What runs that died have left in their drives."""
     from drivers.undo_journal import PREFIX, SUFFIX, read
 
@@ -215,7 +215,7 @@ def _left(folder: Path) -> Iterator[Finding]:
                   "and remove the file")
 
 
-def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
+def _profile(options: RunOptions, connection: Connection) -> Iterator[DoctorFinding]:
     from tdhil.cli.profile_text import sure_text
     from tdhil.session import doubtful, is_accepted
 
@@ -228,7 +228,7 @@ def _profile(options: RunOptions, connection: Connection) -> Iterator[Finding]:
                    f"A run on a real drive is refused until they are: tdhil profiles show {profile.name}")
 
 
-def _limits(rig: Rig | None) -> Iterator[Finding]:
+def _limits(rig: Rig | None) -> Iterator[DoctorFinding]:
     if rig is not None and rig.limits is not None:
         limits = rig.limits
         yield ok("limits", f"{limits.speed_max_rad_s:g} rad/s, {limits.torque_nm:g} N·m ({rig.source('limits')})")
@@ -253,7 +253,7 @@ def _show_registers(registers: list[ValueSeen]) -> None:
     PlainConsole().print(table)
 
 
-def _dump(found: list[Finding], registers: list[ValueSeen], code: int) -> None:
+def _dump(found: list[DoctorFinding], registers: list[ValueSeen], code: int) -> None:
     print_json({
         "checks": [asdict(one) for one in found],
         "registers": [one.plain() for one in registers],

@@ -13,7 +13,7 @@ Grade = Literal["ok", "note", "bad"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorFinding:
     """``bad`` is what would keep a run from starting, or make it unsafe; ``do``: what mends it."""
 
     grade: Grade
@@ -28,28 +28,28 @@ class Finding:
         return visible(f"{line}\n{'':<22} → {self.do}" if self.do else line, keep="\n")
 
 
-def ok(name: str, said: str) -> Finding:
+def ok(name: str, said: str) -> DoctorFinding:
     """As it should be."""
-    return Finding("ok", name, said)
+    return DoctorFinding("ok", name, said)
 
 
-def note(name: str, said: str, do: str = "") -> Finding:
+def note(name: str, said: str, do: str = "") -> DoctorFinding:
     """Worth a line, and no obstacle."""
-    return Finding("note", name, said, do)
+    return DoctorFinding("note", name, said, do)
 
 
-def bad(name: str, said: str, do: str) -> Finding:
+def bad(name: str, said: str, do: str) -> DoctorFinding:
     """An obstacle."""
-    return Finding("bad", name, said, do)
+    return DoctorFinding("bad", name, said, do)
 
 
-def of_error(name: str, error: TdhilError) -> Finding:
+def of_error(name: str, error: TdhilError) -> DoctorFinding:
     """An error of the tree as a line: what and where; its next step is what to do."""
     said = f"{error.where}: {error.what}" if error.where else error.what
     return bad(name, said, error.next_step or "See the message")
 
 
-def of_check(check: Check) -> Finding:
+def of_check(check: Check) -> DoctorFinding:
     """A row of a preflight table as a line."""
     at = f" ({check.where})" if check.where else ""
     if check.outcome is Outcome.REFUSED:
@@ -59,9 +59,9 @@ def of_check(check: Check) -> Finding:
     return ok("setting", said) if check.outcome is Outcome.OK else note("setting", said, check.next_step)
 
 
-def attempted(name: str, work: Callable[[], Iterable[Finding]]) -> list[Finding]:
+def attempted(name: str, work: Callable[[], Iterable[DoctorFinding]]) -> list[DoctorFinding]:
     """What ``work`` finds, up to where it fails: then that failure is the last line."""
-    found: list[Finding] = []
+    found: list[DoctorFinding] = []
     try:
         for one in work():
             found.append(one)  # noqa: PERF402 (what came before the failure counts)

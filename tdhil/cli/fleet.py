@@ -84,7 +84,7 @@ def run_watch(namespace: argparse.Namespace) -> int:
     if not folder.is_dir():
         raise UsageError("there is no such folder", where=str(folder))
     request = _request(namespace, (str(folder),), namespace.out or folder / "fleet.csv")
-    watch = Watch(request)
+    watch = FolderWatch(request)
     if not namespace.once and sys.stderr.isatty():
         print(f"watching {folder}, table {request.out}; Ctrl-C ends it", file=sys.stderr)  # noqa: T201
     while True:
@@ -95,7 +95,7 @@ def run_watch(namespace: argparse.Namespace) -> int:
         time.sleep(namespace.every)
 
 
-class Watch:
+class FolderWatch:
     """What was there the last time, and what is done. A file that grows without a lock (a copy that is under way) is
     left until it is the same at two looks.
     """
@@ -142,7 +142,7 @@ def _tell(row: FleetRow, as_json: bool) -> None:
 
 
 def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -> FleetRequest:
-    from tdhil.fleet import FleetRequest, Settings
+    from tdhil.fleet import FleetRequest, FleetSettings
     from tdhil.process_pool import TaskLimits, usable_cores
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
@@ -156,7 +156,7 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
     if not namespace.memory_limit >= 100:
         raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
     return FleetRequest(
-        roots, out, Settings(namespace.model, namespace.confidence, namespace.tolerance),
+        roots, out, FleetSettings(namespace.model, namespace.confidence, namespace.tolerance),
         jobs=namespace.jobs or usable_cores(),
         scheduler=getattr(namespace, "scheduler", None),
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from profiles import Confidence, Entry, Profile, Require
+from profiles import Confidence, Profile, ProfileEntry, Require
 from profiles.modbus import ModbusProfile, Register
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -37,7 +37,7 @@ class RegisterUse:
     per_lsb: float | None
     unit: str                   # as people write it
     times: str | None
-    entry: Entry
+    entry: ProfileEntry
 
     @property
     def address(self) -> str:
@@ -147,7 +147,7 @@ def required_text(require: Require, unit: str) -> str:
     return f"{', '.join(parts)} {unit}".strip()
 
 
-def facts_of(entry: Entry) -> Iterator[tuple[str, str, str]]:
+def facts_of(entry: ProfileEntry) -> Iterator[tuple[str, str, str]]:
     """(key, value, what the schema says of it) of everything an entry claims, below nested sections too."""
     yield from _facts(entry, "")
 
@@ -155,7 +155,8 @@ def facts_of(entry: Entry) -> Iterator[tuple[str, str, str]]:
 def _facts(model: BaseModel, prefix: str) -> Iterator[tuple[str, str, str]]:
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
-        if name in ("source", "confidence") or isinstance(value, Entry) or _entries(value) or value in (None, ()):
+        if (name in ("source", "confidence") or isinstance(value, ProfileEntry) or _entries(value)
+                or value in (None, ())):
             continue
         key = prefix + (field.alias or name)
         if isinstance(value, BaseModel):
@@ -168,7 +169,7 @@ def _facts(model: BaseModel, prefix: str) -> Iterator[tuple[str, str, str]]:
 
 
 def _entries(value: Any) -> bool:
-    return isinstance(value, tuple) and bool(value) and isinstance(value[0], Entry)
+    return isinstance(value, tuple) and bool(value) and isinstance(value[0], ProfileEntry)
 
 
 def _flat(model: BaseModel) -> str:

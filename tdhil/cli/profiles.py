@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from profiles import DataFileError, Entry, Profile, eds_path, load_profile, matching_names, profile_names
+from profiles import DataFileError, Profile, ProfileEntry, eds_path, load_profile, matching_names, profile_names
 from profiles.canopen import CanopenProfile, Parameter
 from profiles.modbus import ModbusProfile
 from profiles.modbus import Parameter as ModbusParameter
@@ -143,7 +143,7 @@ def _filters(profile: ModbusProfile, console: Console) -> None:
             console.print(f"  {name}: {note}", markup=False)
 
 
-def _section(name: str, entry: Entry, console: Console) -> None:
+def _section(name: str, entry: ProfileEntry, console: Console) -> None:
     table = _table(f"{name} ({entry.confidence}: {entry.source})", "", "", "")
     table.show_header = False
     for key, value, said in facts_of(entry):

@@ -12,7 +12,7 @@ from tdhil.config import BUSES, imported
 
 if TYPE_CHECKING:
     from profiles import Profile
-    from tdhil.cli.doctor_finding import Finding
+    from tdhil.cli.doctor_finding import DoctorFinding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
 
@@ -68,7 +68,7 @@ class BusCommands(ABC):
     @abstractmethod
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
-    ) -> Iterator[Finding]:
+    ) -> Iterator[DoctorFinding]:
         """What doctor has to say of the bus and of the drive; ``seen`` is filled with values to compare."""
 
     def add_scan_arguments(self, scan: argparse._ArgumentGroup) -> None:

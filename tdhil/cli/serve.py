@@ -139,11 +139,11 @@ def run_accounts(namespace: argparse.Namespace) -> int:
 def run_audit(namespace: argparse.Namespace) -> int:
     """Print the head of the audit's chain. Raises LogBroken where the chain doesn't hold."""
     from tdhil.errors import LogBroken
-    from tdhil.service import Audit, Head, require_folder
+    from tdhil.service import Audit, ChainHead, require_folder
 
     require_folder(namespace.data)
     audit = Audit(namespace.data.resolve() / "audit")
-    kept = None if namespace.head is None else Head.of(namespace.head)
+    kept = None if namespace.head is None else ChainHead.of(namespace.head)
     if (broken := audit.verify(kept)) is not None:
         place = f"{broken.file}:{broken.line}" if broken.file else str(namespace.data)
         raise LogBroken(f"the audit's chain doesn't hold: {broken.why}", where=place,

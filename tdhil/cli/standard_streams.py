@@ -28,7 +28,7 @@ class OutputLost(TdhilError):
     exit_code = ExitCode.PARTIAL
 
 
-class Watched:
+class WatchedStream:
     """A stream whose refusals are its own: of stdout an `OutputLost`, of stderr nothing, for there is no place left."""
 
     def __init__(self, stream: TextIO, *, needed: bool) -> None:
@@ -82,8 +82,8 @@ def sheltered() -> Iterator[None]:
         if hasattr(stream, "reconfigure"):
             with suppress(OSError, ValueError):
                 stream.reconfigure(errors=_HANDLER)
-    sys.stderr = cast(TextIO, Watched(err, needed=False))
-    sys.stdout = cast(TextIO, Watched(sys.stdout, needed=True)) if sys.stdout is not None else sys.stderr
+    sys.stderr = cast(TextIO, WatchedStream(err, needed=False))
+    sys.stdout = cast(TextIO, WatchedStream(sys.stdout, needed=True)) if sys.stdout is not None else sys.stderr
     try:
         yield
     finally:

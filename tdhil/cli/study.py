@@ -55,7 +55,7 @@ class SimulatedFieldBench:
                     peer, options, simulated_connection(options), None, log.frame, None
                 ) as drive:
                     make_task = partial(_task, options, rig)
-                    outcome = Runner(drive, make_task, log, stop_request, _Progress(progress), _no_prompt).run()
+                    outcome = Runner(drive, make_task, log, stop_request, _ProgressDisplay(progress), _no_prompt).run()
             finally:
                 log.close()
         _raise_if_ended(outcome)
@@ -129,7 +129,7 @@ def _raise_if_ended(outcome: RunOutcome) -> None:
         raise not_confirmed(outcome.stop)
 
 
-class _Progress:
+class _ProgressDisplay:
     """A display that turns cycles into a share of the run."""
 
     def __init__(self, report: Callable[[float], None]) -> None:

@@ -65,7 +65,7 @@ def run(namespace: argparse.Namespace) -> int:
 
 def run_compare(namespace: argparse.Namespace) -> int:
     """Identify each, hold them beside the first."""
-    from tdhil.fleet import Settings, compare_document, identified
+    from tdhil.fleet import FleetSettings, compare_document, identified
 
     if len(namespace.logs) < 2:
         raise UsageError("one log has nothing to be compared with", next_step="Name two or more")
@@ -75,7 +75,7 @@ def run_compare(namespace: argparse.Namespace) -> int:
     if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
         raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
     _check_report(namespace.report, namespace.logs)
-    settings = Settings(namespace.model, namespace.confidence)
+    settings = FleetSettings(namespace.model, namespace.confidence)
     document = compare_document([identified(log, settings) for log in namespace.logs])
     if namespace.json:
         print_json(document)

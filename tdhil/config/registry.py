@@ -14,7 +14,7 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Entry:
+class RegistryEntry:
     """``at``: ``module:attribute`` of the object; ``text``: what it is.
 
     What a recording's excitation is to those who can't import it: ``periodic``, it has lines and whole periods;
@@ -30,7 +30,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class BusEntry(Entry):
+class BusEntry(RegistryEntry):
     """``at``: what a run asks of the bus, a `tdhil.session.connection.BusKind`: its options, how a drive is opened.
 
     ``commands``: what scan, doctor and rig new do on it, a `tdhil.cli.scan_common.BusCommands`. Both stand in modules
@@ -40,26 +40,28 @@ class BusEntry(Entry):
     commands: str = ""
 
 
-EXCITATIONS: dict[str, Entry] = {
-    "multisine": Entry("tdhil.runner.excitation.signals:MULTISINE", "several tones at once, of a low crest", True),
-    "sine": Entry("tdhil.runner.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
-    "step": Entry("tdhil.runner.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True,
-                  True),
-    "prbs": Entry("tdhil.runner.excitation.signals:PRBS", "pseudo-random torque, for a drill string on bottom", True,
-                  before_echo=True),
-    "pulses": Entry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
-    "coast-down": Entry("tdhil.runner.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
+EXCITATIONS: dict[str, RegistryEntry] = {
+    "multisine": RegistryEntry("tdhil.runner.excitation.signals:MULTISINE", "several tones at once, of a low crest",
+                               True),
+    "sine": RegistryEntry("tdhil.runner.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
+    "step": RegistryEntry("tdhil.runner.excitation.signals:STEP",
+                          "a square wave of speed (equation 9 of the paper)", True, True),
+    "prbs": RegistryEntry("tdhil.runner.excitation.signals:PRBS",
+                          "pseudo-random torque, for a drill string on bottom", True, before_echo=True),
+    "pulses": RegistryEntry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
+    "coast-down": RegistryEntry("tdhil.runner.excitation.pulses:COAST_DOWN",
+                                "without torque down, under power back up"),
 }
 """Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
 
 DEFAULT_EXCITATION = "multisine"
 
-MODELS: dict[str, Entry] = {
-    "auto": Entry("tdhil.estimation.frequency_domain.shafts:AUTO", "the simplest that fits"),
-    "rigid": Entry("tdhil.estimation.frequency_domain.shafts:RIGID", "one inertia, with reporting lags"),
-    "two-mass": Entry("tdhil.estimation.frequency_domain.shafts:TWO_MASS", "two masses on a spring"),
-    "string": Entry("tdhil.estimation.frequency_domain.shafts:STRING", "a string with a mass at its end"),
-    "paper": Entry("tdhil.estimation.frequency_domain.shafts:PAPER", "rigid, by the paper's method: no lags"),
+MODELS: dict[str, RegistryEntry] = {
+    "auto": RegistryEntry("tdhil.estimation.frequency_domain.shafts:AUTO", "the simplest that fits"),
+    "rigid": RegistryEntry("tdhil.estimation.frequency_domain.shafts:RIGID", "one inertia, with reporting lags"),
+    "two-mass": RegistryEntry("tdhil.estimation.frequency_domain.shafts:TWO_MASS", "two masses on a spring"),
+    "string": RegistryEntry("tdhil.estimation.frequency_domain.shafts:STRING", "a string with a mass at its end"),
+    "paper": RegistryEntry("tdhil.estimation.frequency_domain.shafts:PAPER", "rigid, by the paper's method: no lags"),
 }
 """What the shaft is taken for."""
 
@@ -78,7 +80,7 @@ section of rig.yaml, a field of `tdhil.config.rig.Rig`.
 DEFAULT_BUS = "canopen"
 
 
-def load(registry: Mapping[str, Entry], name: str) -> Any:
+def load(registry: Mapping[str, RegistryEntry], name: str) -> Any:
     """Import what stands behind a name. KeyError where there is none of that name."""
     return imported(registry[name].at)
 
@@ -89,7 +91,7 @@ def imported(at: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def names(registry: Mapping[str, Entry], *, periodic: bool = False) -> list[str]:
+def names(registry: Mapping[str, RegistryEntry], *, periodic: bool = False) -> list[str]:
     """What there is, in its order; of the excitations, the periodic ones alone where asked."""
     return [name for name, entry in registry.items() if entry.periodic or not periodic]
 

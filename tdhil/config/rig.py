@@ -22,7 +22,7 @@ from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
 from profiles import Conversion, DataModel, Finding, Loaded, load_with_lines, messages_of, one_of, parse_with_lines
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, Entry, names
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
@@ -37,7 +37,7 @@ class Registered:
     ``periodic``: of the excitations, those with lines alone.
     """
 
-    registry: Mapping[str, Entry]
+    registry: Mapping[str, RegistryEntry]
     periodic: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:

@@ -24,4 +24,6 @@ from tdhil.estimation.samples import (
     Stretch as Stretch, excited_window as excited_window, repeats as repeats, stretches as stretches,
     usable_samples as usable_samples,
 )
-from tdhil.estimation.spectrum import Line as Line, period_lines as period_lines, pooled_lines as pooled_lines
+from tdhil.estimation.spectrum import (
+    SpectralLine as SpectralLine, period_lines as period_lines, pooled_lines as pooled_lines,
+)

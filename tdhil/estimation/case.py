@@ -21,7 +21,7 @@ from tdhil.estimation.result import (
     rejects,
 )
 from tdhil.estimation.samples import Samples, Stretch
-from tdhil.estimation.spectrum import Line, PeriodLines
+from tdhil.estimation.spectrum import PeriodLines, SpectralLine
 from tdhil.recording import Recording, Stage
 
 
@@ -62,13 +62,13 @@ class PeriodicCase(Case):
     stretches: tuple[Stretch, ...]
     fits: tuple[PeriodLines, ...]
     constraint: ViscousConstraint | None
-    every: tuple[Line, ...]
-    lines: tuple[Line, ...] = ()
-    usable: tuple[Line, ...] = ()
+    every: tuple[SpectralLine, ...]
+    lines: tuple[SpectralLine, ...] = ()
+    usable: tuple[SpectralLine, ...] = ()
 
 
 @dataclass(frozen=True)
-class Words:
+class ModelWords:
     """A model in the reader's words, and what to do next: where the data contradict it, where its interval is wide.
 
     ``what`` ``explains`` the data; ``spread``: what is called too wide; ``digits``: of p where it is contradicted.
@@ -82,12 +82,12 @@ class Words:
     digits: int = 1
 
 
-_NONE, _WORDLESS = Refusal("", ""), Words()
+_NONE, _WORDLESS = Refusal("", ""), ModelWords()
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a route makes of a case, in one form whichever route: `verdict.conclude` makes the verdict of it.
+    """What a route makes of a case, in one form whichever route: `conclude` makes the verdict of it.
 
     ``inertia``: as the data have it, bounded; None where the residuals contradict the model, of which then nothing else
     is told, and where it can't be told, as the ``refusal`` says. ``conditions``: what J is conditional on besides the
@@ -99,7 +99,7 @@ class Finding:
     """
 
     model: str = "none"
-    words: Words = _WORDLESS
+    words: ModelWords = _WORDLESS
     residual: ResidualTest | None = None
     refusal: Refusal = _NONE
     inertia: Estimate | None = None

@@ -1,8 +1,8 @@
 """Hopeless data, recognised before anything is fitted to them: each with what is wrong and what would mend it.
 
 In the order of the questions: are these samples; can the excitation have been so, and was it sampled fast enough
-(`declared`); did anything move; did a limit shape it (`clipped`)? What the lines help to tell (a wrong period, a wrong
-sign, a shaft that stood still) is asked later, in `line_faults`.
+(`check_declared`); did anything move; did a limit shape it (`check_limited`)? What the lines help to tell (a wrong
+period, a wrong sign, a shaft that stood still) is asked later, in `excitation_checks`.
 """
 
 import math

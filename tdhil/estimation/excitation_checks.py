@@ -9,7 +9,7 @@ from tdhil.estimation.case import PeriodicCase
 from tdhil.estimation.friction_levels import Levels, warming_warning
 from tdhil.estimation.result import Refused
 from tdhil.estimation.samples import Samples, Stretch, excited_window, left_out_warnings
-from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
 from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ _CLEAR_SIGN = 5.0      # sd by which Im(T W*) must be below zero at one line at 
 _COPY = 1e-3      # relative
 
 
-def check_direction(lines: tuple[Line, ...], mean_speed: float, mean_torque: float) -> None:
+def check_direction(lines: tuple[SpectralLine, ...], mean_speed: float, mean_torque: float) -> None:
     """Raise Refused if at every one of the excited lines torque trails speed; means in rad/s and N·m."""
     if not lines:
         return
@@ -58,7 +58,7 @@ def check_direction(lines: tuple[Line, ...], mean_speed: float, mean_torque: flo
     )
 
 
-def _copied(lines: tuple[Line, ...]) -> bool:
+def _copied(lines: tuple[SpectralLine, ...]) -> bool:
     """Is T/W one and the same real number, at lines an octave apart or more?"""
     if lines[-1].hertz < 2.0 * lines[0].hertz:
         return False

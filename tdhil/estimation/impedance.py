@@ -92,7 +92,7 @@ _MORE: Final = "let it run for longer (--periods), or with more room in limits.t
 
 
 @dataclass(frozen=True)
-class Line:
+class ImpedanceLine:
     """One excited frequency: M segments' speed and torque, and the covariance of such a mean, of ``nu`` complex dof."""
 
     hertz: float
@@ -108,7 +108,7 @@ class Line:
         return bool(np.all(np.abs(self.x) ** 2 > _CLEAR * noise[None, :]))
 
 
-def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[Line, ...]:
+def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[ImpedanceLine, ...]:
     """Of every segment's longest run of whole periods; () where one has too few."""
     pieces = []
     for stretch, fit_ in zip(case.stretches, case.fits, strict=True):
@@ -124,7 +124,8 @@ def lines_of(case: PeriodicCase, asked: ImpedanceInput) -> tuple[Line, ...]:
         noise = [np.einsum("ni,nj->ij", piece[3][k], piece[3][k].conj()) for piece in pieces]
         covariance: ComplexArray = np.sum(noise, axis=0) / nu + np.mean([np.diag(piece[4]) for piece in pieces], axis=0)
         found.append(
-            Line(hertz, np.array([piece[1][k] for piece in pieces]), np.array([piece[2][k] for piece in pieces]),
+            ImpedanceLine(hertz, np.array([piece[1][k] for piece in pieces]),
+                          np.array([piece[2][k] for piece in pieces]),
                  covariance, nu)
         )
     return tuple(found)
@@ -215,7 +216,7 @@ class _Prior:
 
 
 @dataclass(frozen=True)
-class Problem:
+class ImpedanceProblem:
     """K lines of M segments: ``x`` (K, M, 2) speed and torque, ``u`` (K, M) the command; ``white`` (K, 2, 2)."""
 
     by: str
@@ -284,7 +285,7 @@ def excitation_of(by: str, theta: FloatArray, s: ComplexArray, declared_s: float
     return found
 
 
-def _problem(case: PeriodicCase, asked: ImpedanceInput) -> Problem | DriveImpedance:
+def _problem(case: PeriodicCase, asked: ImpedanceInput) -> ImpedanceProblem | DriveImpedance:
     lines = lines_of(case, asked)
     if len(lines) < _LEAST_LINES:
         return refusal(asked, f"{case.periods_used} usable whole periods are too few to know the noise", _MORE)
@@ -297,7 +298,7 @@ def _problem(case: PeriodicCase, asked: ImpedanceInput) -> Problem | DriveImpeda
         )
     covariance: ComplexArray = np.array([line.covariance for line in lines], dtype=np.complex128)
     white: ComplexArray = np.linalg.inv(np.linalg.cholesky(covariance)).astype(np.complex128)
-    return Problem(
+    return ImpedanceProblem(
         by=asked.by,
         declared_s=asked.reference_filter_s,
         s=np.array([2j * np.pi * line.hertz for line in lines], dtype=np.complex128),
@@ -338,7 +339,7 @@ def _prior(index: int, mean: float, sd: float) -> _Prior:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedImpedance:
     """The best theta, which parameters moved and came to rest inside their bounds, and −2 ln L up to a constant."""
 
     theta: FloatArray
@@ -347,11 +348,11 @@ class Fitted:
     scale: FloatArray
 
 
-def fit(problem: Problem, *, with_filter: bool = False) -> Fitted:
+def fit(problem: ImpedanceProblem, *, with_filter: bool = False) -> FittedImpedance:
     """``with_filter``: a first-order reference filter is fitted as well."""
     held = {REFERENCE_FILTER} if not with_filter or problem.by == OFFSET else set()
     stated = {int(np.argmax(one.row)): one.mean for one in problem.priors if np.count_nonzero(one.row) == 1}
-    best: Fitted | None = None
+    best: FittedImpedance | None = None
     for lags in _STARTS_S:
         speed, torque = stated.get(SPEED_REPORT, lags[0]), stated.get(TORQUE_REPORT, lags[1])
         found = _descended(problem, _start(problem, speed, torque, stated[DELAY], with_filter), held)
@@ -360,7 +361,7 @@ def fit(problem: Problem, *, with_filter: bool = False) -> Fitted:
     return best
 
 
-def _descended(problem: Problem, start: FloatArray, held: set[int]) -> Fitted:
+def _descended(problem: ImpedanceProblem, start: FloatArray, held: set[int]) -> FittedImpedance:
     inertia, viscous, gain, integral = (float(start[k]) for k in (INERTIA, VISCOUS, GAIN, INTEGRAL))
     friction = max(abs(viscous), 0.01 * gain, 0.01 * inertia)
     scale = np.array([inertia, friction, gain, integral, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005, 0.05])
@@ -377,10 +378,10 @@ def _descended(problem: Problem, start: FloatArray, held: set[int]) -> Fitted:
     )
     near = _AT_BOUND * scale
     inside = free & (found.theta > low + near) & (found.theta < high - near)
-    return Fitted(found.theta, inside, found.objective, scale)
+    return FittedImpedance(found.theta, inside, found.objective, scale)
 
 
-def _start(problem: Problem, speed_s: float, torque_s: float, delay_s: float, with_filter: bool) -> FloatArray:
+def _start(problem: ImpedanceProblem, speed_s: float, torque_s: float, delay_s: float, with_filter: bool) -> FloatArray:
     s, u = problem.s[:, None], problem.u
     omega = problem.x[:, :, 0] * (1.0 + speed_s * s)
     torque = problem.x[:, :, 1] * (1.0 + torque_s * s)
@@ -412,10 +413,10 @@ def _real_fit(columns: Sequence[NDArray[np.complex128]], target: NDArray[np.comp
 # What is told: values with intervals by the quadratic approximation, and the residual test.
 
 
-class _Spread:
+class _ThetaSpread:
     """Covariance of theta, and the degrees of freedom of whatever is made of it."""
 
-    def __init__(self, problem: Problem, fitted: Fitted, confidence: float) -> None:
+    def __init__(self, problem: ImpedanceProblem, fitted: FittedImpedance, confidence: float) -> None:
         self._fitted, self._confidence = fitted, confidence
         self._moved = np.flatnonzero(fitted.inside)
         slopes = problem.slopes(fitted.theta, fitted.scale)[:, self._moved]
@@ -451,7 +452,7 @@ class _Spread:
         return tuple(found)
 
 
-def residual_test(problem: Problem, fitted: Fitted) -> ResidualTest | None:
+def residual_test(problem: ImpedanceProblem, fitted: FittedImpedance) -> ResidualTest | None:
     """Bartlett's form of Wilks' Λ line by line, (2ν + M − 2) ln det(1 + S⁻¹ Σ e eᴴ/ν) ~ χ²(4M), and the priors'."""
     from scipy.special import chdtrc
 
@@ -470,7 +471,7 @@ def residual_test(problem: Problem, fitted: Fitted) -> ResidualTest | None:
     return ResidualTest(float(statistic), left, float(chdtrc(left, statistic)))
 
 
-def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: Problem) -> DriveImpedance:
+def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProblem) -> DriveImpedance:
     fitted = fit(problem)
     test = residual_test(problem, fitted)
     bare = replace(refusal(asked, "", ""), residual=test, conditions=_conditions(case, asked))
@@ -492,7 +493,7 @@ def _conclude(case: PeriodicCase, asked: ImpedanceInput, problem: Problem) -> Dr
             advice="does a string or a brake hang on the shaft, has the loop another structure (a feed-forward, a ramp,"
             " a notch), or do the reports have other filters than first-order lags?",
         )
-    spread = _Spread(problem, fitted, confidence)
+    spread = _ThetaSpread(problem, fitted, confidence)
     gains = spread.around(
         lambda theta: np.array([
             theta[GAIN], theta[INTEGRAL], theta[TORQUE_LAG] + theta[SPEED_FILTER], theta[TORQUE_LAG],
@@ -523,17 +524,17 @@ def _not_below_zero(one: Estimate) -> Estimate:
     return Estimate(one.value, max(one.low, 0.0), one.high)
 
 
-def _undeclared(problem: Problem, plain: Fitted, confidence: float) -> Estimate | None:
+def _undeclared(problem: ImpedanceProblem, plain: FittedImpedance, confidence: float) -> Estimate | None:
     """A reference filter that the data want, past chance."""
     found = fit(problem, with_filter=True)
     if plain.objective - found.objective < _REFERENCE_GAIN or not found.inside[REFERENCE_FILTER]:
         return None
-    spread = _Spread(problem, found, confidence)
+    spread = _ThetaSpread(problem, found, confidence)
     return _not_below_zero(spread.around(lambda theta: theta[[REFERENCE_FILTER]])[0])
 
 
 def _points(
-    case: PeriodicCase, asked: ImpedanceInput, problem: Problem, fitted: Fitted, spread: _Spread
+    case: PeriodicCase, asked: ImpedanceInput, problem: ImpedanceProblem, fitted: FittedImpedance, spread: _ThetaSpread
 ) -> tuple[ImpedancePoint, ...]:
     lines = problem.s.imag / (2.0 * math.pi)
     grid = np.geomspace(lines.min(), lines.max(), _POINTS)
@@ -570,7 +571,7 @@ def reflection(impedance: ComplexArray, string_nm_s_rad: float) -> FloatArray:
     return found
 
 
-def _seen(problem: Problem, fitted: Fitted) -> dict[float, tuple[float, float]]:
+def _seen(problem: ImpedanceProblem, fitted: FittedImpedance) -> dict[float, tuple[float, float]]:
     """Z that each line shows by itself: E u/ω, the reported speed without its lag."""
     theta, s = fitted.theta, problem.s
     driven = excitation_of(problem.by, theta, s, problem.declared_s) / (1.0 + theta[SPEED_REPORT] * s)

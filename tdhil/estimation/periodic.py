@@ -34,7 +34,7 @@ from tdhil.estimation.frequency_domain import (
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, measure_levels, tie_viscous
 from tdhil.estimation.result import Refusal, Refused, doubtful
 from tdhil.estimation.samples import Stretch, log_warnings, stretches
-from tdhil.estimation.spectrum import Line, PeriodLines, period_lines, pooled_lines
+from tdhil.estimation.spectrum import PeriodLines, SpectralLine, period_lines, pooled_lines
 from tdhil.recording import Excitation
 
 _ROUGH_REL_SD = 0.1
@@ -163,7 +163,7 @@ def _settled(case: PeriodicCase) -> PeriodicCase:
     return replace(case, every=every, usable=usable) if usable else case
 
 
-def _rigid(case: PeriodicCase, lines: tuple[Line, ...]) -> RigidResult | None:
+def _rigid(case: PeriodicCase, lines: tuple[SpectralLine, ...]) -> RigidResult | None:
     """What a rigid shaft makes of the lines; None if the arithmetic breaks down, which only data can cause that passed
     every test before. Raises Refused where the lines are too few.
     """

@@ -149,7 +149,7 @@ class PeriodLines:
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """One frequency: M segment means and the pooled covariance of a single period.
 
     ``speed``, ``torque`` (M,) complex; ``periods`` (M,) whole numbers; ``nu`` complex degrees of freedom.
@@ -255,7 +255,7 @@ def _turned(time_s: FloatArray, lines_hz: tuple[float, ...]) -> ComplexArray:
 
 def pooled_lines(
     fits: tuple[PeriodLines, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
-) -> tuple[Line, ...]:
+) -> tuple[SpectralLine, ...]:
     """Lines in rising frequency, pooled over the segments that have them; only those with a scatter to go by.
 
     ``viscous``: B as the levels tell it (0 if they don't), for the ramp of torque that a ramp of speed needs.
@@ -287,7 +287,7 @@ def torque_lines(fit: PeriodLines, viscous: float, warming_nm_s: float) -> Compl
 
 def _pool(
     hertz: float, speeds: list[ComplexArray], torques: list[ComplexArray], rounding: list[FloatArray]
-) -> Line | None:
+) -> SpectralLine | None:
     """``rounding``: of each segment, as large as if it came anew in every period."""
     nu = float(sum(len(speed) - 1 for speed in speeds))
     if nu < 1.0:
@@ -307,4 +307,4 @@ def _pool(
     s_ww += _FLOOR * float(np.max(np.abs(mean_speed) ** 2))
     s_tt += _FLOOR * float(np.max(np.abs(mean_torque) ** 2))
     counts = np.array([float(len(speed)) for speed in speeds])
-    return Line(hertz, mean_speed, mean_torque, counts, s_ww, s_tt, s_tw, nu)
+    return SpectralLine(hertz, mean_speed, mean_torque, counts, s_ww, s_tt, s_tw, nu)

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
         FleetRequest as FleetRequest, FleetSummary as FleetSummary, Progress as Progress, find_logs as find_logs,
         run_fleet as run_fleet,
     )
-    from tdhil.fleet.rows import FleetRow as FleetRow, Settings as Settings, counted as counted, row_of as row_of
+    from tdhil.fleet.rows import (
+        FleetRow as FleetRow, FleetSettings as FleetSettings, counted as counted, row_of as row_of,
+    )
     from tdhil.fleet.table import load_duckdb as load_duckdb, read_table as read_table
     from tdhil.fleet.task import Done as Done, LogTask as LogTask, identify_log as identify_log
     from tdhil.fleet.trend import (

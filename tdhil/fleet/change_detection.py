@@ -180,7 +180,7 @@ def _shared(results: Sequence[Measured], relative: bool) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class _ChangeEvidence:
     none: float
     step: float
     drift: float
@@ -191,7 +191,7 @@ class _Evidence:
     drift_sd: float
 
 
-def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray) -> _Evidence:
+def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArray) -> _ChangeEvidence:
     n = len(x)
     steps = np.tri(n, n - 1, -1)                               # column c: 0 up to result c, then 1
     span = time[-1] - time[0]
@@ -231,7 +231,7 @@ def _evidence(x: FloatArray, sd: FloatArray, shared: FloatArray, time: FloatArra
     second = np.sum(posterior * (np.array(variances) + np.array(means) ** 2), axis=0)
     deviation = np.sqrt(np.maximum(second - mean**2, 0.0))
     places = p_steps / max(float(p_steps.sum()), 1e-300)
-    return _Evidence(
+    return _ChangeEvidence(
         p_none / whole, float(p_steps.sum()) / whole, p_drift / whole, places, mean[:-1], deviation[:-1],
         float(mean[-1]), float(deviation[-1]),
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from tdhil.errors import LogError, TdhilError, UsageError
-from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_key
+from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_key
 from tdhil.fleet.table import Journal, check_table_path, write_table
 from tdhil.fleet.task import Done, LogTask, content_hash, identify_log, remote, sidecar_of, told_of
 from tdhil.process_pool import Loss, Pool, TaskLimits
@@ -32,7 +32,7 @@ class FleetRequest:
 
     roots: tuple[str, ...]
     out: Path
-    settings: Settings = field(default_factory=Settings)
+    settings: FleetSettings = field(default_factory=FleetSettings)
     jobs: int = 1
     scheduler: str | None = None
     limits: TaskLimits = field(default_factory=TaskLimits)
@@ -260,7 +260,7 @@ def _stamp(log: str) -> Stamp:
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundLogs:
     """Logs in their order; those that are being written; traces of which nothing is known."""
 
     logs: tuple[str, ...]
@@ -268,7 +268,7 @@ class Found:
     bare_traces: tuple[str, ...]
 
 
-def find_logs(roots: Sequence[str]) -> Found:
+def find_logs(roots: Sequence[str]) -> FoundLogs:
     """Every .mcap, and every .csv with a sidecar, below the folders; a file that is named itself whatever it ends in.
 
     Raises UsageError for a root that isn't there. What can't be listed is left out with a row of its own later: a file
@@ -292,7 +292,7 @@ def find_logs(roots: Sequence[str]) -> Found:
                         _sort_in(Path(folder) / name, logs, live, bare, named=False)
         else:
             raise UsageError("there is no such file or folder", where=root, next_step=_meant(path))
-    return Found(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
+    return FoundLogs(tuple(sorted(logs)), tuple(sorted(live)), tuple(sorted(bare)))
 
 
 def _meant(path: Path) -> str:

@@ -20,7 +20,7 @@ UNREAD: Final = "unread"
 
 
 @dataclass(frozen=True)
-class Settings:
+class FleetSettings:
     """What is asked of every log alike; None: as each run had it (`tdhil.identify`)."""
 
     model: str | None = None
@@ -142,7 +142,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def row_key(sha256: str, settings: Settings) -> str:
+def row_key(sha256: str, settings: FleetSettings) -> str:
     """What a result hangs on: the file's content, this program's version, what was asked for."""
     text = json.dumps([ROW_FORMAT, __version__, sha256, settings.asked()], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
@@ -167,7 +167,7 @@ def row_of(
     log: str,
     document: Mapping[str, Any],
     *,
-    settings: Settings,
+    settings: FleetSettings,
     stored: Mapping[str, Any] | None = None,
     **facts: Any,
 ) -> FleetRow:
@@ -223,7 +223,7 @@ def row_of(
     )
 
 
-def failure_row(log: str, kind: str, text: str, settings: Settings, **facts: Any) -> FleetRow:
+def failure_row(log: str, kind: str, text: str, settings: FleetSettings, **facts: Any) -> FleetRow:
     """The row of a log that gave nothing; ``kind`` is the error's class, ``text`` what it said."""
     return FleetRow(
         log=log, verdict=UNREAD, error_kind=kind, error_text=" ".join(text.split())[:1000],

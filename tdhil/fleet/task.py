@@ -15,7 +15,7 @@ from pydantic import Field
 
 from profiles import DataModel
 from tdhil.errors import LogError, NothingRecoverable, TdhilError, UsageError
-from tdhil.fleet.rows import FleetRow, Settings, failure_row, row_of
+from tdhil.fleet.rows import FleetRow, FleetSettings, failure_row, row_of
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class LogTask:
     """``log``: a path, or a URL that fsspec can open; ``cache``: a folder for recordings that were read, or None."""
 
     log: str
-    settings: Settings = field(default_factory=Settings)
+    settings: FleetSettings = field(default_factory=FleetSettings)
     cache: str | None = None
 
 
@@ -232,7 +232,7 @@ def told_of(url: str) -> Iterator[None]:
 
 
 def _from_cache(kept: Path) -> RunRecord | None:
-    from tdhil.recording import Ended, unpack_recording
+    from tdhil.recording import RunEnd, unpack_recording
     from tdhil.session import RunRecord
 
     found = unpack_recording(kept)
@@ -244,7 +244,7 @@ def _from_cache(kept: Path) -> RunRecord | None:
         return RunRecord(
             recording, beside["configuration"], beside["log"],
             None if beside["assumed"] is None else tuple(beside["assumed"]), tuple(beside["problems"]),
-            None if ended is None else Ended(**ended), beside["stored_result"],
+            None if ended is None else RunEnd(**ended), beside["stored_result"],
         )
     except (KeyError, TypeError):
         return None

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from tdhil.errors import UsageError
 from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
-from tdhil.fleet.rows import FleetRow, Settings, counted, row_of
+from tdhil.fleet.rows import FleetRow, FleetSettings, counted, row_of
 from tdhil.fleet.task import content_hash, read_any
 
 _GOOD: Final = ("valid", "valid_wide")
@@ -182,7 +182,7 @@ class Compared:
     settings: Mapping[str, str]
 
 
-def identified(log: Path, settings: Settings) -> Compared:
+def identified(log: Path, settings: FleetSettings) -> Compared:
     """Identify one log for a comparison. Raises TdhilError."""
     from tdhil.session import conclude
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
         TorqueAnswer as TorqueAnswer, ABORTED as ABORTED, aborted_stage as aborted_stage,
         before_abort as before_abort,
     )
-    from tdhil.recording.run_log import Ended as Ended, RunLog as RunLog, find_ended as find_ended
+    from tdhil.recording.run_log import RunEnd as RunEnd, RunLog as RunLog, find_ended as find_ended
     from tdhil.recording.salvage import Salvage as Salvage, examine as examine, write_copy as write_copy
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -85,7 +85,7 @@ class SampleBlock:
 
 
 @dataclass(frozen=True)
-class Message:
+class RawMessage:
     """One message as it stands in its chunk, not decoded yet."""
 
     number: int
@@ -114,7 +114,7 @@ class ChunkTable:
     def messages(
         self, first: int, last: int, numbers: Mapping[int, int], samples: int, commands: int, skipped: frozenset[int],
         before: TorqueCommand,
-    ) -> tuple[SampleBlock | None, TorqueCommand, list[Message], bool] | None:
+    ) -> tuple[SampleBlock | None, TorqueCommand, list[RawMessage], bool] | None:
         """The samples of the plain chunks from ``first`` to before ``last``, the last command, the other messages, and
         was any of ours?
 
@@ -143,7 +143,7 @@ class ChunkTable:
                 return None
         others = np.flatnonzero((number_of != 0) & ~is_sample & ~is_command & ~np.isin(number_of, tuple(skipped)))
         found = [
-            Message(int(number_of[k]), self._data[at[k] + _MESSAGE_HEAD:at[k] + length[k]]) for k in others.tolist()
+            RawMessage(int(number_of[k]), self._data[at[k] + _MESSAGE_HEAD:at[k] + length[k]]) for k in others.tolist()
         ]
         return block, TorqueCommand(*commanded[-1].tolist()), found, bool(number_of.any())
 

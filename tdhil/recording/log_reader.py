@@ -98,7 +98,7 @@ _BUFFER: Final = 2**17                 # bytes; most of reading is small reads, 
 
 
 class Ours(NamedTuple):
-    """One message on one of our channels, not decoded yet; ``number`` is the channel's in `channels`."""
+    """One message on one of our channels, not decoded yet; ``number`` is the channel's in `CHANNELS`."""
 
     number: int
     payload: bytes

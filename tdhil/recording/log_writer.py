@@ -1,10 +1,10 @@
 """The log of a run as it is written: a cheap front for the control loop, a thread behind it for all the rest.
 
-The front appends to a bounded queue and does nothing else. The thread (`pump`) empties the queue every 50 ms, lays
+The front appends to a bounded queue and does nothing else. The thread (`Pump`) empties the queue every 50 ms, lays
 out the messages, and closes a chunk after 0.25 s of wall time or 0.2 s of control time, whichever comes first:
 a kill costs less than half a second. In stepped time, where control time runs ahead of the wall, the front wakes
 the thread as soon as 256 records wait, and itself waits where the file is 0.4 s of control time behind. A third
-thread (`sync`) has the disk take what was written, against a loss of power.
+thread (`Syncer`) has the disk take what was written, against a loss of power.
 """
 
 import errno

@@ -6,7 +6,7 @@
 
 Only what stands in chunks counts, since only that has a CRC; indexes and summary are stepped over. Where the
 records make no sense any more, the next chunk is looked for by the name of its compression and its consistent
-lengths. Nothing is decompressed beyond the limit of a chunk (`inflate`), nor in sum beyond `TOTAL_LIMIT`.
+lengths. Nothing is decompressed beyond the limit of a chunk (`contents`), nor in sum beyond `TOTAL_LIMIT`.
 """
 
 import re

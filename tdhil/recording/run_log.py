@@ -24,7 +24,7 @@ from tdhil.recording.recording import Excitation, FloatArray, Level, Ramp, Recor
 
 
 @dataclass(frozen=True)
-class Ended:
+class RunEnd:
     """``kind`` is the error's class, such as DriveFault; ``time_s`` is control time; ``exit_code`` is the run's."""
 
     kind: str
@@ -45,10 +45,10 @@ def ended_by(error: BaseException, time_s: float) -> dict[str, Any]:
     what, where, next_step = str(error), "", ""
     if isinstance(error, TdhilError):
         what, where, next_step = error.what, error.where, error.next_step
-    return asdict(Ended(type(error).__name__, what, where, next_step, int(exit_code(error)), time_s))
+    return asdict(RunEnd(type(error).__name__, what, where, next_step, int(exit_code(error)), time_s))
 
 
-def find_ended(configuration: Mapping[str, Any], events: tuple[Event, ...]) -> Ended | None:
+def find_ended(configuration: Mapping[str, Any], events: tuple[Event, ...]) -> RunEnd | None:
     """What ended the run of this log; None where it came to its end, or where the log ends first.
 
     Logs of before 0.2 have it in an event only, in words.
@@ -56,17 +56,17 @@ def find_ended(configuration: Mapping[str, Any], events: tuple[Event, ...]) -> E
     found = configuration.get("ended")
     if isinstance(found, Mapping):
         text = {name: str(found.get(name, "")) for name in ("kind", "what", "where", "next_step")}
-        return Ended(**text, exit_code=_code(found.get("exit_code")), time_s=_number(found.get("time_s")))
+        return RunEnd(**text, exit_code=_code(found.get("exit_code")), time_s=_number(found.get("time_s")))
     for event in events:
         if event.kind == INTERRUPTED:
             by_hand = "Ctrl-C" in event.text
             code = ExitCode.INTERRUPTED if by_hand else ExitCode.TERMINATED
-            return Ended(Interrupted.__name__, event.text, "", "", int(code), event.time_s)
+            return RunEnd(Interrupted.__name__, event.text, "", "", int(code), event.time_s)
         if event.kind == FAILURE:
             kind, _, said = event.text.partition(": ")
             known = {one.__name__: one for one in _below(TdhilError)}.get(kind)
             code = exit_code(known("")) if known is not None and known is not Interrupted else ExitCode.INTERNAL
-            return Ended(kind, said, "", "", int(code), event.time_s)
+            return RunEnd(kind, said, "", "", int(code), event.time_s)
     return None
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
         print_evaluation as print_evaluation, write_evaluation_report as write_evaluation_report,
     )
     from tdhil.report.html import (
-        Shown as Shown, check_report_path as check_report_path, pictures_in as pictures_in,
+        ShownPicture as ShownPicture, check_report_path as check_report_path, pictures_in as pictures_in,
         write_report as write_report,
     )
     from tdhil.report.live import LiveDisplay as LiveDisplay, stderr_console as stderr_console

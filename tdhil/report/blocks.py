@@ -32,7 +32,7 @@ _VERDICTS = {
 
 
 @dataclass(frozen=True)
-class Answer:
+class AnswerBox:
     """The box at the top; ``colour`` green, yellow or red."""
 
     colour: str
@@ -88,7 +88,7 @@ Block = Text | Pairs | Table | Picture
 
 
 @dataclass(frozen=True)
-class Section:
+class ReportSection:
     """Blocks under a heading."""
 
     heading: str
@@ -102,9 +102,9 @@ class Report:
     title: str
     subtitle: str
     simulated: str
-    answer: Answer
+    answer: AnswerBox
     warnings: tuple[str, ...]
-    sections: tuple[Section, ...]
+    sections: tuple[ReportSection, ...]
     footer: str
 
 
@@ -134,7 +134,7 @@ def shown_date(text: str | None) -> str:
     return f"{moment:%Y-%m-%d %H:%M} {moment.tzname() or ''}".strip()
 
 
-def _answer(document: Part) -> Answer:
+def _answer(document: Part) -> AnswerBox:
     inertia, shaft = document["inertia_kg_m2"], document["compliant"]
     value, lines = "No number", []
     if inertia is not None:
@@ -148,7 +148,7 @@ def _answer(document: Part) -> Answer:
             lines.append(f"at the main shaft {inertia_text(document['inertia_main_shaft_kg_m2'], '_total')}")
         if inertia["high_total"] > inertia["high"]:
             lines.append(f"repeatability, this drive: {inertia_text(inertia)}")
-    return Answer(
+    return AnswerBox(
         colour=_COLOURS.get(document["verdict"], "red"),
         value=value,
         lines=tuple(lines),
@@ -158,16 +158,16 @@ def _answer(document: Part) -> Answer:
     )
 
 
-def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Section]:
+def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[ReportSection]:
     from tdhil.report.plots import draw_budget, draw_friction, draw_lines, draw_opinions, draw_run
 
-    yield Section("The run", (Pairs(tuple(_run_rows(document, recording))),))
+    yield ReportSection("The run", (Pairs(tuple(_run_rows(document, recording))),))
     if len(recording.time_s):
         picture = Picture(partial(draw_run, recording=recording), 2.9, "As reported, nothing smoothed. Green: steady "
                           "levels. Blue: the excitation, its settling lighter.")
-        yield Section("Speed and torque", (picture,))
+        yield ReportSection("Speed and torque", (picture,))
     if (impedance := document.get("impedance")) is not None:
-        yield Section("The drive's own impedance", tuple(_impedance(impedance)))
+        yield ReportSection("The drive's own impedance", tuple(_impedance(impedance)))
     if document["inertia_kg_m2"] is not None or document["second_opinions"]:
         rows = len(document["second_opinions"]) + 4
         picture = Picture(
@@ -176,7 +176,7 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Sec
             "scale with the result, and little else: where the two differ by more than their intervals, one of the "
             "assumptions is wrong.", names_left=True,
         )
-        yield Section("All that this run says of the inertia", (picture, *_opinions(document)))
+        yield ReportSection("All that this run says of the inertia", (picture, *_opinions(document)))
     if document["lines"]:
         picture = Picture(
             partial(draw_lines, document=document), 3.0,
@@ -184,24 +184,24 @@ def _sections(document: Part, recording: Recording, sha256: str) -> Iterator[Sec
             "because the drive reports speed and torque late. The model explains all of them with one J, the band. "
             "Below: what it leaves unexplained, in standard deviations; about 1 is chance.",
         )
-        yield Section("Torque against acceleration, line by line", (picture,))
+        yield ReportSection("Torque against acceleration, line by line", (picture,))
     if document["budget"]:
         picture = Picture(
             partial(draw_budget, document=document), 0.5 + 0.18 * len(document["budget"]),
             "The half-width that each source alone would leave. They add up in squares, about. The torque scale counts "
             "in the interval to quote, and not in the repeatability.", names_left=True,
         )
-        yield Section("What makes it unsure", (picture, _budget(document)))
+        yield ReportSection("What makes it unsure", (picture, _budget(document)))
     if document["friction_curve"]:
         picture = Picture(partial(draw_friction, document=document), 1.8,
                           "Torque at steady speed, load included; no lag touches it.")
-        yield Section("Friction over speed", (picture, _friction(document)))
-    yield Section("Numbers", tuple(_numbers(document)))
+        yield ReportSection("Friction over speed", (picture, _friction(document)))
+    yield ReportSection("Numbers", tuple(_numbers(document)))
     if document["lines"]:
-        yield Section("Lines", (_lines(document),))
+        yield ReportSection("Lines", (_lines(document),))
     if document["stages"]:
-        yield Section("Stages", (_stages(document),))
-    yield Section("What it rests on", (Pairs(tuple(_grounds(document, recording, sha256))),))
+        yield ReportSection("Stages", (_stages(document),))
+    yield ReportSection("What it rests on", (Pairs(tuple(_grounds(document, recording, sha256))),))
 
 
 # -- what the run was ----------------------------------------------------------------------------------------

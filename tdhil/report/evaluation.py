@@ -12,7 +12,7 @@ import numpy as np
 from rich.text import Text as Words
 
 from tdhil.recording import FloatArray, Recording
-from tdhil.report.blocks import Answer, Column, Pairs, Picture, Report, Section, Table, shown_date
+from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, shown_date
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED, provenance
 from tdhil.report.html import sha256_of, write_blocks
@@ -137,7 +137,7 @@ def write_evaluation_report(document: Part, rows: FloatArray, path: Path) -> Pat
 def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Report:
     """The blocks of the page."""
     facts = [document["string"] or "a virtual string", shown_date(document["date"])]
-    sections = [Section("Measured, and as tune says", (
+    sections = [ReportSection("Measured, and as tune says", (
         Table((Column("", 0.34), Column("measured", 0.33, number=True), Column("by tune", 0.33, number=True)),
               tuple(_beside(document))),
     ))]
@@ -146,21 +146,21 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
             Picture(partial(draw_close, rows=rows, phase=Phase(phase), before_s=before_s), 1.9, caption)
             for phase, before_s, caption in _CLOSE if np.any(rows[:, COLUMNS.index("phase")] == phase)
         )
-        sections.append(Section("Bit and top drive", (
+        sections.append(ReportSection("Bit and top drive", (
             *shown,
             Picture(partial(draw_course, rows=rows), 3.4,
                     "The whole course: the ramp of the set speed, and trials at steady set speeds, each from a bit "
                     "about to break away. Below: torque of drive and string at the main shaft."),
         )))
     if document["trials"]:
-        sections.append(Section("Trials", (
+        sections.append(ReportSection("Trials", (
             Table((Column("set speed, rpm", 0.3, number=True), Column("the bit ends", 0.7)),
                   tuple((f"{one['set_rpm']:.1f}", "turning" if one["turns"] else "sticking")
                         for one in sorted(document["trials"], key=lambda one: float(one["set_rpm"])))),
         )))
     sections += [
-        Section("What it rests on", (Pairs(tuple(_rests_on(document))),)),
-        Section("Run", (Pairs(tuple(_run(document, sha256))),)),
+        ReportSection("What it rests on", (Pairs(tuple(_rests_on(document))),)),
+        ReportSection("Run", (Pairs(tuple(_run(document, sha256))),)),
     ]
     return Report(
         title="Speed controller on a virtual drill string",
@@ -173,13 +173,13 @@ def evaluation_report(document: Part, rows: FloatArray, sha256: str = "") -> Rep
     )
 
 
-def _answer(document: Part) -> Answer:
+def _answer(document: Part) -> AnswerBox:
     verdict, critical, law = document["verdict"], document["critical_rpm"], document["controller"]
     value = "No critical speed" if critical is None else f"The bit is freed from {critical['value']:.1f} rpm"
     gains = law["at_main_shaft"]
     line = (f"{law['kind']} controller, in {'the drive' if law['own_loop'] else 'the host'}: P = "
             f"{gains['gain_nm_s_rad']:.4g} N·m·s/rad, I = {gains['integral_nm_rad']:.4g} N·m/rad at the main shaft")
-    return Answer(_COLOURS.get(verdict, "red"), value, (line,), _VERDICTS[verdict], f"{document['reason']}.", "")
+    return AnswerBox(_COLOURS.get(verdict, "red"), value, (line,), _VERDICTS[verdict], f"{document['reason']}.", "")
 
 
 def _beside(document: Part) -> Iterator[tuple[str, str, str]]:

@@ -97,7 +97,7 @@ def sha256_of(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownPicture:
     """A picture of a page, as an SVG of its own, with the heading above it and the words below."""
 
     heading: str
@@ -105,14 +105,14 @@ class Shown:
     svg: str
 
 
-def pictures_in(page: str) -> tuple[Shown, ...]:
+def pictures_in(page: str) -> tuple[ShownPicture, ...]:
     """The pictures of a page that `report_page` made, in their order."""
     found, heading = [], ""
     for part in _PARTS.finditer(page):
         if part["heading"] is not None:
             heading = unescape(part["heading"])
         else:
-            found.append(Shown(heading, unescape(part["caption"]), part["svg"]))
+            found.append(ShownPicture(heading, unescape(part["caption"]), part["svg"]))
     return tuple(found)
 
 

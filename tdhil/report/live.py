@@ -158,7 +158,7 @@ _SWITCH_S = 0.0005
 
 
 @dataclass(frozen=True)
-class View:
+class LiveView:
     """What there is to show at one moment; never changed, only replaced."""
 
     expected_s: Mapping[str, float]
@@ -174,14 +174,14 @@ class View:
 class LiveDisplay:
     """Drawn in place on a terminal; elsewhere a line a stage. Costs a clock reading a cycle.
 
-    Nothing here writes: a thread does (`painter`), from a view that no longer changes once it is handed over.
+    Nothing here writes: a thread does (`Painter`), from a view that no longer changes once it is handed over.
     """
 
     def __init__(self, console: Console, show_preflight: bool) -> None:
         self._console = console
         self._show_preflight = show_preflight
         self._painter = Painter()
-        self._view = View(expected_s=dict(_EXPECTED_S))
+        self._view = LiveView(expected_s=dict(_EXPECTED_S))
         self._started_s: float | None = None
         self._next_s = 0.0
         self._live: Live | None = None         # the painter's own
@@ -285,21 +285,21 @@ class LiveDisplay:
 
     # -- in the painter's thread ------------------------------------------------------------------------------
 
-    def _draw(self, view: View) -> None:
+    def _draw(self, view: LiveView) -> None:
         if self._live is None and view.taken:
             self._live = Live(console=self._console, auto_refresh=False, transient=False)
             self._live.start()
         if self._live is not None:
             self._live.update(picture(view), refresh=True)
 
-    def _let_go(self, view: View) -> None:
+    def _let_go(self, view: LiveView) -> None:
         if self._live is not None:
             self._live.update(picture(view), refresh=True)
             self._live.stop()
             self._live = None
 
 
-def picture(view: View) -> RenderableType:
+def picture(view: LiveView) -> RenderableType:
     """Stages, bars, speed and torque."""
     table = Table.grid(padding=(0, 1))
     table.add_column(width=1)

@@ -12,7 +12,7 @@ from functools import lru_cache
 from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
-from tdhil.report.blocks import WIDTH_IN, Answer, Column, Pairs, Picture, Report, Section, Table, Text
+from tdhil.report.blocks import WIDTH_IN, AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.page import lay_out, repeatable_figures
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def _write(sheets: _Sheets, report: Report) -> None:
         _section(sheets, section)
 
 
-def _answer(sheets: _Sheets, answer: Answer) -> None:
+def _answer(sheets: _Sheets, answer: AnswerBox) -> None:
     width, colour = INNER - 26.0, _COLOURS[answer.colour]
     big = wrapped(answer.value, 15.0, width, "bold")
     lines = [part for line in answer.lines for part in wrapped(line, BODY, width)]
@@ -208,7 +208,7 @@ def _warning(sheets: _Sheets, warning: str) -> None:
 _HEADING = 21.0         # with the rule below it
 
 
-def _section(sheets: _Sheets, section: Section) -> None:
+def _section(sheets: _Sheets, section: ReportSection) -> None:
     """The heading goes with the first block, or with the first rows of a table that is longer than a sheet."""
     heading: str | None = section.heading
     for block in section.blocks:
@@ -252,8 +252,9 @@ def _picture(sheets: _Sheets, heading: str | None, block: Picture) -> None:
 
 def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
     columns = block.columns if isinstance(block, Table) else (Column("", 0.27), Column("", 0.73))
-    rows = [_Row(columns, cells) for cells in block.rows]
-    head = _Row(columns, tuple(column.title for column in columns), head=True) if isinstance(block, Table) else None
+    rows = [_TableRow(columns, cells) for cells in block.rows]
+    head = _TableRow(columns, tuple(column.title for column in columns), head=True) if isinstance(block,
+                                                                                                  Table) else None
     head_height = head.height if head is not None else 0.0
     height = head_height + sum(row.height for row in rows)
     above = 13.0 + _HEADING if heading is not None else 5.0
@@ -275,7 +276,7 @@ def _table(sheets: _Sheets, heading: str | None, block: Table | Pairs) -> None:
         heading, above = None, 5.0
 
 
-class _Row:
+class _TableRow:
     """One row of a table, its cells wrapped to their columns."""
 
     def __init__(self, columns: Sequence[Column], cells: Sequence[str], head: bool = False) -> None:
@@ -303,7 +304,7 @@ class _Row:
         on.rule(y + self.height)
 
 
-def _draw_rows(on: _Sheets, y: float, head: _Row | None, rows: Sequence[_Row]) -> None:
+def _draw_rows(on: _Sheets, y: float, head: _TableRow | None, rows: Sequence[_TableRow]) -> None:
     for row in ([head] if head is not None else []) + list(rows):
         row.draw(on, y)
         y += row.height

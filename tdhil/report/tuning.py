@@ -13,7 +13,7 @@ from rich import box
 from rich.table import Table as Grid
 from rich.text import Text as Words
 
-from tdhil.report.blocks import Answer, Column, Pairs, Picture, Report, Section, Table, Text
+from tdhil.report.blocks import AnswerBox, Column, Pairs, Picture, Report, ReportSection, Table, Text
 from tdhil.report.card import with_interval
 from tdhil.report.console import PlainConsole, names_and_texts
 from tdhil.report.document import SIMULATED
@@ -25,8 +25,8 @@ from tdhil.soft_torque import (
     CriticalSpeeds,
     DriveSetting,
     Interval,
+    SimulationTrace,
     SpeedController,
-    Trace,
     TuneCase,
     Tuned,
     Tuning,
@@ -347,7 +347,7 @@ class Showcase:
 
     set_rpm: float
     kinds: tuple[str, ...]
-    trace: Trace
+    trace: SimulationTrace
 
 
 def showcase_of(tuning: Tuning, seconds: float = 60.0) -> Showcase | None:
@@ -383,31 +383,31 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     # what any drive can take goes first: a proportional gain and an integral time
     best = next((one for kind in ("soft", "compensated") for one in taken if one["kind"] == kind), None)
     sections = [
-        Section("Controllers", (
+        ReportSection("Controllers", (
             Table((Column("", 0.24), *(Column(one["kind"], 0.76 / max(1, len(taken)), number=True) for one in taken)),
                   tuple((name, *cells) for name, cells in _rows(document))),
             Pairs(tuple((one["kind"], _WHAT[one["kind"]]) for one in taken)),
             *(Text(f"{one['kind']} refused: {one['refused']}") for one in document["controllers"] if one["refused"]),
         )),
-        Section("What the top drive sends back up the string", (
+        ReportSection("What the top drive sends back up the string", (
             Picture(partial(draw_reflection, document=document), 2.6,
                     "|r(f)| at the top of the string: 1 is a wall, 0 swallows every wave. Dotted: the string's modes "
                     "with the top held."),
         )),
-        Section("Modes and their damping", (
+        ReportSection("Modes and their damping", (
             Picture(partial(draw_modes, document=document), 2.3,
                     "Damping ratio of each mode of string and top drive together; the lowest pair decides."),
         )),
     ]
     if showcase is not None:
-        sections.append(Section("Stick-slip, with and without", (
+        sections.append(ReportSection("Stick-slip, with and without", (
             Picture(partial(draw_showcase, showcase=showcase), 1.7 * len(showcase.kinds) + 0.5,
                     f"Simulated: a stuck bit at a set speed of {showcase.set_rpm:.0f} rpm; the bit in colour, the top "
                     "drive in grey."),
         )))
     settings = list(_setting_rows(document))
     if settings:
-        sections.append(Section("To be typed into the drive, by hand", (
+        sections.append(ReportSection("To be typed into the drive, by hand", (
             Table((Column("parameter", 0.4), Column("value", 0.45), Column("how sure", 0.15)), tuple(settings)),
             Text("Nothing here was written into any drive. Change one thing at a time, at a low speed, with the "
                  "hard-wired stop in reach."),
@@ -415,7 +415,7 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     rests: list[tuple[str, str]] = list(_rests_on(document))
     rests += [("from", document["tuned_for"]["source"]), ("profile", document["tuned_for"]["profile"] or "none")]
     rests += _legend(document)
-    sections.append(Section("What it rests on", (Pairs(tuple(rests)),)))
+    sections.append(ReportSection("What it rests on", (Pairs(tuple(rests)),)))
     simulated = document["tuned_for"]["simulated"]
     return Report(
         title="Speed controller and drill string",
@@ -428,10 +428,10 @@ def tuning_report(document: Part, showcase: Showcase | None) -> Report:
     )
 
 
-def _answer(best: Part | None, document: Part) -> Answer:
+def _answer(best: Part | None, document: Part) -> AnswerBox:
     if best is None:
-        return Answer("red", "No tuned controller", (), "refused",
-                      "Nothing softer than the stiff loop can be recommended.", "")
+        return AnswerBox("red", "No tuned controller", (), "refused",
+                         "Nothing softer than the stiff loop can be recommended.", "")
     gains = best["at_motor"]
     lines = [f"at the motor shaft; {best['kind']}: {_WHAT[best['kind']]}"]
     if gains["compensated_kg_m2"]:
@@ -442,7 +442,7 @@ def _answer(best: Part | None, document: Part) -> Answer:
         cure = _speed(best["critical_rpm"]["cure"], document)
         reason += f" With the bit as stated, a stuck bit is freed from {cure} rpm."
     headline = f"P = {_gain(gains['gain_nm_s_rad'])} N·m·s/rad, I = {_gain(gains['integral_nm_rad'])} N·m/rad"
-    return Answer("green", headline, tuple(lines), "most damping that these two gains can give", reason, "")
+    return AnswerBox("green", headline, tuple(lines), "most damping that these two gains can give", reason, "")
 
 
 def draw_reflection(figure: FigureBase, document: Part) -> None:

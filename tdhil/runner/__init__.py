@@ -6,7 +6,7 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.runner.design import (
-        Knowledge as Knowledge, assumed_noise as assumed_noise, interval_confidence as interval_confidence,
+        DesignKnowledge as DesignKnowledge, assumed_noise as assumed_noise, interval_confidence as interval_confidence,
     )
     from tdhil.runner.five_stages import Runner as Runner
     from tdhil.runner.guard import Guard as Guard

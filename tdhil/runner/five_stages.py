@@ -58,7 +58,7 @@ from tdhil.runner.stages import (
 )
 from tdhil.runner.stop import StopReport, StopSequence
 from tdhil.runner.task import Confirm, ConfirmSpeed, Display, MakeTask, RunOutcome, Say, Task, nobody_sees
-from tdhil.soft_torque import EvaluationCase, Program
+from tdhil.soft_torque import EvaluationCase, SpeedProgram
 
 
 def _nothing(text: str) -> None:
@@ -216,7 +216,7 @@ class Runner:
                 preflight.speed_resolution_rad_s,
             )
 
-    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> Program:
+    def _program(self, task: Task, case: EvaluationCase, loop: ControlLoop, preflight: Preflight) -> SpeedProgram:
         """The virtual string's course, before anything moves. Raises what refuses it."""
         if case.own_loop and preflight.torque_offset_resolution_nm <= 0.0:
             raise PreflightRefused(
@@ -229,7 +229,7 @@ class Runner:
         return program
 
     def _run_virtual_string(
-        self, task: Task, case: EvaluationCase, program: Program, loop: ControlLoop, speed: SpeedResult,
+        self, task: Task, case: EvaluationCase, program: SpeedProgram, loop: ControlLoop, speed: SpeedResult,
         drifted: TorqueResult | None, resolution_rad_s: float,
     ) -> None:
         """Stages 4 and 5 with a virtual string."""

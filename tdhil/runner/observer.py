@@ -1009,7 +1009,7 @@ def _means(values: list[tuple[float, float]], over_s: float) -> list[float]:
 
 
 class _Flat:
-    """A reported speed that stays the same, and the torque meanwhile. `limits.winds_up` only."""
+    """A reported speed that stays the same, and the torque meanwhile. `MachineLimits.winds_up` only."""
 
     def __init__(self, limits: MachineLimits, lag_s: float) -> None:
         self._limits = limits

@@ -14,8 +14,8 @@ from tdhil.runner.design import (
     MARGIN,
     SOON_COUNTED,
     Choice,
+    DesignKnowledge,
     Evidence,
-    Knowledge,
     Stopping,
     choose,
     choose_soonest,
@@ -28,10 +28,10 @@ from tdhil.runner.design import (
 )
 from tdhil.runner.excitation import (
     LEAST_COUNTED,
-    ExcitationWish,
     MotionLimits,
     Plan,
     PlanRefused,
+    PlanRequest,
     RigGuess,
     SwingKind,
     SwingPlan,
@@ -42,7 +42,7 @@ from tdhil.runner.excitation import (
     periodic_kind,
 )
 from tdhil.runner.settings import ExcitationRequest
-from tdhil.runner.stages import Course, reference_plan
+from tdhil.runner.stages import RampCourse, reference_plan
 
 NOT_PREDICTED = "how tight the interval of J will be is not predicted for this motion; it comes from the record itself"
 NOTHING_TO_EXPECT = "no interval of J is to be expected: this motion can't tell the inertia from lags and friction"
@@ -58,7 +58,7 @@ class Planned:
     """
 
     plan: Plan | SwingPlan
-    known: Knowledge
+    known: DesignKnowledge
     half_width: float
     usual_half_width: float
     stopping: Stopping | None = None
@@ -86,10 +86,10 @@ class Planned:
         }
 
 
-def request_of(request: ExcitationRequest, mode: str) -> ExcitationWish:
+def request_of(request: ExcitationRequest, mode: str) -> PlanRequest:
     """The request as the excitation room takes it. Raises PlanRefused where it isn't periodic."""
     periodic_kind(request.kind)
-    return ExcitationWish(
+    return PlanRequest(
         kind=request.kind,
         mode="speed" if mode == "speed" else "torque",
         frequency_hz=request.frequency_hz,
@@ -105,7 +105,7 @@ def adaptive(request: ExcitationRequest) -> bool:
 
 
 def as_followed(
-    guess: RigGuess, limits: MotionLimits, course: Course, speed_lag_s: float
+    guess: RigGuess, limits: MotionLimits, course: RampCourse, speed_lag_s: float
 ) -> tuple[RigGuess, MotionLimits]:
     """Rig and limits as the drive's own speed control leaves them, seen in the ramp of stage 2."""
     signals = course.time_s, course.setpoint_rad_s, course.reported_rad_s
@@ -116,7 +116,7 @@ def as_followed(
 
 
 def plan_acquisition(
-    request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: Knowledge, left_s: float
+    request: ExcitationRequest, mode: str, limits: MotionLimits, guess: RigGuess, known: DesignKnowledge, left_s: float
 ) -> Planned:
     """Plan stage 5; ``left_s`` is what the run's time limit leaves. Raises PlanRefused, naming what does not fit."""
     if isinstance(excitation_kind(request.kind), SwingKind):
@@ -146,7 +146,7 @@ RIGS = ((1.0, 1.0), (0.1, 0.5), (0.01, 0.0), (1.0, 0.0), (10.0, 0.0))
 
 
 def refuse_hopeless(
-    request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: Knowledge
+    request: ExcitationRequest, modes: tuple[str, ...], limits: MotionLimits, guess: RigGuess, known: DesignKnowledge
 ) -> None:
     """PlanRefused where what is asked for fits no rig, in none of ``modes``: that is known before anything moves.
 
@@ -173,7 +173,7 @@ def refuse_hopeless(
 
 
 def _reference(
-    request: ExcitationRequest, limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge,
+    request: ExcitationRequest, limits: MotionLimits, guess: RigGuess, wish: PlanRequest, known: DesignKnowledge,
     left_s: float,
 ) -> Planned:
     """The speed reference's lines that the drive's own impedance is measured by."""
@@ -196,7 +196,7 @@ def _swings(
     mode: str,
     limits: MotionLimits,
     guess: RigGuess,
-    known: Knowledge,
+    known: DesignKnowledge,
     left_s: float,
 ) -> Planned:
     """From speed to speed: there is no line to predict, and no scatter of periods to stop by."""
@@ -224,7 +224,7 @@ def _swings(
 
 
 def _with_pilot(
-    request: ExcitationRequest, chosen: Choice, known: Knowledge, allowed_s: float, fewest: int = LEAST_COUNTED
+    request: ExcitationRequest, chosen: Choice, known: DesignKnowledge, allowed_s: float, fewest: int = LEAST_COUNTED
 ) -> Planned:
     """The pilot: most of what will be needed, so that little is left to chance, and enough to know the scatter."""
     assert request.tolerance is not None
@@ -271,7 +271,7 @@ def counted_in(plan: Plan, time_s: float) -> int:
     return math.floor((time_s - plan.with_counted(0).duration_s - plan.extension_s(0)) / period + 1e-9)
 
 
-def _advice(evidence: Evidence, confidence: float, tolerance: float, known: Knowledge) -> str:
+def _advice(evidence: Evidence, confidence: float, tolerance: float, known: DesignKnowledge) -> str:
     """What would bring the tolerance within reach."""
     ever = half_width(longer(evidence, _EVER), confidence)
     if ever > tolerance:

@@ -61,7 +61,7 @@ class Tried:
 
 
 @dataclass(frozen=True)
-class Choice:
+class RateChoice:
     """The rate that is left set, and what was tried before it, the highest first."""
 
     tried: tuple[Tried, ...]
@@ -106,7 +106,7 @@ def quieten() -> None:
     gc.freeze()
 
 
-def choose_rate(drive: Paced, rates_hz: Sequence[float], cycle: Callable[[], Sample]) -> Choice:
+def choose_rate(drive: Paced, rates_hz: Sequence[float], cycle: Callable[[], Sample]) -> RateChoice:
     """Go down ``rates_hz`` until one holds; that one, or the last, is set. Raises whatever a cycle raises."""
     tried: list[Tried] = []
     for rate_hz in rates_hz:
@@ -115,7 +115,7 @@ def choose_rate(drive: Paced, rates_hz: Sequence[float], cycle: Callable[[], Sam
         if tried[-1].holds:
             break
     drive.set_rate(tried[-1].rate_hz)
-    return Choice(tuple(tried))
+    return RateChoice(tuple(tried))
 
 
 def _try(drive: Paced, rate_hz: float, cycle: Callable[[], Sample]) -> Tried:

@@ -45,7 +45,7 @@ STOOD_RAD = 8.2
 """An angle that hasn't changed over so much reported way (1.3 turns: even a counter of turns would) stands still."""
 
 
-class Ratio(NamedTuple):
+class TravelRatio(NamedTuple):
     """True way over reported way of a stretch, and how far it may be off for counts and time."""
 
     value: float
@@ -53,7 +53,7 @@ class Ratio(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Point:
+class _AnglePoint:
     time_s: float
     angle_rad: float
     way_rad: float
@@ -69,12 +69,12 @@ class Angles:
         self.blind = False                         # the readings came too seldom for an angle that starts over
         self._way_rad = 0.0                        # by the reported speed
         self._before: Sample | None = None
-        self._last: _Point | None = None
+        self._last: _AnglePoint | None = None
         self._raw_rad = 0.0
-        self._recent: list[_Point] = []
-        self._first: _Point | None = None          # of this stretch
-        self._changed: _Point | None = None        # where the count changed first in this stretch, and last
-        self._changed_last: _Point | None = None
+        self._recent: list[_AnglePoint] = []
+        self._first: _AnglePoint | None = None          # of this stretch
+        self._changed: _AnglePoint | None = None        # where the count changed first in this stretch, and last
+        self._changed_last: _AnglePoint | None = None
 
     def restart(self) -> None:
         """A new stretch begins with the next reading; what a count is stays known."""
@@ -105,7 +105,7 @@ class Angles:
             if step != 0.0:
                 self.count_rad = abs(step) if self.count_rad is None else min(self.count_rad, abs(step))
         self._raw_rad = reading.position_rad
-        point = self._last = _Point(reading.time_s, angle, self._way_at(reading.time_s), reading.half_width_s)
+        point = self._last = _AnglePoint(reading.time_s, angle, self._way_at(reading.time_s), reading.half_width_s)
         self._recent.append(point)
         while len(self._recent) > LEAST_WINDOW + 1 and point.time_s - self._recent[1].time_s >= WINDOW_S:
             del self._recent[0]
@@ -132,7 +132,7 @@ class Angles:
         turned = abs(recent[-1].angle_rad - recent[0].angle_rad)
         return max(0.0, turned - self.count_rad) / took_s, (turned + self.count_rad) / took_s
 
-    def ratio(self) -> Ratio | None:
+    def ratio(self) -> TravelRatio | None:
         """Of this stretch; None while that is not known well enough."""
         first, last = self._first, self._last
         if first is None or last is None or self.blind or last.time_s - first.time_s < LEAST_S:
@@ -142,7 +142,8 @@ class Angles:
         start, end = self._changed, self._changed_last
         if start is None or end is None:
             # Not one count: standing still, if it ever counted as finely as that, or over the whole of a turn.
-            return Ratio(0.0, 0.0) if way > (STOOD_RAD if count is None else min(STOOD_RAD, 5.0 * count)) else None
+            return TravelRatio(0.0,
+                               0.0) if way > (STOOD_RAD if count is None else min(STOOD_RAD, 5.0 * count)) else None
         way_rad = end.way_rad - start.way_rad
         turned = end.angle_rad - start.angle_rad
         spent_s = end.time_s - start.time_s
@@ -156,7 +157,7 @@ class Angles:
         if abs(way_rad) < 1e-3 * abs(turned):
             way_rad = 1e-3 * turned
         value = turned / way_rad
-        return Ratio(value, half * abs(value))
+        return TravelRatio(value, half * abs(value))
 
     def _every_s(self) -> float:
         recent = self._recent
@@ -391,7 +392,7 @@ class SpeedUnitCheck:
                 self._refuse(f"the shaft's angle moves too fast for the {speed_rad_s:.3g} rad/s asked for", command)
         self._ask(command)
 
-    def _judge(self, ratio: Ratio, command: Command) -> None:
+    def _judge(self, ratio: TravelRatio, command: Command) -> None:
         """Compare with one. Raises PreflightRefused; an angle that stands still is put to the operator."""
         value = ratio.value
         if value == 0.0:

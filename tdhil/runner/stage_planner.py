@@ -13,12 +13,12 @@ from tdhil.estimation import Samples
 from tdhil.recording import FloatArray, LagPrior, RunLog, SteppedSetpoint
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
-from tdhil.runner.design import Knowledge, Noise, assumed_noise, measured_noise
+from tdhil.runner.design import DesignKnowledge, NoiseDensity, assumed_noise, measured_noise
 from tdhil.runner.excitation import MotionLimits, Plan, PlanRefused, RigGuess, SwingPlan, tells_before_echo
 from tdhil.runner.guard import LIGHTEN, Guard
 from tdhil.runner.planning import Planned, as_followed, plan_acquisition
 from tdhil.runner.settings import ExcitationRequest
-from tdhil.runner.stages import Course, SpeedResult
+from tdhil.runner.stages import RampCourse, SpeedResult
 from tdhil.runner.task import Display, Say, Task
 
 MOST_WANDER = 0.8
@@ -63,7 +63,7 @@ class StagePlanner:
         keep = Command(mode, speed_now, model.steady_torque_nm(speed_now))
         left_s = loop.guard.left_s(loop.now_s) - RESERVE_S
         assumed = assumed_noise(limits.torque_nm, limits.speed_max_rad_s)
-        theta = Knowledge(assumed, prior).theta(model)
+        theta = DesignKnowledge(assumed, prior).theta(model)
 
         work = partial(_reckon, request, mode, room, model, prior, assumed, speed.steady, theta, course,
                        left_s, limits.winds_up)
@@ -143,15 +143,15 @@ def _reckon(
     room: MotionLimits,
     model: RigGuess,
     prior: LagPrior,
-    assumed: Noise,
+    assumed: NoiseDensity,
     steady: tuple[Samples, ...],
     theta: FloatArray,
-    course: Course | None,
+    course: RampCourse | None,
     left_s: float,
     winds_up: bool,
 ) -> Planned:
     """The arithmetic: plain data in and out, so that it can be done anywhere."""
-    known = Knowledge(measured_noise(steady, theta, assumed), prior, winds_up)
+    known = DesignKnowledge(measured_noise(steady, theta, assumed), prior, winds_up)
     if course is None:
         return plan_acquisition(request, mode.value, room, model, known, left_s)
     seen, within = as_followed(model, room, course, known.speed_lag_s)

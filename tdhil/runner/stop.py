@@ -5,14 +5,14 @@
 2. Wait for standstill, by status word and by speed. The reported speed lags, so it must stay at zero for longer
    than the largest plausible lag. How long that takes depends on the torque limit and on what swings: as long as the
    shaft keeps getting slower, it is waited for.
-3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`let_go`). Since a drive may
-   end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in speed mode,
-   at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at once, and is
-   then left holding what it holds: a wound-up string is not let go by disabling.
+3. With a drill string, bring trapped torque down under speed control, on the rig's ramp (`string_release`). Since a
+   drive may end a quick stop by switching its torque off, this comes before it: the shaft is brought to standstill in
+   speed mode, at the quick stop's own rate, and yields from there. A drive that does not follow gets the quick stop at
+   once, and is then left holding what it holds: a wound-up string is not let go by disabling.
 4. Only then disable, and confirm: torque off by status word, and the shaft still at rest without it.
 
 What is judged is the motor's shaft. A string below may go on swinging by itself when the torque at the top has been
-quiet for half a swing (`let_go.QUIET_S`); its motor does not follow, since its friction holds.
+quiet for half a swing (`string_release.QUIET_S`); its motor does not follow, since its friction holds.
 
 Where the cycle brings no feedback any more (a drive that restarted, a foreign NMT command, lost frames), the drive is
 looked at one question at a time; so it is where the cycle's feedback goes on telling of a turning shaft, once the stop
@@ -415,8 +415,8 @@ class StopSequence:
                 return False
         why = f" ({observer.doubt.what})" if observer.doubt is not None else ""
         self._trouble.append(
-            f"torque removed: the reported speed is not believed{why}. The drive gave no torque for {without_s:.0f} s, in"
-            " which friction stops the shaft; nobody saw it at rest"
+            f"torque removed: the reported speed is not believed{why}. The drive gave no torque for {without_s:.0f} s,"
+            " in which friction stops the shaft; nobody saw it at rest"
         )
         self._remove_torque(_NO_TORQUE_ASKED)
         return True

@@ -10,7 +10,7 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.service.accounts import ROLES as ROLES, AccountsFile as AccountsFile
-    from tdhil.service.audit import Audit as Audit, Head as Head
+    from tdhil.service.audit import Audit as Audit, ChainHead as ChainHead
     from tdhil.service.client import Client as Client, ServiceError as ServiceError
     from tdhil.service.console import attend as attend
     from tdhil.service.run_state import Conflict as Conflict, NotAllowed as NotAllowed, NotThere as NotThere

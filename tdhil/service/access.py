@@ -120,7 +120,7 @@ class Tries:
             self._tried.pop(("pair", name, address), None)
 
 
-class Pace:
+class RequestPace:
     """How many runs that show a code may be requested: by one user, and from one address.
 
     A run takes three wrong codes. So a user has at most 120 tries a day for one of a million codes, and each run that

@@ -145,8 +145,8 @@ class Watcher:
 
     def preflight(self, preflight: Preflight) -> None:
         checks = tuple(
-            Check(visible(one.name), visible(one.wanted), visible(one.found), one.outcome.value, visible(one.where),
-                  visible(one.next_step))
+            Check(visible(one.name), visible(one.wanted), visible(one.found), one.outcome.value,
+                  visible(one.where), visible(one.next_step))
             for one in preflight.checks
         )
         who = preflight.identity

@@ -66,7 +66,7 @@ class Broken:
 
 
 @dataclass(frozen=True)
-class Head:
+class ChainHead:
     """The last line of a chain: its number and its hash."""
 
     number: int
@@ -76,13 +76,13 @@ class Head:
         return f"{self.number}:{self.hash}"
 
     @staticmethod
-    def of(text: str) -> Head:
+    def of(text: str) -> ChainHead:
         """Read ``NUMBER:HASH``, as it is exported. Raises UsageError."""
         found = _HEAD.fullmatch(text.strip())
         if found is None:
             raise UsageError("is no head of an audit", where=f"head {text[:80]!r}",
                              next_step="It is NUMBER:HASH, as tdhil serve audit prints it")
-        return Head(int(found[1]), found[2])
+        return ChainHead(int(found[1]), found[2])
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class _Seal:
     key: bytes
     made: str
     plain: int
-    anchor: Head
+    anchor: ChainHead
 
     def hash_of(self, entry: Entry) -> str:
         """What the line's hash must be."""
@@ -100,7 +100,7 @@ class _Seal:
         text = json.dumps(plain, ensure_ascii=False, sort_keys=True).encode()
         return hashlib.sha256(text).hexdigest() if entry.number <= self.plain else self._mac(b"line", text)
 
-    def of_head(self, head: Head) -> str:
+    def of_head(self, head: ChainHead) -> str:
         """What seals a head."""
         return self._mac(b"head", str(head).encode())
 
@@ -116,7 +116,7 @@ class Audit:
         self._key_path = folder.parent / KEY_FILE
         self._lock = threading.Lock()
         self._seal: _Seal | None = None
-        self._last: Head | None = None
+        self._last: ChainHead | None = None
 
     def begin(self) -> None:
         """Make the key where there is none; lines from before it are taken as they are. Raises OSError."""
@@ -130,7 +130,7 @@ class Audit:
         with self._lock:
             self._add(self._sealed(), who, what, run, rig, details)
 
-    def head(self) -> Head | None:
+    def head(self) -> ChainHead | None:
         """The last line, to be kept elsewhere; None where there is none, or the chain's end doesn't hold."""
         with self._lock:
             seal = self._seal or self._read()
@@ -148,7 +148,7 @@ class Audit:
             if isinstance(entry, Entry):
                 yield entry
 
-    def verify(self, kept: Head | None = None) -> Broken | None:
+    def verify(self, kept: ChainHead | None = None) -> Broken | None:
         """The first place where a line was changed, taken out or put in; None where the chain holds.
 
         ``kept``: a head that was exported before, which must be one of the lines.
@@ -156,7 +156,7 @@ class Audit:
         with self._lock:
             return self._verify(self._seal or self._read(), kept)
 
-    def _verify(self, seal: _Seal | None, kept: Head | None) -> Broken | None:
+    def _verify(self, seal: _Seal | None, kept: ChainHead | None) -> Broken | None:
         number, before, earlier, at, found = 0, FIRST, FIRST, ("", 0), kept is None
         for file, line, entry in self._lines():
             if isinstance(entry, str):
@@ -168,17 +168,18 @@ class Audit:
             if not hmac.compare_digest(seal.hash_of(entry).encode(), entry.hash.encode()):
                 return Broken(file, line, "it was changed after it was written, or written without the key")
             number, earlier, before, at = entry.number, before, entry.hash, (file, line)
-            found = found or Head(number, before) == kept
+            found = found or ChainHead(number, before) == kept
         if not found and kept is not None:
             return Broken(*at, f"the chain doesn't have line {kept.number} as it was exported")
         if seal is None:
             return None
         # A killed process may leave a line whose head or anchor wasn't written; never a head without its line.
-        ends = (Head(number, before), Head(number - 1, earlier))
+        ends = (ChainHead(number, before), ChainHead(number - 1, earlier))
         if seal.anchor not in ends:
-            return Broken(*at, f"the chain ends with line {number}, and {KEY_FILE} has seen line {seal.anchor.number}")
+            return Broken(*at,
+                               f"the chain ends with line {number}, and {KEY_FILE} has seen line {seal.anchor.number}")
         plain = read_json(self._folder / "head.json") or {}
-        head = Head(plain.get("number", 0), plain.get("hash", FIRST))
+        head = ChainHead(plain.get("number", 0), plain.get("hash", FIRST))
         mac = plain.get("mac")
         # The head of lines from before there was a key has no seal.
         sealed = isinstance(mac, str) and hmac.compare_digest(mac.encode(), seal.of_head(head).encode())
@@ -197,7 +198,7 @@ class Audit:
             file.write(json.dumps(asdict(entry), ensure_ascii=False).encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
-        self._last = head = Head(entry.number, entry.hash)
+        self._last = head = ChainHead(entry.number, entry.hash)
         self._seal = replace(seal, anchor=head)
         write_json(self._folder / "head.json", {**asdict(head), "mac": seal.of_head(head)})
         self._write(self._seal)
@@ -209,9 +210,9 @@ class Audit:
         if self._seal is None:
             if self._key_path.exists():
                 raise OSError(errno.EINVAL, "the audit's key can't be read", str(self._key_path))
-            last = Head(0, FIRST)
+            last = ChainHead(0, FIRST)
             for entry in self.entries():
-                last = Head(entry.number, entry.hash)
+                last = ChainHead(entry.number, entry.hash)
             seal = _Seal(secrets.token_bytes(32), now(), last.number, last)
             self._write(seal)
             self._seal = seal
@@ -224,7 +225,7 @@ class Audit:
         try:
             assert plain is not None
             seal = _Seal(bytes.fromhex(plain["key"]), str(plain["made"]), int(plain["plain"]),
-                         Head(int(plain["number"]), str(plain["hash"])))
+                         ChainHead(int(plain["number"]), str(plain["hash"])))
         except (AssertionError, KeyError, TypeError, ValueError):
             return None
         return seal if len(seal.key) == 32 else None
@@ -233,14 +234,14 @@ class Audit:
         plain = {"key": seal.key.hex(), "made": seal.made, "plain": seal.plain, **asdict(seal.anchor)}
         write_json(self._key_path, plain, mode=0o600)
 
-    def _end(self, seal: _Seal) -> Head | None:
+    def _end(self, seal: _Seal) -> ChainHead | None:
         """The last line, if it is the anchor, or the one that follows it; None where the end doesn't hold."""
         last: Entry | None = None
         for entry in self.entries():
             last = entry
         if last is None:
             return seal.anchor if seal.anchor.number == 0 else None
-        found = Head(last.number, last.hash)
+        found = ChainHead(last.number, last.hash)
         follows = last.number == seal.anchor.number + 1 and last.before == seal.anchor.hash
         good = found == seal.anchor or (
             follows and hmac.compare_digest(seal.hash_of(last).encode(), last.hash.encode()))

@@ -16,7 +16,7 @@ from typing import Final
 from drivers import CommunicationLost
 from profiles import visible
 from tdhil.errors import UsageError
-from tdhil.service.run_channel import SOCKET, Refused, ask, lives
+from tdhil.service.run_channel import SOCKET, RunRefused, ask, lives
 from tdhil.service.run_state import State, Status
 from tdhil.service.store import Store
 
@@ -34,7 +34,7 @@ class Console:
 
     def show(self, run: str, status: Status) -> None:
         """The code of a run that waits for it, if it is another one than was shown last."""
-        with suppress(Refused, CommunicationLost):
+        with suppress(RunRefused, CommunicationLost):
             found = ask(self._store.place(run), {"do": "code"})
             code = found.get("code")
             if code and self._shown.get(run) != code:

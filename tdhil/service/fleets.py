@@ -297,7 +297,7 @@ def main(folder: Path) -> int:
         os.nice(19)
     teller = _Teller()
     try:
-        from tdhil.fleet import FleetRequest, Settings, run_fleet
+        from tdhil.fleet import FleetRequest, FleetSettings, run_fleet
         from tdhil.process_pool import usable_cores
 
         request = read_json(folder / "request.json") or {}
@@ -306,7 +306,7 @@ def main(folder: Path) -> int:
         if request["folder"] == RUNS:
             roots = tuple(sorted(str(path) for path in Path("runs").glob("*/run.mcap")))
         summary = run_fleet(
-            FleetRequest(roots, folder / TABLE, Settings(**request["settings"]), jobs=usable_cores()), teller)
+            FleetRequest(roots, folder / TABLE, FleetSettings(**request["settings"]), jobs=usable_cores()), teller)
         found = summary.document() | {"out": TABLE}
         whole = not summary.interrupted and not summary.left
         teller.say(state="done" if whole else "interrupted", total=len(summary.rows) + summary.left,

@@ -57,7 +57,7 @@ class Running:
 
 
 @dataclass
-class _Reader:
+class _ChannelReader:
     """Of some channels that were subscribed to together; joins the others where it has caught up with them."""
 
     tail: LogTail
@@ -81,7 +81,7 @@ class Relay:
     clock: Callable[[], float] = time.monotonic
     _wanted: dict[int, int] = field(default_factory=dict)
     _new: set[int] = field(default_factory=set)            # channels that no reader has yet
-    _readers: list[_Reader] = field(default_factory=list)
+    _readers: list[_ChannelReader] = field(default_factory=list)
 
     async def hear(self, said: str | bytes) -> None:
         """Something that the viewer says: what it wants and no longer wants; everything else is refused in words."""
@@ -154,7 +154,7 @@ class Relay:
         while True:
             if self._new:
                 wanted, self._new = {one: self._wanted[one] for one in self._new}, set()
-                self._readers.append(_Reader(LogTail(running.log), wanted, self.clock() + FIRST_S))
+                self._readers.append(_ChannelReader(LogTail(running.log), wanted, self.clock() + FIRST_S))
             more = False
             for reader in self._readers:
                 more |= await self._forward(reader)
@@ -168,7 +168,7 @@ class Relay:
                     looked_s, gone = self.clock(), found is None or found.run != running.run
                 await anyio.sleep(EVERY_S)
 
-    async def _forward(self, reader: _Reader) -> bool:
+    async def _forward(self, reader: _ChannelReader) -> bool:
         """What has come in its channels; is there more at once?"""
         looked_s = self.clock()
         came: LogChunks = await anyio.to_thread.run_sync(reader.tail.read_chunks)

@@ -29,7 +29,7 @@ WAITING: Final = 100                   # messages for one viewer, some ten secon
 Viewer = asyncio.Queue[dict[str, Any] | None]
 
 
-class Picture:
+class LivePicture:
     """The run so far, thin enough to be drawn. Pure."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class Feed:
     def __init__(self, path: Path, status: Callable[[], Status]) -> None:
         self._tail = LogTail(path)
         self._read_status = status
-        self.picture = Picture()
+        self.picture = LivePicture()
         self.status: Status | None = None
         self.viewers: set[Viewer] = set()
         self._task: asyncio.Task[None] | None = None

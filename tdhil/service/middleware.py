@@ -21,7 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from drivers import CommunicationLost, DataFileError, PreflightRefused
 from tdhil.errors import ExitCode, LogError, TdhilError, UsageError
 from tdhil.service.access import Access, token_in
-from tdhil.service.run_channel import Refused
+from tdhil.service.run_channel import RunRefused
 from tdhil.service.run_state import (
     Conflict,
     NoRoom,
@@ -69,7 +69,7 @@ class Site(Protocol):
 Answer = Callable[[Site, Request, Any], Awaitable[Any]]
 
 
-class Guard:
+class RequestGuard:
     """Before everything: a known host, no other site's page, and the headers of every answer."""
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], viewers: frozenset[str] = frozenset()) -> None:
@@ -139,14 +139,14 @@ def status_of(error: BaseException) -> int:
     ):
         if isinstance(error, kind):
             return status
-    if isinstance(error, Refused):
+    if isinstance(error, RunRefused):
         return {int(ExitCode.USAGE): 422, int(ExitCode.REFUSED): 409}.get(int(error.told.exit_code), 500)
     return 500
 
 
 def told_of(error: BaseException) -> ErrorView:
     """The body of an error."""
-    if isinstance(error, Refused):
+    if isinstance(error, RunRefused):
         return ErrorView(error.told)
     if isinstance(error, HTTPException):
         return ErrorView(Told("UsageError", error.detail, error.detail, "", "", int(ExitCode.USAGE)))

@@ -31,7 +31,7 @@ _PATH_LIMIT: Final = 100               # of a socket's path; the system has 108
 Answer = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
-class Refused(TdhilError):
+class RunRefused(TdhilError):
     """What the run said no to; ``told`` is its own error."""
 
     def __init__(self, told: Told) -> None:
@@ -40,7 +40,7 @@ class Refused(TdhilError):
         self.exit_code = told.exit_code
 
 
-class Listener:
+class ChannelListener:
     """The run's end. Each request is answered in a thread of its own: no slow client holds another up.
 
     Some threads wait for requests from the beginning, since to start one takes 200 ms on a busy computer.
@@ -122,7 +122,7 @@ def ask(folder: Path, request: Mapping[str, Any], *, timeout_s: float = 2.0) -> 
             next_step="If the shaft turns, use the hard-wired stop",
         ) from error
     if found.get("error"):
-        raise Refused(Told(**found["error"]))
+        raise RunRefused(Told(**found["error"]))
     return found
 
 

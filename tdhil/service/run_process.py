@@ -29,10 +29,10 @@ from tdhil.service.attendance import (
     Watcher,
     tell,
 )
-from tdhil.service.run_channel import STOP_FILE, Listener
+from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import State, Status, Told, Watch, end_of, now, way_to
 from tdhil.service.start_request import binding_of, plan_of, read_rig, refuse_changed, run_request
-from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
+from tdhil.service.store import CONNECTION_FILE, Store, StoredRequest, read_json, write_json
 
 if TYPE_CHECKING:
     from tdhil.runner import RunOutcome
@@ -49,7 +49,7 @@ class RunProcess:
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
         self.store = Store(self.folder.parent.parent)
-        self.request: Request = self.store.request(self.folder.name)
+        self.request: StoredRequest = self.store.request(self.folder.name)
         self.board = Board(self.store, replace(self.store.status(self.request.id), pid=os.getpid(),
                                                expected_s=EXPECTED_S))
         self._plan: dict[str, Any] = {}
@@ -66,7 +66,7 @@ class RunProcess:
         """Run it; the exit code, as of `tdhil identify`."""
         from tdhil.session import stop_on_signals
 
-        with stop_on_signals(self.stop), Listener(self.folder, self.answer):
+        with stop_on_signals(self.stop), ChannelListener(self.folder, self.answer):
             try:
                 if (early := read_json(self.folder / STOP_FILE)) is not None:
                     self.answer({"do": "stop", "by": early.get("by", "somebody")})
@@ -177,10 +177,10 @@ class RunProcess:
 
     def _row(self, document: Mapping[str, Any], torque_scale_rel_sd: float) -> None:
         """The run as a line of its rig's history."""
-        from tdhil.fleet import Settings, row_of
+        from tdhil.fleet import FleetSettings, row_of
 
         try:
-            row = row_of(self.request.id, document, settings=Settings(), torque_scale_rel_sd=torque_scale_rel_sd)
+            row = row_of(self.request.id, document, settings=FleetSettings(), torque_scale_rel_sd=torque_scale_rel_sd)
             write_json(self.folder / "row.json", asdict(replace(row, rig=self.request.rig)))
         except Exception as error:             # the result stands without it
             tell(f"the history can't be written: {error}")

@@ -22,7 +22,7 @@ from tdhil.service.start_request import options_of
 if TYPE_CHECKING:
     from starlette.requests import Request
 
-    from tdhil.report import Shown
+    from tdhil.report import ShownPicture
 
 T = TypeVar("T")
 _PICTURE_POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; sandbox"
@@ -42,10 +42,10 @@ async def _picture(site: Site, request: Request, body: None) -> Response:
     return Response(found[int(number)].svg, media_type="image/svg+xml", headers=said)
 
 
-async def _shown(site: Site, run: str) -> tuple[Shown, ...]:
+async def _shown(site: Site, run: str) -> tuple[ShownPicture, ...]:
     from tdhil.report import pictures_in
 
-    def look() -> tuple[Shown, ...]:
+    def look() -> tuple[ShownPicture, ...]:
         report = site.store.place(run) / "report.html"
         return pictures_in(report.read_text("utf-8")) if report.is_file() else ()
 

@@ -79,7 +79,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Request:
+class StoredRequest:
     """What was asked for; request.json. ``options`` as they came, ``motion`` as the rig has it."""
 
     id: str
@@ -94,8 +94,8 @@ class Request:
     idempotency_key: str | None = None
 
     @staticmethod
-    def of_plain(plain: Mapping[str, Any]) -> Request:
-        return Request(**plain)
+    def of_plain(plain: Mapping[str, Any]) -> StoredRequest:
+        return StoredRequest(**plain)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Summary:
     exit_code: int | None = None
 
 
-def summary_of(request: Request, status: Status, result: Mapping[str, Any] | None) -> Summary:
+def summary_of(request: StoredRequest, status: Status, result: Mapping[str, Any] | None) -> Summary:
     """Of what the files say."""
     inertia = (result or {}).get("inertia_kg_m2") or {}
     return Summary(
@@ -167,16 +167,16 @@ class Store:
             return sorted((one.name for one in self.runs.iterdir() if ID.fullmatch(one.name)), reverse=True)
         return []
 
-    def request(self, run: str) -> Request:
+    def request(self, run: str) -> StoredRequest:
         """Raises NotThere where the run never got as far."""
         plain = read_json(self.place(run) / "request.json")
         try:
-            return Request.of_plain(plain or {})
+            return StoredRequest.of_plain(plain or {})
         except TypeError:
             raise NotThere("the run has no request", where=f"run {run}") from None
 
     def status(self, run: str) -> Status:
-        """As its file has it; that of a file that can't be read is `interrupted`."""
+        """As its file has it; that of a file that can't be read is ``interrupted``."""
         folder = self.place(run)
         plain = read_json(folder / _USED) or read_json(folder / "state.json")
         try:
@@ -197,7 +197,7 @@ class Store:
             with suppress(NotThere):
                 yield self.summary(run)
 
-    def begin(self, request: Request) -> Status:
+    def begin(self, request: StoredRequest) -> Status:
         """Write down what was asked for. Raises OSError."""
         status = Status.begun(request.id, request.rig, request.asked)
         write_json(self.runs / request.id / "request.json", asdict(request))

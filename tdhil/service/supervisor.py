@@ -26,10 +26,10 @@ from typing import Any, Final
 
 from drivers import CommunicationLost
 from tdhil.errors import ExitCode, LogError, UsageError
-from tdhil.service.access import Pace
+from tdhil.service.access import RequestPace
 from tdhil.service.audit import Audit
 from tdhil.service.console import Console
-from tdhil.service.run_channel import STOP_FILE, Refused, ask, lives, send_signal, stands_still, take_life
+from tdhil.service.run_channel import STOP_FILE, RunRefused, ask, lives, send_signal, stands_still, take_life
 from tdhil.service.run_state import (
     MAY_TURN,
     Conflict,
@@ -45,7 +45,7 @@ from tdhil.service.run_state import (
     way_to,
 )
 from tdhil.service.start_request import RigFile, Rigs, edited, is_as_it_was, options_of, require_motion
-from tdhil.service.store import CONNECTION_FILE, Index, Request, Store, read_json, write_json, write_whole
+from tdhil.service.store import CONNECTION_FILE, Index, Store, StoredRequest, read_json, write_json, write_whole
 from tdhil.session import Holder, holder_of, holders
 
 LOOK_S: Final = 0.2
@@ -64,7 +64,7 @@ Say = Callable[[str], None]
 class Asked:
     """A run that was asked for. ``new``: it was not asked for before with the same key."""
 
-    request: Request
+    request: StoredRequest
     new: bool
 
 
@@ -118,7 +118,7 @@ class Supervisor:
         self._unindexed: set[str] = set()
         self._to_index: set[str] = set()               # those that have just ended
         self._braking = False
-        self.pace = Pace()
+        self.pace = RequestPace()
         self.not_at_rest: list[str] = []               # of those that `brake` stopped
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
@@ -217,8 +217,8 @@ class Supervisor:
             simulated = rig.simulated
             if not simulated or rig.motion == "watched":           # it shows a code
                 self.pace.begin(who, address, rig.id)
-            request = self._write_down(Request("", rig.id, str(rig.path.resolve()), rig.sha256, options, who, now(),
-                                               simulated, rig.motion, key))
+            request = self._write_down(StoredRequest("", rig.id, str(rig.path.resolve()), rig.sha256, options, who,
+                                                     now(), simulated, rig.motion, key))
             run = request.id
             try:
                 self._begin(run)
@@ -230,7 +230,7 @@ class Supervisor:
         self.note(who, "asked", run, rig.id, options=options)
         return Asked(request, new=True)
 
-    def _write_down(self, request: Request) -> Request:
+    def _write_down(self, request: StoredRequest) -> StoredRequest:
         """Give the run an id and a folder. Raises NoRoom, and LogError where the folder can't be written."""
         run = ""
         try:
@@ -293,7 +293,7 @@ class Supervisor:
         try:
             found = ask(self.store.place(run),
                         {"do": "confirm", "code": code, "binding": binding, "by": who, "lease": lease})
-        except (Refused, CommunicationLost) as error:
+        except (RunRefused, CommunicationLost) as error:
             self.note(who, "confirmation refused", run, status.rig, why=str(error))
             raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
         self.note(who, "confirmed", run, status.rig, binding=binding)
@@ -304,7 +304,7 @@ class Supervisor:
         asked = {"do": "lease", "key": key, "new_key": new_key, "gone": gone, "by": who}
         try:
             return Watch(**ask(self.store.place(run), asked)["watch"])
-        except Refused as error:
+        except RunRefused as error:
             raise Conflict(error.what, where=error.where, next_step=error.next_step) from error
 
     def stop(self, run: str, who: str) -> Status:
@@ -319,7 +319,7 @@ class Supervisor:
         try:
             try:
                 found = ask(folder, wish, timeout_s=1.0)
-            except (Refused, CommunicationLost):
+            except (RunRefused, CommunicationLost):
                 if (status := self.store.status(run)).ended:
                     return status
                 self._kill_frozen(status, who)
@@ -329,7 +329,7 @@ class Supervisor:
             status = Status.of_plain(found["status"])
         except NotReacting:
             raise
-        except (Refused, CommunicationLost, OSError) as error:
+        except (RunRefused, CommunicationLost, OSError) as error:
             status = self.store.status(run)
             begins = status.state is State.REQUESTED and (folder / STOP_FILE).exists()
             reached = begins or (status.pid is not None and send_signal(status.pid, folder, signal.SIGTERM))
@@ -368,7 +368,7 @@ class Supervisor:
         seen, said = _stop_seen(_tdhil_stop(rig.path))
         return int(ExitCode.OK if seen else ExitCode.STOP_NOT_CONFIRMED), said
 
-    def _stop_drive_of(self, request: Request, status: Status) -> tuple[bool, str]:
+    def _stop_drive_of(self, request: StoredRequest, status: Status) -> tuple[bool, str]:
         """Stop the drive of a run, on the run's own connection. Was it seen at rest, and what is there to say?
 
         Never seen at rest where the rig's file was changed since: nobody knows then which shaft that was.
@@ -428,7 +428,7 @@ class Supervisor:
 
     # -- looking after them ----------------------------------------------------------------------------------------
 
-    def _by_key(self, rig: str, key: str, who: str) -> Request | None:
+    def _by_key(self, rig: str, key: str, who: str) -> StoredRequest | None:
         for run in self.store.ids()[:KEYS]:
             with suppress(Exception):
                 request = self.store.request(run)
@@ -544,7 +544,7 @@ class Supervisor:
             text = done.stderr.decode("utf-8", "replace").strip().splitlines()
             found = {"error": Told("Error", "the work failed", text[-1] if text else "", what, "", 1).__dict__}
         if found.get("error"):
-            raise Refused(Told(**found["error"]))
+            raise RunRefused(Told(**found["error"]))
         return found
 
     # -- what is written down of it: nothing that has to do with a shaft waits for it ----------------------------------

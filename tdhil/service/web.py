@@ -50,12 +50,12 @@ from tdhil.service.access import (
 )
 from tdhil.service.accounts import Role
 from tdhil.service.attendance import LEASE_S
-from tdhil.service.audit import Head
+from tdhil.service.audit import ChainHead
 from tdhil.service.door import NO_DESCRIPTOR, Seldom
 from tdhil.service.fleets import Fleets
 from tdhil.service.foxglove import PROTOCOLS, Relay, Running
 from tdhil.service.live_feed import Feed, Feeds
-from tdhil.service.middleware import Guard, body_of, error_response, off, status_of, told_of
+from tdhil.service.middleware import RequestGuard, body_of, error_response, off, status_of, told_of
 from tdhil.service.run_channel import lives
 from tdhil.service.run_state import (
     NotAllowed,
@@ -148,7 +148,7 @@ class Web:
                              middleware=[Middleware(AuthenticationMiddleware, backend=self.access)],
                              exception_handlers=dict.fromkeys((TdhilError, HTTPException, OSError, Exception),
                                                               self._failed))
-        self.asgi: ASGIApp = Guard(self.app, hosts, viewers)
+        self.asgi: ASGIApp = RequestGuard(self.app, hosts, viewers)
 
     def _routes(self) -> list[BaseRoute]:
         api = [Way(f"{API}{route.path}", self._endpoint(route), methods=[route.method]) for route in ROUTES]
@@ -477,7 +477,7 @@ class Web:
             raise UsageError("must be 1 to 5000", where="limit")
 
         given = request.query_params.get("head")
-        kept = None if given is None else Head.of(given)
+        kept = None if given is None else ChainHead.of(given)
 
         def look() -> AuditView:
             audit = self.supervisor.audit

@@ -92,10 +92,11 @@ def trend(asked: dict[str, Any]) -> dict[str, Any]:
 
 def compare(asked: dict[str, Any]) -> dict[str, Any]:
     """Some runs side by side, each identified from its log."""
-    from tdhil.fleet import Settings, compare_document, identified
+    from tdhil.fleet import FleetSettings, compare_document, identified
 
     os.chdir(asked["runs_folder"])
-    return {"document": compare_document([identified(Path(run) / "run.mcap", Settings()) for run in asked["runs"]])}
+    return {"document": compare_document([identified(Path(run) / "run.mcap",
+                                                     FleetSettings()) for run in asked["runs"]])}
 
 
 WORK: Final = {

@@ -13,9 +13,9 @@ from tdhil.version import __version__
 
 if TYPE_CHECKING:
 
-    from tdhil.runner import Knowledge, MachineLimits, Planned, excitation
+    from tdhil.runner import DesignKnowledge, MachineLimits, Planned, excitation
     from tdhil.runner.excitation import RigGuess
-    from tdhil.soft_torque import EvaluationCase, Program
+    from tdhil.soft_torque import EvaluationCase, SpeedProgram
 
 
 SPIN_UP_S = 2.5             # assumed J: the torque limit would take so long through the speed window
@@ -63,7 +63,7 @@ def plan_dry(
 
 def plan_course(
     case: EvaluationCase, rig: Rig | None, simulated: bool, rate_hz: float
-) -> tuple[Program, MachineLimits]:
+) -> tuple[SpeedProgram, MachineLimits]:
     """A virtual string's course, and the machine's limits. Raises what keeps it from being turned."""
     from tdhil.runner import ControlAssumptions, Guard, course_of
 
@@ -134,14 +134,14 @@ def _room(options: RunOptions, limits: MachineLimits) -> excitation.MotionLimits
     return Guard.room(limits, assumptions)
 
 
-def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, Knowledge, tuple[Figure, ...]]:
+def _assumed(bench: Rig, limits: MachineLimits) -> tuple[RigGuess, DesignKnowledge, tuple[Figure, ...]]:
     """The rig, its noise and its lags, and what each of them rests on."""
-    from tdhil.runner import Knowledge, assumed_noise
+    from tdhil.runner import DesignKnowledge, assumed_noise
 
     guess, figures = _guess(bench, limits)
     stated = bench.expected.load_noise_nm
     noise = assumed_noise(limits.torque_nm, limits.speed_max_rad_s, stated)
-    known = Knowledge(noise, lag_prior(bench), limits.winds_up)
+    known = DesignKnowledge(noise, lag_prior(bench), limits.winds_up)
     return guess, known, (
         *figures,
         Figure("disturbing torque (sd)", noise.load_sd_nm, "N·m", _source(bench, "expected.load_noise_nm")),

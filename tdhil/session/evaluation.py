@@ -46,7 +46,7 @@ def evaluation_case(
 
     ``where``: the tuning's file. UsageError where they don't go together, or lack what is needed.
     """
-    from tdhil.soft_torque import EvaluationCase, Prediction, Rig, SpeedController, TopDrive
+    from tdhil.soft_torque import EvaluationCase, IdentifiedRig, Prediction, SpeedController, TopDrive
 
     try:
         _same_string(string, tuning["string"], where)
@@ -68,8 +68,8 @@ def evaluation_case(
                              next_step="Identify with a multisine, and tune with what comes of it")
         low, high = lag.get("low"), lag.get("high")
         error_s = 0.5 * (high - low) if low is not None and high is not None else 0.0
-        real = Rig(inertia["value"], _value(rig["viscous_nm_s_rad"]), _value(rig["coulomb_nm"]),
-                   max(0.0, lag["value"]), rig["gear_ratio"])
+        real = IdentifiedRig(inertia["value"], _value(rig["viscous_nm_s_rad"]), _value(rig["coulomb_nm"]),
+                             max(0.0, lag["value"]), rig["gear_ratio"])
         prediction = Prediction(
             use, _interval(cure), _interval(chosen["least_damping"]), tuple(tuning["string"]["modes_hz"]))
         return EvaluationCase(string, meant, SpeedController(**chosen["at_main_shaft"]), real, prediction, error_s,
@@ -128,16 +128,16 @@ def conclude_evaluation(
     """From what the log holds alone: the same live and replayed. LogError where that is not enough."""
     from tdhil.estimation import torque_contradiction, torque_ratios
     from tdhil.report import evaluation_document
-    from tdhil.soft_torque import Outcome, Program, case_of, evaluate
+    from tdhil.soft_torque import EvaluationOutcome, SpeedProgram, case_of, evaluate
 
     try:
         asked = run["evaluation"]
-        case, program = case_of(asked["case"]), Program(**asked["program"])
+        case, program = case_of(asked["case"]), SpeedProgram(**asked["program"])
         signals = torque_contradiction(torque_ratios(recording, _CONFIDENCE), recording.torque_scale_rel_sd)
         found = evaluate(rows, case, program, "" if signals is None else f"{signals.reason}. Next: {signals.advice}")
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"holds no evaluation that can be read ({error})", where=log,
                        next_step="The run has to be done again") from None
-    stands = found.outcome in (Outcome.AS_PREDICTED, Outcome.DIFFERS)
+    stands = found.outcome in (EvaluationOutcome.AS_PREDICTED, EvaluationOutcome.DIFFERS)
     document = evaluation_document(found, case, recording, run, log)
     return EvaluationConclusion(document, ExitCode.OK if stands else ExitCode.NOT_IDENTIFIABLE)

@@ -10,19 +10,19 @@ import difflib
 from collections.abc import Collection, Iterable
 
 from drivers import PreflightRefused
-from profiles import Entry, Profile
+from profiles import Profile, ProfileEntry
 from tdhil.errors import UsageError
 
 ALL_LIKELY = "likely"
 UNVERIFIED_FLAG = "--accept-unverified"
 
 
-def doubtful(profile: Profile) -> tuple[tuple[str, Entry], ...]:
+def doubtful(profile: Profile) -> tuple[tuple[str, ProfileEntry], ...]:
     """(name, entry) of everything below verified."""
     return tuple((name, entry) for name, entry in profile.entries() if entry.confidence != "verified")
 
 
-def is_accepted(name: str, entry: Entry, accepted: Collection[str]) -> bool:
+def is_accepted(name: str, entry: ProfileEntry, accepted: Collection[str]) -> bool:
     """Has the operator taken this entry?"""
     if name in accepted:
         return True
@@ -69,13 +69,13 @@ def note(profile: Profile) -> str:
     return f"profile {profile.name}: {what} not verified; on a real drive {UNVERIFIED_FLAG} must take them"
 
 
-def _text(profile: Profile, refused: list[tuple[str, Entry]]) -> str:
+def _text(profile: Profile, refused: list[tuple[str, ProfileEntry]]) -> str:
     lines = [f"  {name} ({entry.confidence}): {entry.source}" for name, entry in refused]
     counted = "1 entry of this profile is" if len(lines) == 1 else f"{len(lines)} entries of this profile are"
     return "\n".join([f"{counted} not verified, and the drive is a real one", *lines])
 
 
-def _step(profile: Profile, refused: list[tuple[str, Entry]]) -> str:
+def _step(profile: Profile, refused: list[tuple[str, ProfileEntry]]) -> str:
     words = [ALL_LIKELY] if any(entry.confidence == "likely" for _, entry in refused) else []
     words += [name for name, entry in refused if entry.confidence == "unverified"]
     options = " ".join(f"{UNVERIFIED_FLAG} {word}" for word in words)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from tdhil.recording import Ended, FloatArray, LagPrior, Recording
+    from tdhil.recording import FloatArray, LagPrior, Recording, RunEnd
 
 _REPEATED = frozenset(ExitCode) - {ExitCode.INTERNAL, ExitCode.INTERRUPTED, ExitCode.TERMINATED}
 """Exit codes of a run that tell of the run; the others tell of the process that it was."""
@@ -42,7 +42,7 @@ class RunRecord:
     log: str
     assumed: tuple[str, ...] | None = None
     problems: tuple[str, ...] = ()
-    ended: Ended | None = None
+    ended: RunEnd | None = None
     stored_result: Mapping[str, Any] | None = None
     virtual_string: FloatArray | None = None
 

@@ -6,19 +6,22 @@ from profiles import lazy_face
 
 if TYPE_CHECKING:
     from tdhil.soft_torque.drill_string import (
-        BitFriction as BitFriction, Bottom as Bottom, DrillString as DrillString, Line as Line, Section as Section,
+        BitFriction as BitFriction, BottomEnd as BottomEnd, DrillString as DrillString, WaveLine as WaveLine,
+        PipeSection as PipeSection,
         StringFile as StringFile, load_string as load_string, spring_and_mass as spring_and_mass,
         string_of as string_of,
     )
     from tdhil.soft_torque.controller import (
-        ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins, Mode as Mode,
+        ClosedSystem as ClosedSystem, DERIVATIVE_FILTER_S as DERIVATIVE_FILTER_S, Margins as Margins,
+        NaturalMode as NaturalMode,
         SpeedController as SpeedController, TopDrive as TopDrive, control_law as control_law, impedance as impedance,
         inner_lags as inner_lags, margins as margins, reflection as reflection, reflection_at as reflection_at,
         softest_allowed as softest_allowed, stiff_controller as stiff_controller, tuned_controller as tuned_controller,
     )
     from tdhil.soft_torque.evaluation import (
         Evaluation as Evaluation, EvaluationCase as EvaluationCase, EvaluationRefused as EvaluationRefused,
-        Outcome as Outcome, Prediction as Prediction, Trial as Trial, Window as Window, case_of as case_of,
+        EvaluationOutcome as EvaluationOutcome, Prediction as Prediction, Trial as Trial, RigWindow as RigWindow,
+        case_of as case_of,
         evaluate as evaluate, program_for as program_for, refuse_untrue as refuse_untrue,
     )
     from tdhil.soft_torque.own_units import (
@@ -26,7 +29,8 @@ if TYPE_CHECKING:
     )
     from tdhil.soft_torque.roots import RootsLost as RootsLost, count_in as count_in, roots_in as roots_in
     from tdhil.soft_torque.simulation import (
-        Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search, Trace as Trace,
+        Begin as Begin, CriticalSpeeds as CriticalSpeeds, Grid as Grid, RPM as RPM, Search as Search,
+        SimulationTrace as SimulationTrace,
         critical_speeds as critical_speeds, grid_of as grid_of, lowest_turning as lowest_turning,
         onset_speeds as onset_speeds, simulate as simulate,
     )
@@ -39,8 +43,9 @@ if TYPE_CHECKING:
         string_modes_hz as string_modes_hz, tune as tune,
     )
     from tdhil.soft_torque.virtual_string import (
-        COLUMNS as COLUMNS, Course as Course, HostController as HostController, HostLoop as HostLoop,
-        Observer as Observer, Phase as Phase, Program as Program, Rig as Rig, VirtualString as VirtualString,
+        COLUMNS as COLUMNS, ProgramCourse as ProgramCourse, HostController as HostController, HostLoop as HostLoop,
+        RotorObserver as RotorObserver, Phase as Phase, SpeedProgram as SpeedProgram, IdentifiedRig as IdentifiedRig,
+        VirtualString as VirtualString,
     )
 else:
     __getattr__, __dir__ = lazy_face(__name__)

@@ -113,7 +113,7 @@ def reflection_at(drive: TopDrive, controller: SpeedController, string: DrillStr
 
 
 @dataclass(frozen=True)
-class Mode:
+class NaturalMode:
     """One natural motion."""
 
     pole_rad_s: complex
@@ -155,11 +155,11 @@ class ClosedSystem:
         rotor = (drive.inertia_kg_m2 * s + drive.viscous_nm_s_rad) * speed + torque
         return lags * filtered * s * rotor + law * speed
 
-    def modes(self, below_hz: float) -> tuple[Mode, ...]:
+    def modes(self, below_hz: float) -> tuple[NaturalMode, ...]:
         """Every natural motion up to |s| = 2π ``below_hz`` that swings, by frequency; damping of up to 0.98."""
         reach = 2.0 * pi * below_hz
         found = roots_in(self.characteristic, complex(-reach, 0.02 * reach), complex(0.25 * reach, reach), self._pace)
-        swinging = [Mode(pole) for pole in found if abs(pole) <= reach]
+        swinging = [NaturalMode(pole) for pole in found if abs(pole) <= reach]
         return tuple(sorted(swinging, key=lambda mode: mode.frequency_hz))
 
     def is_stable(self, up_to_rad_s: float | None = None) -> bool:

@@ -67,7 +67,7 @@ class ToolJoints(DataModel):
         return _bore(values)
 
 
-class Section(DataModel):
+class PipeSection(DataModel):
     """One uniform stretch of pipe or collar."""
 
     length_m: _Length | None = Field(default=None, description="m; or stiffness_nm_rad")
@@ -93,14 +93,14 @@ class Section(DataModel):
         return found
 
 
-class Bottom(DataModel):
+class BottomEnd(DataModel):
     """What turns at the bottom: an inertia, or sections of a bottom-hole assembly, and the bit's friction.
 
     The words are plant.yaml's. Without ``coulomb_nm`` no bit is stated, and nothing is said of critical speeds.
     """
 
     inertia_kg_m2: _NotNegative = Field(default=0.0, description="kg·m²; collars and bit as one")
-    sections: tuple[Section, ...] = Field(default=(), description="bottom-hole assembly, from the top down")
+    sections: tuple[PipeSection, ...] = Field(default=(), description="bottom-hole assembly, from the top down")
     viscous_nm_s_rad: _NotNegative = Field(default=0.0, description="N·m·s/rad, of the bit")
     friction: Literal["coulomb", "stribeck"] = "coulomb"
     coulomb_nm: _NotNegative | None = Field(default=None, description="N·m, of a bit that turns fast")
@@ -132,8 +132,8 @@ class StringFile(DataModel):
     """string.yaml."""
 
     name: str | None = Field(default=None, min_length=1, max_length=200)
-    sections: Annotated[tuple[Section, ...], Field(min_length=1)]
-    bottom: Bottom
+    sections: Annotated[tuple[PipeSection, ...], Field(min_length=1)]
+    bottom: BottomEnd
 
 
 def _bore(values: Mapping[str, Any]) -> list[Finding]:
@@ -146,7 +146,7 @@ def _bore(values: Mapping[str, Any]) -> list[Finding]:
 # ---------------------------------------------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
-class Line:
+class WaveLine:
     """A uniform stretch as the waves see it."""
 
     length_m: float
@@ -192,7 +192,7 @@ class BitFriction:
 class DrillString:
     """Lines from the top down, and what turns at the lower end of the last."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[WaveLine, ...]
     bottom_inertia_kg_m2: float
     bottom_viscous_nm_s_rad: float = 0.0
     bit: BitFriction | None = None
@@ -253,7 +253,7 @@ def _cosh_and_sinh_over(square: Complex, length: float) -> tuple[Complex, Comple
     return np.cosh(product), over
 
 
-def line_of(section: Section) -> Line:
+def line_of(section: PipeSection) -> WaveLine:
     """The section as the waves see it; a length that isn't stated is k's."""
     inertia, compliance = _per_metre(section, section.outer_diameter_m, section.inner_diameter_m)
     joints = section.tool_joints
@@ -267,10 +267,10 @@ def line_of(section: Section) -> Line:
     else:
         assert section.stiffness_nm_rad is not None
         length = 1.0 / (section.stiffness_nm_rad * compliance)
-    return Line(length, inertia, compliance, section.drag_nm_s_rad_m)
+    return WaveLine(length, inertia, compliance, section.drag_nm_s_rad_m)
 
 
-def _per_metre(section: Section, outer_m: float, inner_m: float) -> tuple[float, float]:
+def _per_metre(section: PipeSection, outer_m: float, inner_m: float) -> tuple[float, float]:
     polar = pi * (outer_m**4 - inner_m**4) / 32.0
     return section.density_kg_m3 * polar, 1.0 / (section.shear_modulus_pa * polar)
 
@@ -312,6 +312,6 @@ def spring_and_mass(
     inertia = SPRING_SHARE * load
     delay_s = sqrt(inertia / stiffness_nm_rad)
     drag = 2.0 * SPRING_LOSS * inertia * pi / delay_s
-    line = Line(1.0, inertia, 1.0 / stiffness_nm_rad, drag)
+    line = WaveLine(1.0, inertia, 1.0 / stiffness_nm_rad, drag)
     mass = inertia / (swing * delay_s * tan(swing * delay_s))
     return DrillString((line,), mass, max(0.0, damping_nm_s_rad - drag / 3.0), name=name, supposed=True)

@@ -16,7 +16,7 @@ from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString
 from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, Array, Begin, simulate
 from tdhil.soft_torque.tuning import Interval, lowest_modes_below_hz
-from tdhil.soft_torque.virtual_string import COLUMNS, Phase, Program, Rig
+from tdhil.soft_torque.virtual_string import COLUMNS, IdentifiedRig, Phase, SpeedProgram
 
 LOWEST_RATE_HZ = 20.0
 MOST_CROSSOVER = 0.35
@@ -59,7 +59,7 @@ class Prediction:
 
 
 @dataclass(frozen=True)
-class Window:
+class RigWindow:
     """What the rig may do, at the motor: speed, torque, and by how much its guard looks ahead."""
 
     lowest_rad_s: float
@@ -75,7 +75,7 @@ class EvaluationCase:
     string: DrillString
     meant: TopDrive
     law: SpeedController
-    rig: Rig
+    rig: IdentifiedRig
     prediction: Prediction
     speed_lag_error_s: float = 0.0
     """Half of the lag's 95 % interval."""
@@ -126,7 +126,7 @@ def refuse_untrue(case: EvaluationCase, period_s: float) -> None:
             "again with a multisine, for longer")
 
 
-def program_for(case: EvaluationCase, window: Window) -> Program:
+def program_for(case: EvaluationCase, window: RigWindow) -> SpeedProgram:
     """The course for this rig. EvaluationRefused where its speed window or its torque has no room for it."""
     cure, ratio = case.prediction.cure_rpm, case.rig.gear_ratio
     ends = cure.high + max(ABOVE_RPM, ABOVE_SHARE * cure.high)
@@ -158,13 +158,13 @@ def program_for(case: EvaluationCase, window: Window) -> Program:
             next_step="Raise it, if machine and drive allow, or take a softer controller (--use)")
     # Of the meant rotor, in its first second too, which a bit that breaks away kicks.
     moving_nm = case.meant.inertia_kg_m2 * float(np.abs(rate).max()) / ratio
-    program = Program(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
+    program = SpeedProgram(below[bearable[0]] * RPM, min(ends * RPM, room / ratio), peak_nm=moving_nm)
     if case.own_loop:      # which has to make up for the string's torque by itself
         program = replace(program, fade_s=OWN_LOOP_FADE_S, armed_s=OWN_LOOP_ARMED_S, settle_s=OWN_LOOP_ARMED_S)
     return program
 
 
-def _refuse_low(case: EvaluationCase, window: Window, lowest_rad_s: float) -> NoReturn:
+def _refuse_low(case: EvaluationCase, window: RigWindow, lowest_rad_s: float) -> NoReturn:
     """At every set speed at which the bit shall stick the top swings too low, at the best to ``lowest_rad_s``."""
     if lowest_rad_s <= 0.0:
         raise EvaluationRefused(
@@ -183,7 +183,7 @@ def _refuse_low(case: EvaluationCase, window: Window, lowest_rad_s: float) -> No
 # From the rows of a log.
 
 
-class Outcome(StrEnum):
+class EvaluationOutcome(StrEnum):
     """Of an evaluation."""
 
     AS_PREDICTED = "as_predicted"
@@ -207,7 +207,7 @@ class Trial:
 class Evaluation:
     """Speeds and torques of the meant machine's main shaft."""
 
-    outcome: Outcome
+    outcome: EvaluationOutcome
     why: str
     critical_rpm: Interval | None
     """Lowest set speed from which a bit about to break away ends turning, and the bracket: *cure*, as `tune` has it."""
@@ -232,7 +232,7 @@ FOREIGN_SHARE = 0.1
 """Of the torque that moves the shaft, that may be unknown: more, and the rig isn't the one that was identified."""
 
 
-def evaluate(rows: Array, case: EvaluationCase, program: Program, contradiction: str = "") -> Evaluation:
+def evaluate(rows: Array, case: EvaluationCase, program: SpeedProgram, contradiction: str = "") -> Evaluation:
     """What the log of a run shows. ValueError where no row is there.
 
     ``contradiction``: how the drive's torque signals contradict each other, if they do; then nothing is as predicted.
@@ -261,7 +261,7 @@ def evaluate(rows: Array, case: EvaluationCase, program: Program, contradiction:
     reached = float(set_rad_s.max())
     outcome, why = _verdict(case, program, clamped, foreign, did_stick, critical, decay, unknown, reached)
     if contradiction:
-        outcome, why = Outcome.INVALID, contradiction
+        outcome, why = EvaluationOutcome.INVALID, contradiction
     return Evaluation(
         outcome, why, critical, ramp, trials, _rms(column["drive_nm"][holding]),
         _rms(column["drive_nm"][steady][-round(10.0 / period_s) :]), None if decay is None else decay[0],
@@ -271,38 +271,40 @@ def evaluate(rows: Array, case: EvaluationCase, program: Program, contradiction:
 
 
 def _verdict(
-    case: EvaluationCase, program: Program, clamped: int, foreign: float, did_stick: bool, critical: Interval | None,
+    case: EvaluationCase, program: SpeedProgram, clamped: int, foreign: float, did_stick: bool,
+    critical: Interval | None,
     decay: tuple[float, float] | None, unknown_nm: float, reached: float,
-) -> tuple[Outcome, str]:
+) -> tuple[EvaluationOutcome, str]:
     predicted, damping = case.prediction.cure_rpm, case.prediction.least_damping
     if clamped:
-        return Outcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
+        return EvaluationOutcome.INVALID, f"the torque limit cut the virtual string's torque off in {clamped} cycles"
     if foreign > FOREIGN_SHARE:
-        return Outcome.INVALID, (
+        return EvaluationOutcome.INVALID, (
             f"{unknown_nm:.0f} N·m rms of torque that nobody commanded, {100.0 * foreign:.0f} % of what moved the "
             "shaft: " + ("the drive's gains are not these, or " if case.own_loop else "")
             + "inertia, friction or lags are not those of the result")
     if not did_stick:
-        return Outcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
+        return EvaluationOutcome.NOT_FOUND, "the bit did not stick and slip at the first set speed"
     if critical is None:
         if reached < program.highest_rad_s - 0.5 * RPM:
-            return Outcome.NOT_FOUND, f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning"
-        return Outcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
+            return (EvaluationOutcome.NOT_FOUND,
+                    f"the run ended at {reached / RPM:.0f} rpm, before the bit had ended turning")
+        return EvaluationOutcome.NOT_FOUND, "the bit never ended turning, up to the highest set speed"
     off = max(predicted.low - critical.value, critical.low - predicted.high, 0.0)
     words = f"critical speed {critical.value:.1f} rpm, predicted {predicted.low:.0f} to {predicted.high:.0f}"
     if off > TOLERANCE_RPM:
-        return Outcome.DIFFERS, words
+        return EvaluationOutcome.DIFFERS, words
     if decay is not None and not damping.low - TOLERANCE_DAMPING <= decay[0] <= damping.high + TOLERANCE_DAMPING:
-        return Outcome.DIFFERS, (
+        return EvaluationOutcome.DIFFERS, (
             f"damping {decay[0]:.3f}, predicted {damping.low:.3f} to {damping.high:.3f}; {words}")
-    return Outcome.AS_PREDICTED, words
+    return EvaluationOutcome.AS_PREDICTED, words
 
 
 def _rms(values: Array) -> float | None:
     return float(np.std(values)) if len(values) else None
 
 
-def _trials(rows: Array, program: Program, period_s: float) -> tuple[Trial, ...]:
+def _trials(rows: Array, program: SpeedProgram, period_s: float) -> tuple[Trial, ...]:
     at = np.flatnonzero(rows[:, COLUMNS.index("phase")] == Phase.TRIAL)
     if not len(at):
         return ()
@@ -373,18 +375,18 @@ def _fitted(poles: NDArray[np.complex128], values: Array, every_s: float) -> NDA
 
 def case_of(plain: Mapping[str, Any]) -> EvaluationCase:
     """What `EvaluationCase.plain` made a mapping of, as a log's configuration gives it back. Raises as its types do."""
-    from tdhil.soft_torque.drill_string import BitFriction, Line
+    from tdhil.soft_torque.drill_string import BitFriction, WaveLine
 
     string, bit = plain["string"], plain["string"]["bit"]
     if bit is not None and bit["stribeck_speed_rad_s"] is None:
         bit = {**bit, "stribeck_speed_rad_s": inf}
     prediction = plain["prediction"]
     return EvaluationCase(
-        DrillString(tuple(Line(**line) for line in string["lines"]), string["bottom_inertia_kg_m2"],
+        DrillString(tuple(WaveLine(**line) for line in string["lines"]), string["bottom_inertia_kg_m2"],
                     string["bottom_viscous_nm_s_rad"], None if bit is None else BitFriction(**bit), string["name"]),
         TopDrive(**{**plain["meant"], "inner_lags_s": tuple(plain["meant"]["inner_lags_s"])}),
         SpeedController(**plain["law"]),
-        Rig(**plain["rig"]),
+        IdentifiedRig(**plain["rig"]),
         Prediction(prediction["kind"], Interval(**prediction["cure_rpm"]), Interval(**prediction["least_damping"]),
                    tuple(prediction["string_modes_hz"])),
         plain["speed_lag_error_s"],

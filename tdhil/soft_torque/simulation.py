@@ -98,7 +98,7 @@ def grid_of(string: DrillString, longest_tick_s: float = LONGEST_TICK_S) -> Grid
 
 
 @dataclass(frozen=True)
-class Trace:
+class SimulationTrace:
     """What was kept: first index time, second the loop, third the set speed."""
 
     time_s: Array
@@ -136,7 +136,7 @@ def simulate(
     keep_every_s: float = 0.1,
     longest_tick_s: float = LONGEST_TICK_S,
     hold_s: float = 0.0,
-) -> Trace:
+) -> SimulationTrace:
     """Every loop at every set speed: the set speed goes from ``begin``'s to the target along the ramp, after a hold.
 
     ``target_rad_s``: (loops, speeds). A bit must be stated. Raises ValueError where none is.
@@ -148,7 +148,7 @@ def simulate(
     top = _Top(loops, grid, shape[1])
     now = np.broadcast_to(begin.speed_rad_s, shape).astype(float).copy()
     set_speed = now.copy() if begin.how != "rest" else np.zeros(shape)
-    pipe = Pipe(string, grid, shape[0] * shape[1])
+    pipe = PipeSimulation(string, grid, shape[0] * shape[1])
     speed, held = np.zeros(shape), np.zeros(shape)
     if begin.how == "stuck":
         speed, held = now, np.full(shape, string.bit.static_nm)
@@ -178,8 +178,8 @@ def simulate(
         if tick % every == 0:
             kept.append((time_s, set_speed, mean_top, bit_speed.reshape(shape), top.torque_nm))
     times, sets, tops, bits, torques = zip(*kept, strict=True)
-    return Trace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
-                 first.reshape(shape), last.reshape(shape))
+    return SimulationTrace(np.array(times), np.array(sets), np.array(tops), np.array(bits), np.array(torques),
+                           first.reshape(shape), last.reshape(shape))
 
 
 class _Waves:
@@ -240,7 +240,7 @@ class _Waves:
         self._now += 1
 
 
-class Pipe:
+class PipeSimulation:
     """Waves and bit, a tick at a time: whatever hangs below a top drive, simulated or real; one number a case."""
 
     def __init__(self, string: DrillString, grid: Grid, cases: int) -> None:

@@ -33,7 +33,7 @@ from profiles import TdhilError
 from tdhil.soft_torque.controller import (
     ClosedSystem,
     Margins,
-    Mode,
+    NaturalMode,
     SpeedController,
     TopDrive,
     margins,
@@ -163,7 +163,7 @@ class Tuned:
     """Mean |r| over `BAND_HZ`."""
     damping: Interval | None = None
     """The least of the lowest modes'."""
-    modes: tuple[Mode, ...] = ()
+    modes: tuple[NaturalMode, ...] = ()
     margins: Margins | None = None
     lag_reserve_s: float | None = None
     """So much more lag in the loop, and it swings; None: more than 1 s."""
@@ -228,7 +228,9 @@ def lowest_modes_below_hz(held_hz: Sequence[float]) -> float:
     return max(sqrt(held_hz[0] * second), NEXT_MODE_SHARE * second)
 
 
-def lowest_modes(case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]) -> tuple[Mode, ...]:
+def lowest_modes(
+    case: TuneCase, drive: TopDrive, law: SpeedController, held_hz: Sequence[float]
+) -> tuple[NaturalMode, ...]:
     """Those that the string's lowest mode has become."""
     return ClosedSystem(case.string, drive, law).modes(lowest_modes_below_hz(held_hz))
 

@@ -15,9 +15,9 @@ knows of, and F the rig's known friction,
 
     J dω/dt = T − F(ω) + d        τ_w dy/dt = ω − y        dd/dt = 0
 
-is followed by the report through three equal poles (`Observer`), exactly sampled; then ω is carried on by the torque
-that is under way to the moment at which the next one acts. d is used for that and is never compensated: what the real
-rotor does otherwise than the believed one, it also does to the virtual string.
+is followed by the report through three equal poles (`RotorObserver`), exactly sampled; then ω is carried on by the
+torque that is under way to the moment at which the next one acts. d is used for that and is never compensated: what
+the real rotor does otherwise than the believed one, it also does to the virtual string.
 
 **Energy.** String and bit take ∫ τ ω dt by their own speed, and ∫ τ y dt by the speed that is reported; what the first
 is ahead of the second was put into the shaft by the loop's own errors.
@@ -33,7 +33,7 @@ import numpy as np
 
 from tdhil.soft_torque.controller import SpeedController, TopDrive
 from tdhil.soft_torque.drill_string import DrillString
-from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, SLIDING_BLUR_RAD_S, Array, Pipe, grid_of
+from tdhil.soft_torque.simulation import LONGEST_TICK_S, RPM, SLIDING_BLUR_RAD_S, Array, PipeSimulation, grid_of
 
 
 class VirtualString:
@@ -51,7 +51,7 @@ class VirtualString:
 
     def arm(self) -> None:
         """At rest, and wound up to where the bit is about to break away."""
-        self._pipe = Pipe(self._string, self._grid, 1)
+        self._pipe = PipeSimulation(self._string, self._grid, 1)
         self._pipe.wind_up(np.array([self._static_nm]))
         self._into_tick_s = self._travel_rad = self._top_rad_s = 0.0
 
@@ -164,7 +164,7 @@ SLOWEST_RAD_S, FASTEST_RAD_S = 3.0, 10.0
 
 
 @dataclass(frozen=True)
-class Rig:
+class IdentifiedRig:
     """The machine that turns, at the motor's shaft, as `identify` found it."""
 
     inertia_kg_m2: float
@@ -174,7 +174,7 @@ class Rig:
     gear_ratio: float = 1.0
 
 
-class Observer:
+class RotorObserver:
     """The rotor's speed now, from torques that were commanded and speeds that were reported late."""
 
     def __init__(self, drive: TopDrive, speed_lag_s: float, period_s: float) -> None:
@@ -257,7 +257,7 @@ class Phase(IntEnum):
 
 
 @dataclass(frozen=True)
-class Program:
+class SpeedProgram:
     """Speeds are of the main shaft."""
 
     start_rad_s: float
@@ -291,10 +291,10 @@ class Program:
         return once + self.most_trials * (self.trial_s + around + 0.5 * span / self.move_rad_s2)
 
 
-class Course:
+class ProgramCourse:
     """Where the program is; told in every cycle whether the bit stands still."""
 
-    def __init__(self, program: Program, period_s: float) -> None:
+    def __init__(self, program: SpeedProgram, period_s: float) -> None:
         self._program, self._period_s = program, period_s
         self._time_s = self._phase_s = self._stuck_s = 0.0
         self._target_rad_s = program.start_rad_s
@@ -401,9 +401,11 @@ class Course:
 
 
 _STEPS = {
-    Phase.MOVE: Course._move, Phase.ARM: Course._arm, Phase.HOLD: Course._hold, Phase.RAMP: Course._ramp,
-    Phase.STEADY: Course._steady, Phase.RELEASED: Course._released, Phase.FADE_OUT: Course._fade_out,
-    Phase.TRIAL: Course._trial,
+    Phase.MOVE: ProgramCourse._move, Phase.ARM: ProgramCourse._arm, Phase.HOLD: ProgramCourse._hold,
+    Phase.RAMP: ProgramCourse._ramp,
+    Phase.STEADY: ProgramCourse._steady, Phase.RELEASED: ProgramCourse._released,
+    Phase.FADE_OUT: ProgramCourse._fade_out,
+    Phase.TRIAL: ProgramCourse._trial,
 }
 
 
@@ -425,7 +427,7 @@ class HostLoop:
     """
 
     def __init__(
-        self, string: DrillString, meant: TopDrive, law: SpeedController, rig: Rig, program: Program,
+        self, string: DrillString, meant: TopDrive, law: SpeedController, rig: IdentifiedRig, program: SpeedProgram,
         period_s: float, torque_limit_nm: float, own_loop: bool = False,
     ) -> None:
         self._meant, self._rig, self._period_s, self._own_loop = meant, rig, period_s, own_loop
@@ -435,10 +437,10 @@ class HostLoop:
         self._own = TopDrive(rig.inertia_kg_m2 * rig.gear_ratio / self.scale,
                              rig.viscous_nm_s_rad * rig.gear_ratio / self.scale, rig.coulomb_nm / self.scale)
         self._same = own_loop or abs(self.scale * rig.gear_ratio - 1.0) < 1e-9
-        self._observer = Observer(self._own, rig.speed_lag_s, period_s)
+        self._observer = RotorObserver(self._own, rig.speed_lag_s, period_s)
         self._string = VirtualString(string)
         self._controller = HostController(law, meant.inner_lags_s, period_s)
-        self._course = Course(program, period_s)
+        self._course = ProgramCourse(program, period_s)
         self._torque_nm = self._acted_nm = 0.0     # acts until the next one does, and the one before; main shaft
         self._share = 0.0
         self._put_in_j = self._net_nm = 0.0

@@ -14,7 +14,7 @@ Cell = str | int | float | None
 
 @dataclass(frozen=True)
 class ResultTable:
-    """Written as one CSV and printed as one table. Units stand in the column names (`inertia_kg_m2`)."""
+    """Written as one CSV and printed as one table. Units stand in the column names (``inertia_kg_m2``)."""
 
     name: str                                  # file stem, and heading when printed
     columns: tuple[str, ...]

@@ -23,19 +23,18 @@ from pydantic import TypeAdapter, ValidationError
 import tdhil
 from drivers.drive import RawFrame
 from drivers.errors import CommunicationLost, DataFileError
-from profiles.entry import DriveProfile
-from profiles.entry import Entry as ProfileEntry
+from profiles.entry import DriveProfile, ProfileEntry
 from profiles.library import SCHEMAS
 from profiles.model import Positive
 from profiles.yaml_loader import parse_model
 from sim_bus.params import RigParams
 from sim_bus.plant import kinds as plants
-from sim_bus.plant.friction.shaft import Shaft
-from tdhil.cli.doctor_finding import Finding, ok
+from sim_bus.plant.friction.shaft import ShaftParams
+from tdhil.cli.doctor_finding import DoctorFinding, ok
 from tdhil.cli.main import build_parser, main
 from tdhil.cli.scan_common import BusCommands, FoundDrive
 from tdhil.config.options import Setting
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, Entry, load, names, told_before_echo
+from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, BusEntry, RegistryEntry, load, names, told_before_echo
 from tdhil.config.rig import Registered, Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.estimation import Options, identify
@@ -43,7 +42,15 @@ from tdhil.estimation.frequency_domain.shafts import ShaftModel, TwoMassShaft
 from tdhil.recording.csv.excitation import ExcitationFile
 from tdhil.recording.log_format import MODBUS
 from tdhil.recording.log_reader import read_frames, read_run
-from tdhil.runner.excitation import ExcitationKind, MotionLimits, PeriodicKind, PlanRefused, RigGuess, Shape, Way
+from tdhil.runner.excitation import (
+    ExcitationKind,
+    MotionLimits,
+    PeriodicKind,
+    PlanRefused,
+    RigGuess,
+    Shape,
+    SpeedChange,
+)
 from tdhil.runner.excitation.pulses import SwingKind, SwingPlan
 from tdhil.runner.excitation.signals import unit_peak
 from tdhil.runner.planning import adaptive, plan_acquisition, refuse_hopeless
@@ -68,12 +75,12 @@ def two_tones() -> Shape:
     return unit_peak(Shape(harmonics=(1, 3), amplitudes=(1.0, 0.4), phases_rad=(0.0, 1.0)))
 
 
-def stairs(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+def stairs(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[SpeedChange]:
     levels = (low, 0.5 * (low + high), high, 0.5 * (low + high))
     number = 0
     while True:
         at, to = levels[number % 4], levels[(number + 1) % 4]
-        yield Way(at, to, max(0.5, abs(to - at) / rate), guess)
+        yield SpeedChange(at, to, max(0.5, abs(to - at) / rate), guess)
         number += 1
 
 
@@ -83,8 +90,8 @@ STAIRS = SwingKind(ways=stairs, needs_torque_mode=True, why_torque_mode="for the
 
 @pytest.fixture
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(EXCITATIONS, "two-tones", Entry(f"{__name__}:TWO_TONES", "two tones", periodic=True))
-    monkeypatch.setitem(EXCITATIONS, "stairs", Entry(f"{__name__}:STAIRS", "up and down in steps"))
+    monkeypatch.setitem(EXCITATIONS, "two-tones", RegistryEntry(f"{__name__}:TWO_TONES", "two tones", periodic=True))
+    monkeypatch.setitem(EXCITATIONS, "stairs", RegistryEntry(f"{__name__}:STAIRS", "up and down in steps"))
 
 
 @pytest.mark.heavy
@@ -150,7 +157,7 @@ STIFF_JOINT = ShaftModel(StiffJoint, "a stiff joint")
 def test_a_toy_shaft_is_fitted_by_name(monkeypatch):
     with pytest.raises(ValueError, match=r"model must be auto, rigid, two-mass, .* or [a-z-]+: 'stiff-joint'"):
         Options(model="stiff-joint")
-    monkeypatch.setitem(MODELS, "stiff-joint", Entry(f"{__name__}:STIFF_JOINT", "a stiff joint"))
+    monkeypatch.setitem(MODELS, "stiff-joint", RegistryEntry(f"{__name__}:STIFF_JOINT", "a stiff joint"))
     recording = run(TwoMass(), [3], noise=MILD, lag_prior=KNOWN_LAGS)[0]
     toy, two = (identify(recording, Options(model=name)) for name in ("stiff-joint", "two-mass"))
     assert toy.model == "stiff-joint" and "a stiff joint explains the data" in toy.reason
@@ -166,7 +173,7 @@ def test_a_toy_shaft_is_fitted_by_name(monkeypatch):
 # A plant of the simulator: its file, and one line in the list
 
 
-class FlywheelParams(Shaft):
+class FlywheelParams(ShaftParams):
     """The toy's section in plant.yaml."""
 
     kind: Literal["flywheel"] = "flywheel"
@@ -177,7 +184,7 @@ class Flywheel(plants.Rigid):
     """More inertia on a rigid shaft."""
 
     def __init__(self, params: FlywheelParams) -> None:
-        same = {name: getattr(params, name) for name in Shaft.model_fields}
+        same = {name: getattr(params, name) for name in ShaftParams.model_fields}
         super().__init__(plants.Params(**same | {"inertia_kg_m2": params.inertia_kg_m2 + params.wheel_kg_m2}))
 
 
@@ -310,7 +317,7 @@ class ToyCommands(BusCommands):
     def scan(self, plan: Any, connection: Any, options: Any, asked: Any) -> tuple[tuple[FoundDrive, ...], list[str]]:
         return (FoundDrive("toy", connection.line.value("peg"), "a toy", "wood", plan.embedded),), ["it is asleep"]
 
-    def findings(self, plan: Any, connection: Any, options: Any, rig: Any, seen: list[Any]) -> Iterator[Finding]:
+    def findings(self, plan: Any, connection: Any, options: Any, rig: Any, seen: list[Any]) -> Iterator[DoctorFinding]:
         yield ok("toy", f"peg {connection.line.value('peg')} answers")
         seen.append(Peg(7))
 

@@ -7,8 +7,8 @@ import struct
 import pytest
 
 from drivers.angle import Unwrapped, longest_gap_s
-from drivers.canopen.pdo import Shape, Slow
-from drivers.canopen.slow_feedback import FORGOTTEN, Shown, SlowFeedback
+from drivers.canopen.pdo import FrameShape, Slow
+from drivers.canopen.slow_feedback import FORGOTTEN, ModeAndDemand, SlowFeedback
 from drivers.drive import Mode, Outcome
 from drivers.modbus.cycle import plan_cycle
 from profiles.canopen import STANDARD_POSITION, CanopenProfile
@@ -170,10 +170,10 @@ def test_it_gives_the_mapping_back(made):
 
 def test_a_wide_drive_has_no_room_for_both(made):
     """Statusword, mode, demand and angle are nine bytes: the demand is left out, by rule."""
-    wide = Shape(torque=(0x5830, 0, 32))
+    wide = FrameShape(torque=(0x5830, 0, 32))
     assert Slow.fitting(True, STANDARD_POSITION, wide) == Slow(False, STANDARD_POSITION, True)
     assert Slow.fitting(True, None, wide) == Slow(True, None, True)
-    assert Slow.fitting(True, STANDARD_POSITION, Shape()) == Slow(True, STANDARD_POSITION, False)
+    assert Slow.fitting(True, STANDARD_POSITION, FrameShape()) == Slow(True, STANDARD_POSITION, False)
 
 
 def test_of_a_wide_drive_it_comes_with_every_cycle(made, monkeypatch):
@@ -252,7 +252,7 @@ def test_it_is_waited_for_in_the_cycle_in_which_it_is_due():
         if slow.due:
             waited.append(cycle)
     assert waited == [5 * k for k in range(1, FORGOTTEN + 1)]
-    assert slow.take(frame(8), False) == Shown(9, 5)       # of the SYNC before
+    assert slow.take(frame(8), False) == ModeAndDemand(9, 5)       # of the SYNC before
     for _ in range(3):
         slow.begin()
         assert not slow.due
@@ -271,7 +271,7 @@ def test_what_is_shown_by_one_that_was_waited_for_counts_from_the_next_cycle_on(
     slow.wait()
     assert slow.take(frame(8), True) is None
     assert slow.counts == 8.0
-    assert slow.end() == Shown(9, 5)
+    assert slow.end() == ModeAndDemand(9, 5)
     assert slow.end() is None
     slow.begin()
     assert slow.counts is None

@@ -4,16 +4,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.pdo import STANDARD, Feedback, Shape
+from drivers.canopen.pdo import STANDARD, FrameShape, PdoFeedback
 from profiles.simulator_marker import CYCLE_OVER, CYCLES_END, LAST_CYCLE_OVER
 
 OLD, NEW, OTHER = b"\x01" * 8, b"\x02" * 8, b"\x03" * 8
-WIDE = Shape(torque=(0x2000, 0, 32))
+WIDE = FrameShape(torque=(0x2000, 0, 32))
 
 
 def cycles(*frames, feedback=None):
     """What was taken of each cycle, None for nothing; and the feedback."""
-    feedback = feedback or Feedback(STANDARD)
+    feedback = feedback or PdoFeedback(STANDARD)
     taken = []
     for cycle in frames:
         feedback.begin()
@@ -61,7 +61,7 @@ def test_contradictions(frames, contradictions):
 
 
 def test_the_drive_answers_somebody_elses_sync_too():
-    feedback = Feedback(STANDARD)
+    feedback = PdoFeedback(STANDARD)
     for _ in range(10):
         feedback.begin()
         feedback.on_tpdo1(NEW)
@@ -73,7 +73,7 @@ def test_the_drive_answers_somebody_elses_sync_too():
 
 @given(st.lists(st.lists(st.sampled_from([OLD, NEW, OTHER]), max_size=4), max_size=20))
 def test_a_drive_alone_is_never_doubted_and_more_than_one_always(frames):
-    feedback = Feedback(STANDARD)
+    feedback = PdoFeedback(STANDARD)
     for cycle in frames:
         taken, _ = cycles(cycle, feedback=feedback)
         assert taken == [cycle[0] if cycle else None]
@@ -85,7 +85,7 @@ def test_a_drive_alone_is_never_doubted_and_more_than_one_always(frames):
 @given(st.lists(st.sampled_from(["in time", "lost", "late"]), max_size=30))
 def test_a_slow_drive_contradicts_nothing(fates):
     """Answers that are lost, or come within the next cycle, before that one's own."""
-    feedback, late = Feedback(STANDARD), None
+    feedback, late = PdoFeedback(STANDARD), None
     for number, fate in enumerate(fates):
         feedback.begin()
         if late is not None:
@@ -104,7 +104,7 @@ def test_another_length_is_no_feedback(data):
 
 def test_halves_of_one_sync_are_joined_in_either_order():
     for order in ("status first", "data first"):
-        feedback = Feedback(WIDE)
+        feedback = PdoFeedback(WIDE)
         feedback.begin()
         if order == "status first":
             feedback.on_status(b"\x27\x02")
@@ -119,7 +119,7 @@ def test_halves_of_one_sync_are_joined_in_either_order():
 
 
 def test_while_a_peer_tells_where_cycles_end_they_are_waited_for():
-    feedback = Feedback(STANDARD)
+    feedback = PdoFeedback(STANDARD)
     feedback.begin()
     feedback.on_cycle_end(CYCLES_END)
     feedback.on_tpdo1(NEW)
@@ -148,7 +148,7 @@ class Wire:
 
     def __init__(self):
         self.now_s = 0.0
-        self.feedback = Feedback(STANDARD, lambda: self.now_s, PERIOD_S)
+        self.feedback = PdoFeedback(STANDARD, lambda: self.now_s, PERIOD_S)
         self.given = []
         self._coming = []
         self._last_s = 0.0
@@ -265,7 +265,7 @@ def test_where_no_sync_went_out_no_answer_is_owed():
 
 def test_halves_of_a_burst_keep_together():
     now = [0.0]
-    feedback = Feedback(WIDE, lambda: now[0], PERIOD_S)
+    feedback = PdoFeedback(WIDE, lambda: now[0], PERIOD_S)
     size = WIDE.data_size()
     for _ in range(3):
         feedback.begin(now[0])

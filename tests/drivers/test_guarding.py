@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.supervision import Guarding, Watch
+from drivers.canopen.supervision import Guarding, NodeWatch
 from drivers.clock import SteppedClock
 from drivers.drive import Mode, PowerState
 from drivers.errors import CommunicationLost, DriveFault
@@ -22,7 +22,7 @@ class Guarded:
 
     def __init__(self):
         self.clock = SteppedClock()
-        self.watch = Watch(1, self.clock)
+        self.watch = NodeWatch(1, self.clock)
         self.asked = 0
         self.guarding = Guarding(self.watch, self.ask)
         self.watch.start(0.5)

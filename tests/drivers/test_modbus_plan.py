@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import PreflightRefused
-from drivers.modbus.cycle import Span, plan_cycle, spans
+from drivers.modbus.cycle import RegisterSpan, plan_cycle, spans
 from profiles.library import load_modbus_profile
 from profiles.modbus import ModbusProfile, Register
 
@@ -158,4 +158,4 @@ def test_no_fewer_spans_would_do(drawn, gap, most):
                   if any(possible(cuts) for cuts in itertools.combinations(range(1, len(registers)), count)))
     assert len(found) == fewest + 1
     assert found == sorted(set(found))
-    assert isinstance(found[0], Span)
+    assert isinstance(found[0], RegisterSpan)

@@ -4,8 +4,8 @@ import itertools
 
 import pytest
 
-from drivers.drive import Mode, PowerState
-from drivers.modbus.state_machine import Wish, controlword_towards, decode, power_state, seen
+from drivers.drive import Mode, PowerRequest, PowerState
+from drivers.modbus.state_machine import controlword_towards, decode, power_state, seen
 from profiles.library import load_modbus_profile
 from profiles.modbus import Bits
 from tests.drivers.power_machine import (
@@ -46,13 +46,13 @@ def walk(machine, wish, cycles=10, turning=False):
 
 def test_the_way_in_and_out():
     machine = PowerMachine()
-    assert walk(machine, Wish.ENABLED) == [OFF, READY, ON, ENABLED]
-    assert walk(machine, Wish.QUICK_STOP) == [ENABLED, STOPPING]
-    assert walk(machine, Wish.ENABLED) == [STOPPING]            # a quick stop is not ended by enabling
-    assert walk(machine, Wish.OFF) == [STOPPING, OFF]
+    assert walk(machine, PowerRequest.ENABLED) == [OFF, READY, ON, ENABLED]
+    assert walk(machine, PowerRequest.QUICK_STOP) == [ENABLED, STOPPING]
+    assert walk(machine, PowerRequest.ENABLED) == [STOPPING]            # a quick stop is not ended by enabling
+    assert walk(machine, PowerRequest.OFF) == [STOPPING, OFF]
 
 
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(PowerRequest))
 def test_no_wish_resets_a_fault(wish):
     machine = PowerMachine(FAULT)
     assert walk(machine, wish) == [FAULT]
@@ -61,13 +61,13 @@ def test_no_wish_resets_a_fault(wish):
 @pytest.mark.parametrize("state", [ENABLED, STOPPING])
 def test_a_turning_shaft_is_braked_not_disabled(state):
     machine = PowerMachine(state)
-    assert walk(machine, Wish.OFF, turning=True)[-1] == STOPPING
-    assert walk(machine, Wish.OFF)[-1] == OFF
+    assert walk(machine, PowerRequest.OFF, turning=True)[-1] == STOPPING
+    assert walk(machine, PowerRequest.OFF)[-1] == OFF
 
 
 def test_bits_of_the_mode_and_the_direction_stand_in_every_word():
     control = CONTROL.model_copy(update={"speed_bits": 0x0400, "torque_bits": 0x0C00, "reverse_bits": 0x2000})
-    for state, wish in itertools.product((None, *control.states), Wish):
+    for state, wish in itertools.product((None, *control.states), PowerRequest):
         plain = controlword_towards(CONTROL, state, wish, Mode.SPEED)
         assert controlword_towards(control, state, wish, Mode.SPEED) == plain | 0x0400
         assert controlword_towards(control, state, wish, Mode.TORQUE) == plain | 0x0C00

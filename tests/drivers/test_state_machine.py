@@ -2,8 +2,8 @@
 
 import pytest
 
-from drivers.canopen.state_machine import State, Wish, controlword_towards, decode, power_state
-from drivers.drive import PowerState
+from drivers.canopen.state_machine import State, controlword_towards, decode, power_state
+from drivers.drive import PowerRequest, PowerState
 from tests.drivers.power_machine import (
     ENABLED,
     FAULT,
@@ -18,7 +18,7 @@ from tests.drivers.power_machine import (
     matches,
 )
 
-NEAR = {Wish.OFF: {OFF}, Wish.ENABLED: {ENABLED}, Wish.QUICK_STOP: {STOPPING, OFF}}
+NEAR = {PowerRequest.OFF: {OFF}, PowerRequest.ENABLED: {ENABLED}, PowerRequest.QUICK_STOP: {STOPPING, OFF}}
 
 
 def _short(name):
@@ -73,10 +73,11 @@ WORDS = {
 
 @pytest.mark.parametrize("state", list(State))
 def test_controlwords(state):
-    assert tuple(controlword_towards(state, wish) for wish in (Wish.OFF, Wish.ENABLED, Wish.QUICK_STOP)) == WORDS[state]
+    assert tuple(controlword_towards(state, wish) for wish in (PowerRequest.OFF, PowerRequest.ENABLED,
+                                                               PowerRequest.QUICK_STOP)) == WORDS[state]
 
 
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(PowerRequest))
 @pytest.mark.parametrize("state", list(State))
 def test_no_word_resets_a_fault_or_halts(state, wish):
     assert controlword_towards(state, wish) & ~0x0F == 0
@@ -92,28 +93,28 @@ def follow(start, wish, cycles):
     return path
 
 
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(PowerRequest))
 @pytest.mark.parametrize("start", [NOT_READY, OFF, READY, ON, ENABLED, STOPPING])
 def test_the_wish_is_reached_within_four_transitions_and_held(start, wish):
     path = follow(start, wish, 12)
-    goal = {STOPPING} if (start, wish) == (STOPPING, Wish.ENABLED) else NEAR[wish]
+    goal = {STOPPING} if (start, wish) == (STOPPING, PowerRequest.ENABLED) else NEAR[wish]
     assert path[4] in goal
     assert set(path[4:]) == {path[4]}
 
 
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(PowerRequest))
 @pytest.mark.parametrize("start", [FAULT, REACTION, STOPPING])
 def test_nothing_is_enabled_out_of_a_fault_or_a_quick_stop(start, wish):
     assert ENABLED not in follow(start, wish, 20)
 
 
-@pytest.mark.parametrize("wish", list(Wish))
+@pytest.mark.parametrize("wish", list(PowerRequest))
 @pytest.mark.parametrize("start", [FAULT, REACTION])
 def test_a_fault_stays_until_it_is_reset(start, wish):
     assert follow(start, wish, 20)[-1] == FAULT
 
 
 def test_a_turning_shaft_loses_no_voltage_on_the_way_to_a_stop():
-    for wish in Wish:
+    for wish in PowerRequest:
         assert controlword_towards(State.OPERATION_ENABLED, wish) & 0b0010
-    assert follow(ENABLED, Wish.OFF, 2) == [ENABLED, ON, OFF]
+    assert follow(ENABLED, PowerRequest.OFF, 2) == [ENABLED, ON, OFF]

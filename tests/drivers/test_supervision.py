@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.canopen.supervision import Watch, emcy_text
+from drivers.canopen.supervision import NodeWatch, emcy_text
 from drivers.clock import SteppedClock
 from drivers.errors import CommunicationLost, DriveFault
 
@@ -16,7 +16,7 @@ def clock():
 
 @pytest.fixture
 def watch(clock):
-    watch = Watch(5, clock)
+    watch = NodeWatch(5, clock)
     watch.start(0.5)
     watch.on_heartbeat(OPERATIONAL)
     return watch
@@ -54,7 +54,7 @@ def test_each_trouble_once(watch, event, kind, text):
 
 @pytest.mark.parametrize("event", [event for event, _, _ in EVENTS])
 def test_before_the_start_and_after_the_end_nothing_is_trouble(clock, event):
-    watch = Watch(5, clock)
+    watch = NodeWatch(5, clock)
     event(watch)
     clock.wait_until(100.0)
     watch.check()
@@ -68,7 +68,7 @@ def test_before_the_start_and_after_the_end_nothing_is_trouble(clock, event):
 
 def test_a_drive_is_given_a_moment_to_become_operational(clock):
     """A heartbeat that was under way when it was started still says pre-operational; one much later means it."""
-    watch = Watch(5, clock)
+    watch = NodeWatch(5, clock)
     watch.start(0.0)
     watch.on_heartbeat(b"\x7f")
     watch.check()
@@ -97,7 +97,7 @@ def test_silence_once(watch, clock):
 
 
 def test_a_drive_without_a_heartbeat_is_not_missed(clock):
-    watch = Watch(5, clock)
+    watch = NodeWatch(5, clock)
     watch.start(0.0)
     clock.wait_until(100.0)
     watch.check()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from drivers.canopen.bus import CanLink, Condition, condition, queue_is_full
 from drivers.canopen.drive import Cia402Drive
-from drivers.canopen.supervision import Watch
+from drivers.canopen.supervision import NodeWatch
 from drivers.clock import SteppedClock
 from drivers.drive import Command, DriveLimits, Mode
 from drivers.errors import CommunicationLost, PreflightRefused
@@ -97,7 +97,7 @@ def test_other_programs_of_this_computer_are_heard(wire, link):
 
 def test_a_second_master_is_told_with_its_second_frame_of_a_kind_however_late():
     clock = SteppedClock()
-    watch = Watch(1, clock)
+    watch = NodeWatch(1, clock)
     watch.on_foreign("SYNC")                      # left by another run, and still under way
     watch.on_foreign("SYNC")
     watch.start(0.0)

@@ -2,13 +2,13 @@
 
 import math
 
-from tdhil.runner.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRequest, RigGuess, make_plan
 from tests.estimation.shaft_bench import Motion
 
 LIMITS = MotionLimits(0.5, 10.0, 400.0)
 
 
-def planned(wish: ExcitationWish | None = None, guess: RigGuess | None = None) -> tuple[Motion, Plan]:
+def planned(wish: PlanRequest | None = None, guess: RigGuess | None = None) -> tuple[Motion, Plan]:
     """A plan for the field-like rig, segment after segment with the transitions' time between them."""
     plan = make_plan(LIMITS, guess or RigGuess(104.0, 8.0, 60.0), wish)
     now = 3.0

@@ -11,7 +11,7 @@ from tdhil.estimation.frequency_domain.before_echo import ECHO, EchoShaft, probl
 from tdhil.estimation.frequency_domain.inference import standard_deviation
 from tdhil.estimation.frequency_domain.optimiser import box, minimise
 from tdhil.estimation.result import Refused
-from tdhil.estimation.spectrum import Line, PeriodLines, pooled_lines
+from tdhil.estimation.spectrum import PeriodLines, SpectralLine, pooled_lines
 from tdhil.recording import Excitation, LagPrior, Recording, Segment
 from tests.estimation.loaded_bench import STEP_S, Loaded, late, records, turned
 
@@ -82,7 +82,7 @@ def test_however_long_the_bottom_takes_to_answer():
     wave, ways = np.sqrt(down / along), np.tanh(np.sqrt(down * along))
     g = (PLANT.motor * s + 8.0 + wave * (below + wave * ways) / (wave + below * ways)) * (1 + 0.4 * s) / (1 + 0.15 * s)
     torque = 100.0 * np.exp(1j * np.pi * np.arange(30) ** 2 / 30)
-    lines = tuple(Line(float(hz), np.array([t / z]), np.array([t]), np.array([30.0]), 3.6e-7, 1.0, 0j, 87.0)
+    lines = tuple(SpectralLine(float(hz), np.array([t / z]), np.array([t]), np.array([30.0]), 3.6e-7, 1.0, 0j, 87.0)
                   for hz, t, z in zip(hertz, torque, g, strict=True))
     problem = problem_of(lines, pipe, LagPrior())
     held = dict.fromkeys(problem.model.structure, 0.0)

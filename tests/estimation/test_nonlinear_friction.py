@@ -9,20 +9,20 @@ from hypothesis import strategies as st
 
 from tdhil.estimation import Options, identify
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
+from tdhil.estimation.frequency_domain.likelihood import Likelihood, TorqueLoad
 from tdhil.estimation.frequency_domain.model import Model
 from tdhil.estimation.frequency_domain.nonlinear_friction import (
     BEND,
     MODEL,
     Bend,
     BentShaft,
-    Motion,
-    Wave,
+    SegmentWave,
+    ShaftMotion,
     bends,
     starts_of,
 )
 from tdhil.estimation.result import Verdict
-from tdhil.estimation.spectrum import Line
+from tdhil.estimation.spectrum import SpectralLine
 from tests.estimation.analytic import LINES, closed_form
 from tests.estimation.shaft_bench import Rig
 from tests.estimation.stages_bench import Stages, run_stages
@@ -38,14 +38,14 @@ FIRST_ORDER = np.array([0.4, 0.0, 0.15, 0.0, 0.0, 0.02])
 def test_the_two_filters_have_the_ratio_that_the_lines_show(phi):
     s = 2j * np.pi * np.array(LINES)
     speed, torque = signal_filters.filters(phi, s)
-    assert np.allclose(torque / speed, signal_filters.Ratio(phi, s).value, rtol=1e-12)
+    assert np.allclose(torque / speed, signal_filters.FilterRatio(phi, s).value, rtol=1e-12)
 
 
 def test_a_parabola_s_lines_by_hand():
     """ω = m + A cos(Ωt + φ): ω² = m² + A²/2 + 2 m A cos(Ωt + φ) + …, each signal behind its own first-order lag."""
     mean, true, s = 5.0, 1.3 * np.exp(0.7j), 2j * np.pi * 0.2
     reported = true / (1.0 + 0.4 * s)
-    lines, level = Wave((0.2,), np.array([reported]), mean, 10.0).through(Bend(None), FIRST_ORDER)
+    lines, level = SegmentWave((0.2,), np.array([reported]), mean, 10.0).through(Bend(None), FIRST_ORDER)
     assert level == pytest.approx(mean**2 + abs(true) ** 2 / 2.0, rel=1e-12)
     assert lines[0] == pytest.approx(2.0 * mean * true * np.exp(-0.02 * s) / (1.0 + 0.15 * s), rel=1e-12)
 
@@ -59,7 +59,7 @@ def test_backwards_every_bend_is_the_mirror_image():
 def test_a_small_swing_sees_the_slope_of_a_bell():
     mean, bend = 2.0, Bend(1.5)
     slope = (bend.over(np.array([mean + 1e-4])) - bend.over(np.array([mean - 1e-4]))) / 2e-4
-    lines, level = Wave((0.1, 0.3), np.array([0.01, 0.02j]), mean, 10.0).through(bend, np.zeros(6))
+    lines, level = SegmentWave((0.1, 0.3), np.array([0.01, 0.02j]), mean, 10.0).through(bend, np.zeros(6))
     assert lines == pytest.approx(slope * np.array([0.01, 0.02j]), abs=1e-4)
     assert level == pytest.approx(float(bend.over(np.array([mean]))[0]), rel=1e-3)
 
@@ -67,12 +67,13 @@ def test_a_small_swing_sees_the_slope_of_a_bell():
 def loaded(seed=3):
     rng = np.random.default_rng(seed)
     lines = tuple(
-        Line(hertz, 1.0 + 0.3j * rng.standard_normal(2), 100.0 * (0.5 + 1j) * (1.0 + 0.1 * rng.standard_normal(2)),
+        SpectralLine(hertz, 1.0 + 0.3j * rng.standard_normal(2),
+                     100.0 * (0.5 + 1j) * (1.0 + 0.1 * rng.standard_normal(2)),
              np.array([9.0, 9.0]), 1e-4, 2.0, 0.003 + 0.002j, 16.0)
         for hertz in LINES
     )
     extra = rng.standard_normal(8) + 1j * rng.standard_normal(8)
-    problem = Likelihood(lines, Model(BentShaft(0.3, 1.0)), None, (), Load(BEND, extra))
+    problem = Likelihood(lines, Model(BentShaft(0.3, 1.0)), None, (), TorqueLoad(BEND, extra))
     return problem, np.concatenate([[104.0, 8.0, 2.0], FIRST_ORDER + 0.01])
 
 
@@ -157,8 +158,8 @@ def test_a_bend_is_seen_behind_short_lags():
 
 def test_lags_that_all_but_cancel_are_taken_out_of_the_wave():
     """A straight fit with a second on both reports: by its lags the shaft would turn back and forth."""
-    wave = Wave((0.1, 0.4), np.array([1.0 + 0.5j, 1.5j]), 4.0, 10.0)
-    motion = Motion((wave,), None, (), None)
+    wave = SegmentWave((0.1, 0.4), np.array([1.0 + 0.5j, 1.5j]), 4.0, 10.0)
+    motion = ShaftMotion((wave,), None, (), None)
     straight = np.array([104.0, 8.0, 1.01, 0.0, 1.0, 0.0, 0.0, 0.01])
     assert wave.over_period(straight[2:]).min() < 0.0 < wave.over_period(np.zeros(6)).min()
     (start,) = starts_of(motion, straight)

@@ -9,12 +9,12 @@ import pytest
 
 import tdhil.estimation as package
 from tdhil.estimation import Estimate, Options, ResidualTest, Verdict
-from tdhil.estimation.case import Case, Finding, Words
+from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.conclude import conclude
 from tdhil.estimation.result import BudgetLine, Refusal
 from tdhil.recording.recording import Recording, Stage
 
-WORDS = Words("a shaft", "look elsewhere", "excite more")
+WORDS = ModelWords("a shaft", "look elsewhere", "excite more")
 FOUND = Finding("shaft", WORDS, ResidualTest(3.0, 3.0, 0.4), inertia=Estimate(100.0, 99.0, 101.0),
                 budget=(BudgetLine("noise", 1.0, ""),))
 REJECTED = replace(FOUND, inertia=None, residual=ResidualTest(90.0, 3.0, 1e-9), remark=", and no other does better")

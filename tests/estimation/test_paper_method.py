@@ -5,7 +5,7 @@ import pytest
 
 from tdhil.estimation import Verdict, identify
 from tdhil.recording.recording import LagPrior
-from tdhil.runner.excitation import ExcitationWish
+from tdhil.runner.excitation import PlanRequest
 from tests.estimation.analytic import closed_form
 from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate
@@ -21,7 +21,7 @@ def slope(hertz, inertia=104.0, viscous=8.0, speed_lag=0.40, torque_lag=0.15):
 @pytest.mark.heavy
 @pytest.mark.parametrize(("hertz", "field"), [(0.1, 107.0), (0.3, 118.0), (0.5, 137.0), (1.0, 186.0)])
 def test_single_tone_slopes(hertz, field):
-    motion, _ = planned(ExcitationWish(kind="sine", frequency_hz=hertz, periods=max(5, round(50 * hertz))))
+    motion, _ = planned(PlanRequest(kind="sine", frequency_hz=hertz, periods=max(5, round(50 * hertz))))
     for recording in simulate(Rig(), motion, [1, 2]):
         found = identify(recording)
         assert found.paper.stepped.inertia_kg_m2 == pytest.approx(field, rel=0.02)

@@ -130,13 +130,13 @@ def test_impedance_against_a_simulated_filter():
 @pytest.mark.parametrize("over", ("speed", "torque"))
 def test_an_average_is_one_of_the_family(over):
     """A mean over w of a rotating phasor, summed up sample by sample: half of w is delay, the rest u."""
-    from tdhil.estimation.frequency_domain.signal_filters import Ratio
+    from tdhil.estimation.frequency_domain.signal_filters import FilterRatio
 
     w, omega = 0.5, np.array([0.6, 2.0, 5.0])
     steps = (np.arange(20000) + 0.5) * w / 20000
     averaged = np.exp(-1j * np.outer(omega, steps)).mean(axis=1)
     sign = 1.0 if over == "torque" else -1.0
-    found = Ratio(np.array([0.0, 0.0, 0.0, 0.0, sign * w * w, sign * w / 2]), 1j * omega).value
+    found = FilterRatio(np.array([0.0, 0.0, 0.0, 0.0, sign * w * w, sign * w / 2]), 1j * omega).value
     assert np.allclose(found, averaged**sign, rtol=1e-7)
 
 
@@ -145,13 +145,13 @@ def test_likelihood_jacobian_is_the_derivative(stated):
     from tdhil.estimation.frequency_domain.likelihood import Likelihood
     from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
     from tdhil.estimation.friction_levels import ViscousConstraint
-    from tdhil.estimation.spectrum import Line
+    from tdhil.estimation.spectrum import SpectralLine
 
     rng = np.random.default_rng(3)
 
     def line(hertz):
         speed = rng.standard_normal(2) + 1j * rng.standard_normal(2)
-        return Line(hertz, speed, 60.0 * speed * (1 + 2j), np.array([5.0, 6.0]), 0.02, 30.0, 0.1 + 0.2j, 9.0)
+        return SpectralLine(hertz, speed, 60.0 * speed * (1 + 2j), np.array([5.0, 6.0]), 0.02, 30.0, 0.1 + 0.2j, 9.0)
 
     problem = Likelihood((line(0.1), line(0.3)), Model(), ViscousConstraint(8.0, 0.01, 0.1, 9.0),
                          (GaussianPrior(2, 0.3, 0.05),) if stated else ())

@@ -11,7 +11,7 @@ from scipy.stats import binom
 
 from tdhil.estimation import Compliant, Estimate, Options
 from tdhil.estimation.case import Case, Finding
-from tdhil.estimation.cross_checks.momentum import Kind, balances, through
+from tdhil.estimation.cross_checks.momentum import BalanceKind, balances, through
 from tdhil.estimation.cross_checks.momentum_fit import Delay, Density, Resolution, fit_momentum
 from tdhil.estimation.cross_checks.second_opinion import disagreements, second_opinions
 from tdhil.estimation.friction_levels import measure_levels
@@ -19,7 +19,7 @@ from tdhil.estimation.samples import Samples, stretches, usable_samples
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.estimation.spectrum import period_lines
 from tdhil.recording.recording import Recording
-from tdhil.runner.excitation import ExcitationWish
+from tdhil.runner.excitation import PlanRequest
 from tests.estimation.planned_motions import planned
 from tests.estimation.shaft_bench import Rig, simulate
 from tests.estimation.stages_bench import Stages, run_stages, usual_runs
@@ -134,7 +134,7 @@ def test_a_compliant_shaft_is_compared_with_all_that_turns():
 
 
 def test_plateaus_of_a_square_wave_are_torque_steps():
-    motion, _ = planned(ExcitationWish(kind="step", periods=3))
+    motion, _ = planned(PlanRequest(kind="step", periods=3))
     found = []
     for recording in simulate(Rig(), motion, list(range(12)), rate_hz=100.0):
         opinions = opinions_of(recording)
@@ -227,11 +227,11 @@ def test_torque_read_in_step_with_a_speed_setpoint_is_an_unknown_of_its_own():
         read = replace(found, rows=rows)
         known, rounding = Delay(0.25, 0.018, True), Resolution(0.0, 0.0)
         plain, open_share, taken_out = (
-            fit_momentum(read, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95, share)
+            fit_momentum(read, BalanceKind.TURNING, Density(10.0, 18.0), known, rounding, 0.95, share)
             for share in (EXACT_READING, ReadingShare(0.0, 0.08), ReadingShare(0.08, 0.0))
         )
         assert taken_out.inertia == pytest.approx(
-            fit_momentum(found, Kind.TURNING, Density(10.0, 18.0), known, rounding, 0.95).inertia, abs=0.2)
+            fit_momentum(found, BalanceKind.TURNING, Density(10.0, 18.0), known, rounding, 0.95).inertia, abs=0.2)
         assert plain.inertia - TRUE > 0.02 * TRUE
         assert abs(open_share.inertia - TRUE) <= open_share.half_width
         plainly.append(plain.inertia)

@@ -328,9 +328,9 @@ def test_what_stands_beside_a_line_need_not_stand_clear():
     Bins there had counted as clear for their neighbours' sake, and spoken against the model."""
     plant = plants.CoveragePlant(
         "lines", "noise of 3 % of the torque limit", 178.0, 5.0, 30.0, (1.0, 11.7), 435.0,
-        plants.Report((0.06, 0.04)), plants.Report((0.03,)),
-        plants.Noise(5.5, 1.0, 14.0, 0.037, 0.0075, 3.5, 0.01, 1.0),
-        plants.Reading(jitter_s=0.001), lowest_hz=0.2,
+        plants.ReportFilter((0.06, 0.04)), plants.ReportFilter((0.03,)),
+        plants.PlantNoise(5.5, 1.0, 14.0, 0.037, 0.0075, 3.5, 0.01, 1.0),
+        plants.HostSampling(jitter_s=0.001), lowest_hz=0.2,
     )
     for recording in simulate_plan(plant, [(1, 2, 0), (1, 2, 1)], 20):
         got = found(recording)

@@ -27,7 +27,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint
 from tdhil.estimation.result import Refusal
-from tdhil.estimation.spectrum import Line
+from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording.recording import LagPrior, Pipe
 from tests.estimation.compliant_bench import LINES, Noise, TwoMass, run
 from tests.estimation.compliant_bench import Pipe as PipeBench
@@ -58,9 +58,9 @@ def synthetic(plant, seed, noise_nm, hertz=LINES, amplitude=0.2, lags=(0.4, 0.15
         def scatter(one, other):
             return sum(np.sum((a - a.mean()) * np.conj(b - b.mean())) for a, b in zip(one, other, strict=True)) / 10.0
 
-        found.append(Line(hz, np.array([x.mean() for x in speed]), np.array([x.mean() for x in torque]),
-                          np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
-                          complex(scatter(torque, speed)), 10.0))
+        found.append(SpectralLine(hz, np.array([x.mean() for x in speed]), np.array([x.mean() for x in torque]),
+                                  np.array([6.0, 6.0]), scatter(speed, speed).real, scatter(torque, torque).real,
+                                  complex(scatter(torque, speed)), 10.0))
     sd = 0.05 * noise_nm
     return tuple(found), ViscousConstraint(plant.impedance(1e-5).real + sd * rng.normal(), 0.0, sd, 10.0)
 

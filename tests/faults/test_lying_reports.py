@@ -6,7 +6,7 @@ Many more: `python benchmarks/lying_reports.py --all`.
 import pytest
 
 from sim_bus.lying_runs import sample, unknowable
-from sim_bus.shaft_judge import Machine, judge, outcome_of, read_shaft
+from sim_bus.shaft_judge import JudgedMachine, judge, outcome_of, read_shaft
 from tdhil.errors import LogError
 from tdhil.recording.log_reader import read_run
 from tests.path.path_runs import tdhil
@@ -44,7 +44,7 @@ def test_no_lie_is_believed(combination, tmp_path):
     done = tdhil(*combination.arguments(str(tmp_path)), "--json", "--log", log, "--trace", trace)
     document = done.document if done.out.strip() else {}
     outcome = outcome_of(done.code, document, done.err, log_closed=closed(log))
-    machine = Machine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
-                      program.speed_max_rad_s, program.string)
+    machine = JudgedMachine(program.inertia_kg_m2, program.coulomb_nm, combination.largest_torque_nm,
+                            program.speed_max_rad_s, program.string)
     judged = judge(read_shaft(trace), outcome, machine, not_asked=excuse.rules if excuse else frozenset())
     assert judged.broken == {}, outcome.message

@@ -13,12 +13,12 @@ from tdhil.recording.chunk_table import _SAMPLE_ROW, _TAGS
 from tdhil.recording.log_messages import configuration_message, excitation_message, result_message, stage_message
 from tdhil.recording.mcap_container import Container
 from tdhil.recording.recording import Recording, Stage
-from tdhil.studies.coverage.plants import FLEET, CoveragePlant, Reading
+from tdhil.studies.coverage.plants import FLEET, CoveragePlant, HostSampling
 from tdhil.studies.coverage.simulate import simulate
 
 BEGAN = datetime(2026, 1, 5, 8, 0, tzinfo=UTC)
 FIELD = next(plant for plant in FLEET if plant.name == "field")
-QUICK = replace(FIELD, reading=Reading(rate_hz=25.0, command_s=0.04), step_s=0.008)
+QUICK = replace(FIELD, reading=HostSampling(rate_hz=25.0, command_s=0.04), step_s=0.008)
 PERIODS = 6
 
 

@@ -21,9 +21,9 @@ from tdhil.cli.main import main
 from tdhil.errors import UsageError
 from tdhil.fleet import (
     FleetRequest,
+    FleetSettings,
     FleetSummary,
     LogTask,
-    Settings,
     compare_document,
     find_logs,
     identified,
@@ -108,7 +108,7 @@ def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
     assert "3.mcap: aborted in stage acquire (DriveFault)" in note
     assert [point["in_part"] for point in found["quantities"][0]["points"]] == [
         None, None, None, "aborted in stage acquire (DriveFault)", "log cut short"]
-    compared = compare_document([identified(logs / f"{number}.mcap", Settings()) for number in (2, 3)])
+    compared = compare_document([identified(logs / f"{number}.mcap", FleetSettings()) for number in (2, 3)])
     assert next(one for one in compared["settings"] if one["name"] == "run") == {
         "name": "run", "values": ["whole", "aborted in stage acquire (DriveFault)"], "differs": True}
     assert compared["differences"][0]["text"].endswith("3.mcap: aborted in stage acquire (DriveFault)")
@@ -122,7 +122,7 @@ def test_what_comes_from_a_part_of_a_run_is_said_to(few, tmp_path, capsys):
 
 @pytest.mark.heavy
 def test_the_cache_gives_the_same_to_the_last_bit(few, tmp_path):
-    task = LogTask(str(few / "R1-000.mcap"), Settings(confidence=0.9), str(tmp_path))
+    task = LogTask(str(few / "R1-000.mcap"), FleetSettings(confidence=0.9), str(tmp_path))
     first, second = identify_log(task), identify_log(task)
     plain = identify_log(replace(task, cache=None))
     assert (first.cached, second.cached) == (False, True)
@@ -259,7 +259,7 @@ def test_interrupted_and_started_again_only_the_rest_is_done(tmp_path, calls):
     assert (again.done_before, again.rows) == (40, second.rows)
     (tmp_path / "logs" / "004.mcap").write_bytes(b"changed")
     assert run_fleet(request, function=poison.quick).done_before == 39
-    assert run_fleet(replace(request, settings=Settings(confidence=0.9)), function=poison.quick).done_before == 0
+    assert run_fleet(replace(request, settings=FleetSettings(confidence=0.9)), function=poison.quick).done_before == 0
     assert run_fleet(replace(request, again=True), function=poison.quick).done_before == 0
 
 
@@ -436,11 +436,11 @@ def test_the_command(few, tmp_path, capsys, monkeypatch):
 
 
 def test_watch_takes_what_rests_and_leaves_what_grows(tmp_path):
-    from tdhil.cli.fleet import Watch
+    from tdhil.cli.fleet import FolderWatch
 
     folder = tmp_path / "logs"
     many(folder, 2)
-    watch = Watch(FleetRequest((str(folder),), tmp_path / "fleet.csv", jobs=1))
+    watch = FolderWatch(FleetRequest((str(folder),), tmp_path / "fleet.csv", jobs=1))
     assert watch.look() == []                              # seen for the first time: it may be growing
     growing = folder / "growing.mcap"
     growing.write_bytes(b"half")

@@ -9,7 +9,7 @@ from dataclasses import asdict, fields, replace
 import pytest
 
 from tdhil.errors import UsageError
-from tdhil.fleet.rows import COLUMNS, FleetRow, Settings, failure_row, row_from_json, row_key, row_of
+from tdhil.fleet.rows import COLUMNS, FleetRow, FleetSettings, failure_row, row_from_json, row_key, row_of
 from tdhil.fleet.table import Journal, check_table_path, read_table, write_table
 
 VALUES = {
@@ -21,7 +21,7 @@ VALUES = {
 
 def rows():
     rng = random.Random(4)
-    found = [FleetRow("a.mcap", "valid"), failure_row("b.mcap", "DriveFault", "two\nlines", Settings())]
+    found = [FleetRow("a.mcap", "valid"), failure_row("b.mcap", "DriveFault", "two\nlines", FleetSettings())]
     for number in range(30):
         content = {name: rng.choice([*VALUES[kind], None]) for name, kind in COLUMNS.items()}
         content |= {"log": f"{number}.mcap", "verdict": "valid", "tdhil": "0.1.0", "settings": "{}"}
@@ -99,8 +99,8 @@ def test_one_host_at_a_time(tmp_path):
 
 
 def test_what_a_result_hangs_on():
-    keys = {row_key("aa", Settings()), row_key("ab", Settings()), row_key("aa", Settings(model="rigid")),
-            row_key("aa", Settings(confidence=0.9)), row_key("aa", Settings(tolerance=0.9))}
+    keys = {row_key("aa", FleetSettings()), row_key("ab", FleetSettings()), row_key("aa", FleetSettings(model="rigid")),
+            row_key("aa", FleetSettings(confidence=0.9)), row_key("aa", FleetSettings(tolerance=0.9))}
     assert len(keys) == 5
 
 
@@ -123,7 +123,7 @@ def test_what_is_no_row(change):
 ])
 def test_what_changed_against_the_log_s_own_result(stored, changed):
     document = {"verdict": "valid", "reason": "as", "inertia_kg_m2": {"value": 104.0, "low": 103.0}}
-    row = row_of("a.mcap", json.loads(json.dumps(document)), settings=Settings(), stored=stored)
+    row = row_of("a.mcap", json.loads(json.dumps(document)), settings=FleetSettings(), stored=stored)
     assert row.changed is changed
     assert row.inertia_low_kg_m2 == 103.0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_bus.trace import HEADER, NotATrace, Trace
+from sim_bus.trace import HEADER, NotATrace, ShaftTrace
 from tdhil.errors import UsageError
 from tdhil.recording.log_reader import read_run
 from tdhil.recording.log_writer import RunWriter
@@ -174,13 +174,13 @@ def test_a_recovered_copy_goes_over_no_other_file(bench):
 def test_a_trace_goes_over_an_older_trace_only(tmp_path):
     path = tmp_path / "shaft.csv"
     path.write_text(HEADER + "0.01,1,2,ready,\n")
-    Trace(path).close()
+    ShaftTrace(path).close()
     assert path.read_text() == HEADER
     path.write_text("")
-    Trace(path).close()
+    ShaftTrace(path).close()
     path.write_text("time_s,mine\n")
     with pytest.raises(NotATrace, match="holds something else"):
-        Trace(path)
+        ShaftTrace(path)
     assert path.read_text() == "time_s,mine\n"
 
 

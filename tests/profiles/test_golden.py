@@ -6,15 +6,15 @@ from functools import cache
 import pytest
 
 from drivers.clock import SteppedClock
-from drivers.drive import Command, DriveLimits, Mode
+from drivers.drive import Command, DriveLimits, Mode, PowerRequest
 from drivers.modbus import pdu as requests
-from drivers.modbus.access import Access
+from drivers.modbus.access import RegisterAccess
 from drivers.modbus.codec import find_scales, settle, si_per_count
 from drivers.modbus.cycle import Codec, plan_cycle, shown_mode
 from drivers.modbus.link import Reply
 from drivers.modbus.parameters import Parameters, find_filters, wanted_setting
-from drivers.modbus.state_machine import Wish, controlword_towards, decode, seen
-from drivers.preflight import Table
+from drivers.modbus.state_machine import controlword_towards, decode, seen
+from drivers.preflight import PreflightTable
 from profiles.library import load_modbus_profile, load_profile, profile_names
 from sim_bus.modbus.embedded import EmbeddedModbusDrive, LineTiming
 from sim_bus.modbus.parameters import reporting_lag_s
@@ -29,7 +29,7 @@ CASES = [
 ]
 CYCLES = [(name, number) for name in NAMES for number in range(len(load(name).cycles))]
 MODES = {"speed": Mode.SPEED, "torque": Mode.TORQUE}
-WISHES = {"off": Wish.OFF, "enabled": Wish.ENABLED, "quick_stop": Wish.QUICK_STOP}
+WISHES = {"off": PowerRequest.OFF, "enabled": PowerRequest.ENABLED, "quick_stop": PowerRequest.QUICK_STOP}
 
 
 worn = cache(load_modbus_profile)      # reading YAML strictly takes its time
@@ -60,7 +60,7 @@ class Host:
         self.golden = golden
         self.profile = profile = worn(golden.profile)
         self.script = Script(*expected)
-        self.access = Access(
+        self.access = RegisterAccess(
             self.script, profile.line.unit, profile.line.word_order, frozenset(profile.cycle.functions)
         )
         scales = find_scales(profile, golden.told, golden.rated_torque_nm)
@@ -162,7 +162,7 @@ def test_the_driver_sends_whole_cycles(name: str, number: int) -> None:
 def test_filters(name: str) -> None:
     golden = load(name)
     host = Host(golden)
-    found = find_filters(Table(), host.profile, Parameters({}, golden.told))
+    found = find_filters(PreflightTable(), host.profile, Parameters({}, golden.told))
     assert {"speed": found.speed_lag_s, "torque": found.torque_lag_s} == {
         "speed": golden.filters_s.get("speed"), "torque": golden.filters_s.get("torque")
     }

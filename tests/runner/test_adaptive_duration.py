@@ -15,13 +15,13 @@ from tdhil.recording.recording import Excitation, Recording
 from tdhil.runner.adaptive_duration import Decision, decide
 from tdhil.runner.design import Stopping
 from tdhil.runner.design.stopping_rule import MOST_BEHIND, Look, spent_confidence
-from tdhil.runner.excitation import ExcitationWish, MotionLimits, RigGuess, make_plan
+from tdhil.runner.excitation import MotionLimits, PlanRequest, RigGuess, make_plan
 from tdhil.runner.planning import counted_in, pilot_dof
 from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stages.acquire import run_acquire
 from tdhil.runner.stages.hold import MeanSpeedControl
 
-PLAN = make_plan(MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), ExcitationWish(periods=3))
+PLAN = make_plan(MotionLimits(0.5, 10.0, 400.0, 0.9), RigGuess(100.0, 8.0, 60.0), PlanRequest(periods=3))
 RULE = Stopping(0.01, 0.95, 20.0, 6, 10, 600.0, True)
 
 

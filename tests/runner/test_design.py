@@ -11,11 +11,11 @@ from tdhil.estimation.frequency_domain.model import Model
 from tdhil.estimation.frequency_domain.shafts import StringShaft
 from tdhil.estimation.friction_levels import ViscousConstraint
 from tdhil.estimation.samples import Samples
-from tdhil.estimation.spectrum import Line
+from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording.recording import LagPrior
 from tdhil.runner.design import (
-    Knowledge,
-    Noise,
+    DesignKnowledge,
+    NoiseDensity,
     assumed_noise,
     choose,
     expected_half_width,
@@ -25,7 +25,7 @@ from tdhil.runner.design import (
     predicted,
 )
 from tdhil.runner.design.prediction import assumed_theta
-from tdhil.runner.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan
+from tdhil.runner.excitation import MotionLimits, PlanRefused, PlanRequest, RigGuess, make_plan
 from tdhil.runner.guard import Guard
 from tdhil.runner.planning import plan_acquisition
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest
@@ -37,7 +37,7 @@ FORESIGHT_S = Guard.foresight_s(ControlAssumptions())
 PLANTS = {plant.name: plant for plant in FLEET}
 LIMITS = MotionLimits(0.5, 10.0, 400.0, FORESIGHT_S)
 GUESS = RigGuess(104.0, 8.0, 60.0)
-KNOWN = Knowledge(assumed_noise(400.0, 10.0), LagPrior())
+KNOWN = DesignKnowledge(assumed_noise(400.0, 10.0), LagPrior())
 
 
 def machine(plant):
@@ -47,7 +47,8 @@ def machine(plant):
 
 def true_noise(plant):
     noise = plant.noise
-    return Noise(2.0 * noise.load_nm**2 * noise.load_time_s, noise.sensor_rad_s**2 * plant.step_s, noise.load_time_s)
+    return NoiseDensity(2.0 * noise.load_nm**2 * noise.load_time_s, noise.sensor_rad_s**2 * plant.step_s,
+                        noise.load_time_s)
 
 
 # -- noise ---------------------------------------------------------------------------------------------------
@@ -100,8 +101,8 @@ def test_the_noise_is_measured_at_steady_speed():
 def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
     plant = PLANTS[name]
     limits, guess = machine(plant)
-    known = Knowledge(true_noise(plant), LagPrior())
-    usual, chosen = make_plan(limits, guess), choose(limits, guess, ExcitationWish(), known, 0.95)
+    known = DesignKnowledge(true_noise(plant), LagPrior())
+    usual, chosen = make_plan(limits, guess), choose(limits, guess, PlanRequest(), known, 0.95)
     plan = chosen.plan
     assert plan.duration_s <= 1.02 * usual.duration_s
     assert chosen.half_width < 0.96 * chosen.usual_half_width
@@ -117,7 +118,7 @@ def test_the_chosen_motion_stays_inside_and_is_expected_to_tell_more(name):
 
 @pytest.mark.heavy
 def test_it_repeats_and_says_what_the_estimator_would():
-    first, again = (choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95) for _ in range(2))
+    first, again = (choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95) for _ in range(2))
     assert first == again
     assert first.half_width < first.usual_half_width
     theta = KNOWN.theta(GUESS)
@@ -128,18 +129,18 @@ def test_it_repeats_and_says_what_the_estimator_would():
 
 @pytest.mark.heavy
 def test_stated_lags_tighten_what_is_expected_and_move_the_lines():
-    stated = Knowledge(KNOWN.noise, LagPrior(0.02, 0.002, 0.01, 0.001, "rig.yaml"))
-    chosen = choose(LIMITS, GUESS, ExcitationWish(), stated, 0.95)
-    assert chosen.half_width < 0.7 * choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95).half_width
+    stated = DesignKnowledge(KNOWN.noise, LagPrior(0.02, 0.002, 0.01, 0.001, "rig.yaml"))
+    chosen = choose(LIMITS, GUESS, PlanRequest(), stated, 0.95)
+    assert chosen.half_width < 0.7 * choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95).half_width
 
 
 @pytest.mark.parametrize(
     "wish",
     [
-        ExcitationWish(frequency_hz=0.2),
-        ExcitationWish(periods=9),
-        ExcitationWish(kind="step"),
-        ExcitationWish(kind="sine", frequency_hz=0.3),
+        PlanRequest(frequency_hz=0.2),
+        PlanRequest(periods=9),
+        PlanRequest(kind="step"),
+        PlanRequest(kind="sine", frequency_hz=0.3),
     ],
 )
 def test_what_the_user_fixes_rules(wish):
@@ -147,7 +148,7 @@ def test_what_the_user_fixes_rules(wish):
 
 
 def test_amplitude_and_offset_are_kept_while_the_lines_are_chosen():
-    wish = ExcitationWish(amplitude_rad_s=0.8, offsets_rad_s=(3.0, 6.5))
+    wish = PlanRequest(amplitude_rad_s=0.8, offsets_rad_s=(3.0, 6.5))
     plan = choose(LIMITS, GUESS, wish, KNOWN, 0.95).plan
     assert [segment.reference.offset_rad_s for segment in plan.segments] == [3.0, 6.5]
     for segment in plan.segments:
@@ -157,11 +158,11 @@ def test_amplitude_and_offset_are_kept_while_the_lines_are_chosen():
 
 def test_the_time_allowed_is_kept():
     for time_s in (120.0,):
-        plan = choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95, time_s).plan
+        plan = choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95, time_s).plan
         assert 0.8 * time_s < plan.duration_s <= time_s
         assert all(segment.periods - segment.settle_periods >= 6 for segment in plan.segments)
     with pytest.raises(PlanRefused, match="time"):
-        choose(LIMITS, GUESS, ExcitationWish(), KNOWN, 0.95, 40.0)
+        choose(LIMITS, GUESS, PlanRequest(), KNOWN, 0.95, 40.0)
 
 
 def test_with_a_tolerance_the_plan_that_meets_it_soonest_is_taken():
@@ -183,7 +184,7 @@ STRING_GUESS = RigGuess(1950.0, 23.0, 100.0, STRING_ERROR)
 
 
 def hung(**options):
-    return replace(KNOWN, winds_up=True), ExcitationWish(**options)
+    return replace(KNOWN, winds_up=True), PlanRequest(**options)
 
 
 def test_with_a_string_lines_of_equal_torque_reach_from_below_its_swing_to_above_the_second_one():
@@ -210,7 +211,8 @@ def motor_sd(plan):
     counts = np.array([float(one.periods - one.settle_periods) for one in plan.segments])
     variance = 4.0 * 20.0 * plan.segments[0].reference.period_s**-1.0
     lines = tuple(
-        Line(hz, np.full(2, w), np.full(2, gain * w), counts, variance / abs(gain) ** 2, 0.0, 0j, counts.sum() - 2.0)
+        SpectralLine(hz, np.full(2, w), np.full(2, gain * w), counts, variance / abs(gain) ** 2, 0.0, 0j,
+                     counts.sum() - 2.0)
         for hz, w, gain in zip(hertz, speed, g, strict=True)
     )
     problem = Likelihood(lines, Model(shaft), ViscousConstraint(23.5, 0.0, 1.0, 20.0), ())
@@ -235,13 +237,13 @@ def test_a_string_s_tolerance_keeps_its_lines_and_promises_nothing():
     assert planned.plan.segments[0].reference.lines_hz[0] == pytest.approx(0.08)
     assert math.isnan(planned.half_width)
     assert planned.stopping.by_interval
-    assert planned.plan == choose(STRING_LIMITS, STRING_GUESS, ExcitationWish(), known, 0.95).plan
+    assert planned.plan == choose(STRING_LIMITS, STRING_GUESS, PlanRequest(), known, 0.95).plan
     assert "not predicted" in planned.said()
 
 
 def test_where_braking_can_t_be_had_the_motion_asks_for_none():
     bitten = RigGuess(1950.0, 50.0, 1000.0, STRING_ERROR)
-    free, held = (make_plan(limits, bitten, ExcitationWish(offsets_rad_s=(4.0, 6.0)))
+    free, held = (make_plan(limits, bitten, PlanRequest(offsets_rad_s=(4.0, 6.0)))
                   for limits in (STRING_LIMITS, replace(STRING_LIMITS, least_torque_nm=1000.0)))
     assert free.torque_min_nm < 1000.0
     assert held.torque_min_nm == pytest.approx(1000.0)

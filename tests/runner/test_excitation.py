@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from tdhil.config.registry import EXCITATIONS, names
 from tdhil.recording.recording import LagPrior
-from tdhil.runner.design import Knowledge, assumed_noise, choose
-from tdhil.runner.excitation import ExcitationWish, MotionLimits, PlanRefused, RigGuess, make_plan, make_transition
+from tdhil.runner.design import DesignKnowledge, assumed_noise, choose
+from tdhil.runner.excitation import MotionLimits, PlanRefused, PlanRequest, RigGuess, make_plan, make_transition
 
 LIMITS = MotionLimits(0.5, 10.0, 400.0)
 GUESS = RigGuess(104.0, 8.0, 60.0)
@@ -26,7 +26,7 @@ def sampled(segment, points=2000):
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_stays_inside_even_if_the_inertia_is_wrong_by_a_fifth(kind, mode):
-    plan = make_plan(LIMITS, GUESS, ExcitationWish(kind=kind, mode=mode))
+    plan = make_plan(LIMITS, GUESS, PlanRequest(kind=kind, mode=mode))
     for segment in plan.segments:
         _, values = sampled(segment)
         speed, torque = values[:, 0], values[:, 1]
@@ -90,16 +90,16 @@ def test_an_aborted_segment_ends_with_its_last_whole_period():
 @pytest.mark.parametrize(
     ("wish", "word"),
     [
-        (ExcitationWish(amplitude_rad_s=6.0), "speed window"),
-        (ExcitationWish(kind="sine", frequency_hz=2.0, amplitude_rad_s=1.0), "torque limit"),
-        (ExcitationWish(offsets_rad_s=(0.4,)), "speed window"),
-        (ExcitationWish(offsets_rad_s=(5.0, 11.0)), "speed window"),
-        (ExcitationWish(frequency_hz=0.0), "frequency"),
-        (ExcitationWish(amplitude_rad_s=-1.0), "amplitude"),
-        (ExcitationWish(amplitude_rad_s=math.nan), "amplitude"),
-        (ExcitationWish(periods=1), "periods"),
-        (ExcitationWish(offsets_rad_s=()), "offset"),
-        (ExcitationWish(kind="noise"), "unknown"),
+        (PlanRequest(amplitude_rad_s=6.0), "speed window"),
+        (PlanRequest(kind="sine", frequency_hz=2.0, amplitude_rad_s=1.0), "torque limit"),
+        (PlanRequest(offsets_rad_s=(0.4,)), "speed window"),
+        (PlanRequest(offsets_rad_s=(5.0, 11.0)), "speed window"),
+        (PlanRequest(frequency_hz=0.0), "frequency"),
+        (PlanRequest(amplitude_rad_s=-1.0), "amplitude"),
+        (PlanRequest(amplitude_rad_s=math.nan), "amplitude"),
+        (PlanRequest(periods=1), "periods"),
+        (PlanRequest(offsets_rad_s=()), "offset"),
+        (PlanRequest(kind="noise"), "unknown"),
     ],
 )
 def test_refuses_by_name(wish, word):
@@ -124,7 +124,7 @@ def test_refuses_impossible_machines(limits, guess, word):
 
 
 def test_wishes_are_kept():
-    wish = ExcitationWish(kind="sine", frequency_hz=0.3, amplitude_rad_s=0.5, offsets_rad_s=(3.0, 6.0), periods=9)
+    wish = PlanRequest(kind="sine", frequency_hz=0.3, amplitude_rad_s=0.5, offsets_rad_s=(3.0, 6.0), periods=9)
     plan = make_plan(LIMITS, GUESS, wish)
     assert [segment.reference.offset_rad_s for segment in plan.segments] == [3.0, 6.0]
     assert plan.segments[0].reference.lines_hz == (pytest.approx(0.3),)
@@ -161,7 +161,7 @@ def test_any_rig_is_planned_inside_its_limits_or_refused(scale, low, width, kind
     limits = MotionLimits(low, low + width, 400.0 * scale)
     try:
         guess = RigGuess(104.0 * scale, 8.0 * scale, 60.0 * scale)
-        plan = make_plan(limits, guess, ExcitationWish(kind=kind, mode=mode))
+        plan = make_plan(limits, guess, PlanRequest(kind=kind, mode=mode))
     except PlanRefused:
         return
     assert limits.speed_low_rad_s < plan.speed_min_rad_s < plan.speed_max_rad_s < limits.speed_high_rad_s
@@ -170,7 +170,7 @@ def test_any_rig_is_planned_inside_its_limits_or_refused(scale, low, width, kind
 
 def test_pseudo_random_torque():
     """Flat over its lines, at one speed for ten minutes; nobody says how tight it will get."""
-    plan = make_plan(LIMITS, RigGuess(104.0, 8.0, 60.0), ExcitationWish(kind="prbs"))
+    plan = make_plan(LIMITS, RigGuess(104.0, 8.0, 60.0), PlanRequest(kind="prbs"))
     (segment,) = plan.segments
     reference = segment.reference
     assert (segment.periods - segment.settle_periods) * reference.period_s == 600.0
@@ -182,7 +182,8 @@ def test_pseudo_random_torque():
     assert abs(np.count_nonzero(elements > 0.0) - 32) <= 5
     usual = np.abs(np.fft.rfft(elements))[1:31]
     assert usual.min() > 0.4 * usual.max()
-    chosen = choose(LIMITS, GUESS, ExcitationWish(kind="prbs"), Knowledge(assumed_noise(400.0, 10.0), LagPrior()), 0.95)
+    chosen = choose(LIMITS, GUESS, PlanRequest(kind="prbs"), DesignKnowledge(assumed_noise(400.0, 10.0), LagPrior()),
+                    0.95)
     with pytest.raises(PlanRefused, match=r"0\.1 Hz apart"):
-        make_plan(LIMITS, GUESS, ExcitationWish(kind="prbs", frequency_hz=0.1))
+        make_plan(LIMITS, GUESS, PlanRequest(kind="prbs", frequency_hz=0.1))
     assert math.isnan(chosen.half_width) and math.isnan(chosen.usual_half_width)

@@ -10,7 +10,7 @@ import pytest
 from drivers.drive import Mode
 from drivers.errors import CommandRejected
 from tdhil.runner.excitation import MotionLimits, RigGuess, SwingPlan
-from tdhil.runner.excitation.pulses import CALM_S, Way
+from tdhil.runner.excitation.pulses import CALM_S, SpeedChange
 from tdhil.runner.guard import kept_within
 from tdhil.runner.settings import ControlAssumptions
 from tdhil.runner.stages.acquire import Follower, run_swings
@@ -110,7 +110,7 @@ def test_the_slow_loop_asks_for_no_braking_torque_where_none_may_be(world):
 def test_coasting_ends_where_nothing_slows_the_shaft(world):
     """Friction was taken too high by far: after twice the planned time it is held again."""
     guess = RigGuess(100.0, 2.0, 20.0)
-    way = Way(6.0, 2.0, 5.0, guess, coasting=True)
+    way = SpeedChange(6.0, 2.0, 5.0, guess, coasting=True)
     plan = SwingPlan("coast-down", "torque", 6.0, (way,), 2.0, 6.0, 0.0, 100.0, ROOM, guess)
     drive = FakeDrive(coulomb=0.0, viscous=0.0)
     longest = 2.0 * CALM_S + 2.0 * way.duration_s

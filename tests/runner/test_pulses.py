@@ -12,7 +12,7 @@ from drivers.errors import PreflightRefused
 from tdhil.estimation import identify
 from tdhil.estimation.result import Options, Verdict
 from tdhil.recording.recording import LagPrior
-from tdhil.runner.design import Knowledge, assumed_noise
+from tdhil.runner.design import DesignKnowledge, assumed_noise
 from tdhil.runner.excitation import MotionLimits, PlanRefused, RigGuess, make_swings
 from tdhil.runner.excitation.pulses import CALM_S, TOTAL_S, coasting_s
 from tdhil.runner.planning import plan_acquisition
@@ -87,7 +87,7 @@ def test_coasting_time_obeys_the_equation_of_motion():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_frequency_and_no_more_time_than_there_is(kind):
-    known = Knowledge(assumed_noise(400.0, 10.0), LagPrior())
+    known = DesignKnowledge(assumed_noise(400.0, 10.0), LagPrior())
     with pytest.raises(PlanRefused, match="has no frequency"):
         plan_acquisition(ExcitationRequest(kind, frequency_hz=0.1), "torque", LIMITS, GUESS, known, 900.0)
     with pytest.raises(PlanRefused, match="are left"):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tdhil.runner.excitation import MotionLimits, RigGuess, fit_following, held_back_to, make_plan
-from tdhil.runner.excitation.plan import ExcitationWish
+from tdhil.runner.excitation.plan import PlanRequest
 
 STEP_S = 0.001
 
@@ -75,8 +75,8 @@ def test_a_plan_leaves_room_for_a_loop_that_overshoots():
     """Driven through the loop, the shaft stays within the window that the plan kept with its margin."""
     limits = MotionLimits(0.5, 10.0, 1e6)
     following = fit_following(*course(1.5, 2.0, 0.0, 0.02))
-    plain = make_plan(limits, RigGuess(1.0), ExcitationWish(mode="speed"))
-    aware = make_plan(limits, RigGuess(1.0, following=following), ExcitationWish(mode="speed"))
+    plain = make_plan(limits, RigGuess(1.0), PlanRequest(mode="speed"))
+    aware = make_plan(limits, RigGuess(1.0, following=following), PlanRequest(mode="speed"))
     assert aware.segments[0].reference.amplitudes_rad_s[0] < plain.segments[0].reference.amplitudes_rad_s[0]
     for segment in aware.segments:
         reference = segment.reference

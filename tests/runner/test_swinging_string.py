@@ -17,9 +17,9 @@ from tdhil.runner.excitation import RigGuess
 from tdhil.runner.settings import ControlAssumptions, ExcitationRequest, MachineLimits
 from tdhil.runner.stage_planner import StagePlanner
 from tdhil.runner.stages.braking_probe import (
-    Answer,
     Before,
-    Listener,
+    BrakingAnswer,
+    BrakingListener,
     NoPulse,
     Pulse,
     plan_pulse,
@@ -165,24 +165,25 @@ CALM = [seen(200.0 + 5.0 * (-1) ** n) for n in range(50)]
 
 
 def test_the_speed_loops_demand_at_the_switch_is_no_answer():
-    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
     assert listener.hear(seen(demand_nm=500.0)) is None
     assert listener.hear(seen(demand_nm=-600.0)) is None
-    assert listener.hear(seen(demand_nm=500.0)) is Answer.FASTER
+    assert listener.hear(seen(demand_nm=500.0)) is BrakingAnswer.FASTER
 
 
 def test_a_demand_that_stays_up_is_an_answer_once_it_would_have_had_to_follow():
-    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
-    assert [listener.hear(seen(demand_nm=4000.0)) for _ in range(5)] == [None] * 4 + [Answer.FASTER]
+    listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    assert [listener.hear(seen(demand_nm=4000.0)) for _ in range(5)] == [None] * 4 + [BrakingAnswer.FASTER]
 
 
 def test_a_demand_that_had_followed_the_switch_is_an_answer_at_once():
-    assert Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=210.0).hear(seen(demand_nm=4000.0)) is Answer.FASTER
+    assert BrakingListener(PULSE, CALM, PERIOD_S, 0.1,
+                           demand_nm=210.0).hear(seen(demand_nm=4000.0)) is BrakingAnswer.FASTER
 
 
 def test_the_torque_itself_is_an_answer_whatever_the_demand():
-    listener = Listener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
-    assert Answer.FASTER in [listener.hear(seen(3000.0, demand_nm=None)) for _ in range(3)]
+    listener = BrakingListener(PULSE, CALM, PERIOD_S, 0.1, demand_nm=500.0)
+    assert BrakingAnswer.FASTER in [listener.hear(seen(3000.0, demand_nm=None)) for _ in range(3)]
 
 
 def test_there_is_no_pulse_where_the_string_hides_its_answer():

@@ -13,13 +13,23 @@ from drivers.errors import CommunicationLost, DriveFault, LimitHit, PreflightRef
 from tdhil.runner.five_stages import Runner
 from tdhil.runner.settings import ExcitationRequest
 from tdhil.runner.task import Task
-from tdhil.soft_torque import COLUMNS, RPM, EvaluationRefused, HostLoop, Outcome, Phase, Program, Rig, evaluate
+from tdhil.soft_torque import (
+    COLUMNS,
+    RPM,
+    EvaluationOutcome,
+    EvaluationRefused,
+    HostLoop,
+    IdentifiedRig,
+    Phase,
+    SpeedProgram,
+    evaluate,
+)
 from tests.runner.fake_drive import LIMITS, FakeDrive, FakeLog
 from tests.runner.run_outcomes import assert_at_rest, outcomes, up_to
 from tests.soft_torque.test_evaluation import CASE
 
 ROOM = replace(LIMITS, torque_nm=1000.0, speed_max_rad_s=15.0, time_s=2000.0)
-BENCH = replace(CASE, rig=Rig(100.0, 8.0, 60.0, 0.02))      # FakeDrive reports at once
+BENCH = replace(CASE, rig=IdentifiedRig(100.0, 8.0, 60.0, 0.02))      # FakeDrive reports at once
 
 
 class RowsLog(FakeLog):
@@ -34,7 +44,7 @@ class RowsLog(FakeLog):
 @pytest.fixture
 def course(monkeypatch):
     """Already laid: what lays it simulates for a second."""
-    laid = Program(45.0 * RPM, 79.0 * RPM, peak_nm=7000.0)
+    laid = SpeedProgram(45.0 * RPM, 79.0 * RPM, peak_nm=7000.0)
     monkeypatch.setattr("tdhil.runner.stages.virtual_string.program_for", lambda case, window: laid)
 
 
@@ -182,5 +192,5 @@ def test_a_torque_limit_that_acts_fades_the_string_out_and_leaves_no_result(worl
     assert np.all(np.diff(rows["share"][first:]) <= 0.0) and rows["share"][-1] == 0.0
     assert max(abs(one.torque_nm) for one in here.drive.commands) <= 350.0
     assert ("limits", "virtual string: the torque limit acts; it is faded out") in here.log.events
-    found = evaluate(np.array(here.log.rows), BENCH, Program(45.0 * RPM, 79.0 * RPM))
-    assert found.outcome is Outcome.INVALID and "torque limit" in found.why
+    found = evaluate(np.array(here.log.rows), BENCH, SpeedProgram(45.0 * RPM, 79.0 * RPM))
+    assert found.outcome is EvaluationOutcome.INVALID and "torque limit" in found.why

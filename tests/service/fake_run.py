@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 from drivers import PreflightRefused
 from tdhil.service.attendance import Board, Confirming, Lease
-from tdhil.service.run_channel import STOP_FILE, Listener
+from tdhil.service.run_channel import STOP_FILE, ChannelListener
 from tdhil.service.run_state import Check, Confirmation, State, Stop, now, way_to
 from tdhil.service.store import Store, read_json, write_json
 
@@ -61,7 +61,7 @@ def main(folder: Path) -> None:
 
     heard = signal.SIG_IGN if what == "frozen" else lambda number, frame: setattr(stop, "asked", True)
     signal.signal(signal.SIGTERM, heard)
-    listener = Listener(folder, answer)
+    listener = ChannelListener(folder, answer)
     with listener:
         if (folder / STOP_FILE).exists():
             answer({"do": "stop", **(read_json(folder / STOP_FILE) or {})})
@@ -70,7 +70,8 @@ def main(folder: Path) -> None:
             (folder / "control.sock").unlink()
         if what in ("ask", "patient"):
             board.to(State.AWAITING, confirmation=Confirmation(confirming.binding, "this moves", now()),
-                     preflight=(Check("watchdog", "500 ms", "500 ms", "ok", "1016h:1"),), expected_half_width=0.013,
+                     preflight=(Check("watchdog", "500 ms", "500 ms", "ok", "1016h:1"),),
+                     expected_half_width=0.013,
                      expected_s={"setup": 10.0, "acquire": 120.0}, safe_action="quick stop", identity="A drive")
             while not stop.asked and confirming.confirmed_by is None:
                 if confirming.void is not None:

@@ -22,7 +22,7 @@ from tdhil.service import access as access_module
 from tdhil.service import accounts as accounts_module
 from tdhil.service import supervisor as supervisor_module
 from tdhil.service import web as web_module
-from tdhil.service.access import SESSION_S, STOPS_S, Access, Pace, Tries, address_of
+from tdhil.service.access import SESSION_S, STOPS_S, Access, RequestPace, Tries, address_of
 from tdhil.service.accounts import ROLES, AccountsFile, matches, scrypt
 from tdhil.service.run_state import TooManyRuns, TooManyTries
 from tdhil.service.schemas import API
@@ -751,7 +751,7 @@ def test_runs_are_named_to_who_is_known_alone(guarded):
 
 def test_codes_are_shown_ten_times_in_ten_minutes_and_forty_times_a_day():
     time_s = 0.0
-    pace = Pace(lambda: time_s)
+    pace = RequestPace(lambda: time_s)
     begun = 0
     for _ in range(20):
         with contextlib.suppress(TooManyRuns):
@@ -773,7 +773,7 @@ def test_codes_are_shown_ten_times_in_ten_minutes_and_forty_times_a_day():
 
 
 def test_an_address_has_a_limit_of_its_own_and_what_was_refused_does_not_count():
-    pace, begun = Pace(lambda: 0.0), 0
+    pace, begun = RequestPace(lambda: 0.0), 0
     for user in range(100):
         with contextlib.suppress(TooManyRuns):
             pace.begin(f"user-{user}", "192.0.2.1", "r")
@@ -784,7 +784,7 @@ def test_an_address_has_a_limit_of_its_own_and_what_was_refused_does_not_count()
 
 
 def test_runs_that_show_a_code_are_limited_and_simulated_ones_are_not(guarded, monkeypatch):
-    monkeypatch.setattr(Pace, "LIMITS", ((600.0, 2, 9), (86_400.0, 40, 120)))
+    monkeypatch.setattr(RequestPace, "LIMITS", ((600.0, 2, 9), (86_400.0, 40, 120)))
     for _ in range(2):
         run = guarded.run("ask", rig="real")
         guarded("POST", f"/runs/{run}/stop", guarded.sessions["operator"], json={})

@@ -11,7 +11,7 @@ from drivers import Identity, PreflightRefused
 from tdhil.service.run_process import RunProcess
 from tdhil.service.run_state import Conflict, now
 from tdhil.service.start_request import read_rig, run_request
-from tdhil.service.store import Request, Store
+from tdhil.service.store import Store, StoredRequest
 from tests.path.path_runs import REAL, Peer, peer
 from tests.path.test_real_peer import RIG, enabled
 from tests.service.conftest import Service, wait_for
@@ -37,7 +37,7 @@ def test_a_code_is_void_once_the_rig_s_file_or_its_profile_is_another(tmp_path, 
     store = Store(tmp_path / "data")
     store.prepare()
     rig, run = read_rig(tmp_path / "rig.yaml"), store.new_id()
-    store.begin(Request(run, "rig", str(rig.path), rig.sha256, {}, "local", now(), False, "attended"))
+    store.begin(StoredRequest(run, "rig", str(rig.path), rig.sha256, {}, "local", now(), False, "attended"))
     process = RunProcess(store.place(run))
     process._asked = run_request(rig, {})
     found = SimpleNamespace(checks=(), identity=Identity(1, 2, 3, 4, "a drive", False))

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from tdhil.recording import LogNews
-from tdhil.service.live_feed import MOST, SPACING_S, Picture
+from tdhil.service.live_feed import MOST, SPACING_S, LivePicture
 from tdhil.service.schemas import API
 from tests.recording.test_log_tail import write
 from tests.service.conftest import URL
@@ -26,7 +26,7 @@ def news(first_s: float, count: int, every_s: float = 0.004, **more: object) -> 
 
 
 def test_it_is_thin_whatever_pieces_it_comes_in():
-    whole, pieces = Picture(), Picture()
+    whole, pieces = LivePicture(), LivePicture()
     all_of_it = news(0.0, 1000)
     whole.take(all_of_it, 0.0)
     for k in range(0, 1000, 7):
@@ -37,7 +37,7 @@ def test_it_is_thin_whatever_pieces_it_comes_in():
 
 
 def test_a_long_run_stays_small_and_whole():
-    picture = Picture()
+    picture = LivePicture()
     for k in range(60):
         picture.take(news(100.0 * k, 1000, 0.1), 0.0)
     assert len(picture.samples) <= MOST
@@ -45,7 +45,7 @@ def test_a_long_run_stays_small_and_whole():
 
 
 def test_its_age_is_the_clock_s_or_in_stepped_time_that_of_its_arrival():
-    real, stepped = Picture(), Picture()
+    real, stepped = LivePicture(), LivePicture()
     assert real.age_s(0.0, 0.0) is None
     real.take(news(0.0, 2, 1.0, epoch_ns=10**18), 5.0)
     assert real.age_s(10**9 + 3.5, 99.0) == pytest.approx(2.5)
@@ -54,7 +54,7 @@ def test_its_age_is_the_clock_s_or_in_stepped_time_that_of_its_arrival():
 
 
 def test_what_is_no_number_is_none_in_json():
-    picture = Picture()
+    picture = LivePicture()
     shown = picture.take(LogNews(np.array([[0.0, np.nan, np.inf]])), 0.0)
     assert json.dumps(shown, allow_nan=False)
     assert shown["samples"] == [[0.0], [None], [None]]

@@ -15,7 +15,7 @@ from tdhil.service.run_channel import STOP_FILE
 from tdhil.service.run_process import NICE, RunProcess, main
 from tdhil.service.run_state import State, Watch, now
 from tdhil.service.start_request import read_rig
-from tdhil.service.store import CONNECTION_FILE, Request, Store, read_json, write_json
+from tdhil.service.store import CONNECTION_FILE, Store, StoredRequest, read_json, write_json
 from tests.service.conftest import Service, wait_for
 from tests.service.test_lost_run import LIMITS
 
@@ -34,8 +34,8 @@ class Asked:
         found = read_rig(self.rig)
         self.run = self.store.new_id()
         self.folder = self.store.place(self.run)
-        self.store.begin(Request(self.run, "rig", str(self.rig), found.sha256, options, "local", now(), simulated,
-                                 motion))
+        self.store.begin(StoredRequest(self.run, "rig", str(self.rig), found.sha256, options, "local", now(), simulated,
+                                       motion))
 
     def serve(self) -> int:
         return main([str(self.folder)])

@@ -16,10 +16,10 @@ import pytest
 
 from tdhil.cli.main import main
 from tdhil.errors import UsageError
-from tdhil.service.audit import KEY_FILE, Audit, Head
+from tdhil.service.audit import KEY_FILE, Audit, ChainHead
 from tdhil.service.run_channel import lives, take_life
 from tdhil.service.run_state import NotThere, State, Status, now, way_to
-from tdhil.service.store import Index, Request, Store, summary_of, write_json, write_whole
+from tdhil.service.store import Index, Store, StoredRequest, summary_of, write_json, write_whole
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def store(tmp_path) -> Store:
 
 def a_run(store: Store, rig: str = "a", end: State | None = State.REFUSED) -> str:
     run = store.new_id()
-    status = store.begin(Request(run, rig, "rig.yaml", "0" * 64, {"seed": 7}, "local", now(), True, "never"))
+    status = store.begin(StoredRequest(run, rig, "rig.yaml", "0" * 64, {"seed": 7}, "local", now(), True, "never"))
     if end is not None:
         store.save(way_to(status, end, now()))
     return run
@@ -331,7 +331,7 @@ def test_killed_between_head_and_anchor_it_still_holds(store, audit):
 
 def test_a_kept_head_finds_another_chain_with_another_key(store, audit):
     kept = audit.head()
-    assert (kept.number, Head.of(str(kept))) == (12, kept)
+    assert (kept.number, ChainHead.of(str(kept))) == (12, kept)
     audit.note("local", "asked")
     assert audit.verify(kept) is None
     all_of_it_deleted(audit)
@@ -343,7 +343,7 @@ def test_a_kept_head_finds_another_chain_with_another_key(store, audit):
     assert other.verify() is None
     assert "line 12 as it was exported" in other.verify(kept).why      # … but what was kept elsewhere
     with pytest.raises(UsageError):
-        Head.of("12")
+        ChainHead.of("12")
 
 
 def test_a_chain_from_before_there_was_a_key_is_taken_as_it_is_and_sealed_from_then_on(store):

@@ -16,9 +16,9 @@ import pytest
 from drivers import CommunicationLost, DataFileError
 from tdhil.errors import LogError
 from tdhil.service import supervisor as supervisor_module
-from tdhil.service.run_channel import STOP_FILE, Refused
+from tdhil.service.run_channel import STOP_FILE, RunRefused
 from tdhil.service.run_state import Conflict, NoRoom, State, Status, now, way_to
-from tdhil.service.store import Request
+from tdhil.service.store import StoredRequest
 from tdhil.service.supervisor import KEYS
 from tests.service.conftest import FAKE, Service, wait_for
 
@@ -33,8 +33,9 @@ def begun(service: Service, what: str = "hold", rig: str = "a", *states: str) ->
 def ended(service: Service, rig: str = "a", state: State = State.STOP_NOT_CONFIRMED) -> str:
     """A run of before that ended so."""
     run = service.store.new_id()
-    status = service.store.begin(Request(run, rig, "rig.yaml", "0" * 64, {}, "anna", now(), True, "never"))
-    service.store.save(way_to(status.to(State.PREFLIGHT, now()).to(State.MOVING, now()), state, now(), exit_code=8))
+    status = service.store.begin(StoredRequest(run, rig, "rig.yaml", "0" * 64, {}, "anna", now(), True, "never"))
+    service.store.save(way_to(status.to(State.PREFLIGHT, now()).to(State.MOVING, now()), state, now(),
+                              exit_code=8))
     return run
 
 
@@ -318,16 +319,16 @@ def test_what_is_left_of_a_lost_run_is_its_result(service, monkeypatch):
 
 
 def test_arithmetic_that_fails_says_why(service, monkeypatch):
-    with pytest.raises(Refused, match="nosuch") as refused:
+    with pytest.raises(RunRefused, match="nosuch") as refused:
         service.supervisor.work("plan", None, {"rig_file": "/nosuch/rig.yaml", "options": {}})
     assert refused.value.told.exit_code != 0
     broken = SimpleNamespace(stdout=b"no JSON", stderr=b"first\nkilled\n")
     monkeypatch.setattr(supervisor_module.subprocess, "run", lambda *_, **__: broken)
-    with pytest.raises(Refused) as refused:
+    with pytest.raises(RunRefused) as refused:
         service.supervisor.work("plan", None, {})
     assert (refused.value.told.message, refused.value.told.what) == ("the work failed", "killed")
     broken.stderr = b""
-    with pytest.raises(Refused):
+    with pytest.raises(RunRefused):
         service.supervisor.work("plan", None, {})
 
 
@@ -352,7 +353,7 @@ def test_an_audit_or_an_index_that_cannot_be_written_is_said_and_holds_nothing_u
     (False, State.MOVING, True), (False, State.AWAITING, False), (True, State.MOVING, False)])
 def test_a_real_shaft_of_a_run_that_moves_may_turn(service, monkeypatch, simulated, state, turns):
     run = service.store.new_id()
-    status = service.store.begin(Request(run, "a", "rig.yaml", "0" * 64, {}, "anna", now(), simulated, "never"))
+    status = service.store.begin(StoredRequest(run, "a", "rig.yaml", "0" * 64, {}, "anna", now(), simulated, "never"))
     status = status.to(State.PREFLIGHT, now())
     service.store.save(status.to(state, now()))
     service.supervisor._live[run] = None

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_bus.plant.batch import ANGLE, BRISTLE, SPEED, FixedStep, Shafts, white_torque
-from sim_bus.plant.rigid import Params, State, step
+from sim_bus.plant.rigid import Params, ShaftState, step
 
 TOLERANCE = 1e-9      # relative to the larger of 1 and the value
 
 
-def alone(params: Params, torques, dt_s: float) -> State:
-    state = State()
+def alone(params: Params, torques, dt_s: float) -> ShaftState:
+    state = ShaftState()
     for torque in torques:
         state = step(params, state, float(torque), dt_s)
     return state

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from sim_bus.plant.friction import torque
-from sim_bus.plant.rigid import Params, State, friction_torque, step
+from sim_bus.plant.rigid import Params, ShaftState, friction_torque, step
 
 MODELS = ("coulomb", "stribeck", "dahl", "lugre")
 STICKING = ("coulomb", "stribeck")
@@ -79,7 +79,7 @@ def reference(params: Params, times: np.ndarray, profile: tuple = PROFILE) -> np
 
 
 def simulated(params: Params, dt_s: float, profile: tuple = PROFILE) -> np.ndarray:
-    state, speeds = State(), [0.0]
+    state, speeds = ShaftState(), [0.0]
     for begin, end, u in profile:
         for _ in range(round((end - begin) / dt_s)):
             state = step(params, state, u, dt_s)
@@ -140,7 +140,7 @@ def test_a_shaft_ten_thousand_times_lighter_is_still_followed(words: dict[str, o
 ] + [{"friction": "dahl", "dahl_stiffness_nm_rad": stiffness} for stiffness in (1e5, 1e7)], ids=str)
 def test_a_stiff_bristle_comes_to_rest_and_stays(words: dict[str, object], inertia: float) -> None:
     params = Params(inertia_kg_m2=inertia, viscous_nm_s_rad=80.0, **words)  # type: ignore[arg-type]
-    state, top = State(0.2), 0.2 + 300.0 / 80.0
+    state, top = ShaftState(0.2), 0.2 + 300.0 / 80.0
     for _ in range(50):
         state = step(params, state, 300.0, 0.002)
         assert abs(state.speed_rad_s) <= top
@@ -156,7 +156,7 @@ def test_a_stiff_bristle_comes_to_rest_and_stays(words: dict[str, object], inert
     assert max(speeds) < 1e-5                                  # no chatter
 
 
-def energy(params: Params, state: State) -> float:
+def energy(params: Params, state: ShaftState) -> float:
     stiffness = {"dahl": params.dahl_stiffness_nm_rad, "lugre": params.lugre_stiffness_nm_rad}.get(params.friction, 0.0)
     return 0.5 * params.inertia_kg_m2 * state.speed_rad_s**2 + 0.5 * stiffness * state.bristle_rad**2
 
@@ -166,7 +166,7 @@ def energy(params: Params, state: State) -> float:
        viscous=st.floats(0, 20), inertia=st.sampled_from([20.0, 104.0, 1500.0]))
 def test_friction_only_takes_energy(friction: str, speed: float, drive: float, viscous: float, inertia: float) -> None:
     params = Params(friction=friction, viscous_nm_s_rad=viscous, inertia_kg_m2=inertia)  # type: ignore[arg-type]
-    state = State(speed)
+    state = ShaftState(speed)
     stored, work, scale = energy(params, state), 0.0, 0.0
     for _ in range(300):
         after = step(params, state, drive, 0.002)
@@ -181,7 +181,7 @@ def test_friction_only_takes_energy(friction: str, speed: float, drive: float, v
        inertia=st.sampled_from([0.01, 1.0, 104.0]))
 def test_left_alone_it_never_gets_faster(friction: str, speed: float, dt_s: float, inertia: float) -> None:
     params = Params(friction=friction, inertia_kg_m2=inertia)  # type: ignore[arg-type]
-    state = State(speed)
+    state = ShaftState(speed)
     most = energy(params, state)
     for _ in range(50):
         state = step(params, state, 0.0, dt_s)
@@ -193,7 +193,7 @@ def test_left_alone_it_never_gets_faster(friction: str, speed: float, dt_s: floa
 def test_it_sticks_exactly(friction: str, speed: float, share: float) -> None:
     params = Params(friction=friction)  # type: ignore[arg-type]
     holds = params.coulomb_nm if friction == "coulomb" else params.static_nm
-    state = State(speed, 1.5)
+    state = ShaftState(speed, 1.5)
     for _ in range(20_000):
         state = step(params, state, 0.0, 0.002)
         if state.speed_rad_s == 0.0:
@@ -209,7 +209,7 @@ def test_it_sticks_exactly(friction: str, speed: float, share: float) -> None:
 @pytest.mark.parametrize("friction", ["dahl", "lugre"])
 def test_a_bristle_that_carries_the_load_is_a_fixed_point(friction: str) -> None:
     params = Params(friction=friction, dahl_stiffness_nm_rad=4096.0, lugre_stiffness_nm_rad=4096.0)  # type: ignore[arg-type]
-    state = State(0.0, 0.0, 32.0 / 4096.0)
+    state = ShaftState(0.0, 0.0, 32.0 / 4096.0)
     assert step(params, state, 32.0, 0.002) == state
 
 
@@ -219,7 +219,7 @@ def test_a_bristle_that_carries_the_load_is_a_fixed_point(friction: str) -> None
 def test_both_directions_are_alike(friction: str, speed: float, bristle: float, drive: float, dt_s: float,
                                    inertia: float) -> None:
     params = Params(friction=friction, inertia_kg_m2=inertia)  # type: ignore[arg-type]
-    one, other = State(speed, 0.0, bristle), State(-speed, 0.0, -bristle)
+    one, other = ShaftState(speed, 0.0, bristle), ShaftState(-speed, 0.0, -bristle)
     for _ in range(5):
         one, other = step(params, one, drive, dt_s), step(params, other, -drive, dt_s)
         assert one == tuple(-value for value in other)
@@ -232,7 +232,7 @@ def test_steady_sliding_has_the_torque_of_the_law(friction: str, speed: float) -
     params = Params(friction=friction, inertia_kg_m2=1e6)  # type: ignore[arg-type]
     law = Law.of(params)
     bristle = law.g(speed) / law.s0 if law.s0 else 0.0
-    state = step(params, State(speed, 0.0, bristle), law.g(speed) + law.B * speed, 0.002)
+    state = step(params, ShaftState(speed, 0.0, bristle), law.g(speed) + law.B * speed, 0.002)
     assert state.speed_rad_s == pytest.approx(speed, rel=1e-12)
     assert state.angle_rad == pytest.approx(speed * 0.002, rel=1e-12)
     assert torque(params, speed, bristle) == pytest.approx(law.g(speed), rel=1e-12)
@@ -240,18 +240,18 @@ def test_steady_sliding_has_the_torque_of_the_law(friction: str, speed: float) -
 
 def test_friction_falls_from_breakaway_to_sliding() -> None:
     params = Params(friction="stribeck")
-    levels = [friction_torque(params, State(speed)) for speed in (1e-9, 0.05, 0.1, 0.2, 1.0)]
+    levels = [friction_torque(params, ShaftState(speed)) for speed in (1e-9, 0.05, 0.1, 0.2, 1.0)]
     assert levels[0] == pytest.approx(80.0) and levels[-1] == pytest.approx(60.0)
     assert levels[2] == pytest.approx(60.0 + 20.0 / math.e)
     assert all(a > b for a, b in pairwise(levels))
-    assert friction_torque(params, State(), 300.0) == 80.0
+    assert friction_torque(params, ShaftState(), 300.0) == 80.0
 
 
 def test_without_coulomb_friction_no_model_has_any() -> None:
     for friction in MODELS:
         params = Params(friction=friction, coulomb_nm=0.0)  # type: ignore[arg-type]
-        assert step(params, State(1.0), 5.0, 0.002) == step(Params(coulomb_nm=0.0), State(1.0), 5.0, 0.002)
-        assert friction_torque(params, State(1.0)) == 0.0
+        assert step(params, ShaftState(1.0), 5.0, 0.002) == step(Params(coulomb_nm=0.0), ShaftState(1.0), 5.0, 0.002)
+        assert friction_torque(params, ShaftState(1.0)) == 0.0
 
 
 @pytest.mark.parametrize("friction", ["stribeck", "lugre"])

@@ -16,9 +16,9 @@ from contextlib import contextmanager
 import pytest
 
 from profiles.library import load_modbus_profile
-from sim_bus.modbus.lines import Listener, RtuListener, TcpListener
+from sim_bus.modbus.lines import RequestListener, RtuListener, TcpListener
 from sim_bus.modbus.machine import Machine
-from sim_bus.modbus.server import Server
+from sim_bus.modbus.server import DriveServer
 from tests.path.path_runs import wait_for
 from tests.sim_bus.modbus_host import QUIET_RIG
 
@@ -63,7 +63,7 @@ class Poll:
 @contextmanager
 def served(name: str, line: str, unit: int = 1) -> Iterator[tuple[Poll, Machine]]:
     """The simulated drive in a thread, in real time."""
-    listener: Listener
+    listener: RequestListener
     where: tuple[str, ...]
     if line == "tcp":
         listener = TcpListener("127.0.0.1", 0)
@@ -73,7 +73,7 @@ def served(name: str, line: str, unit: int = 1) -> Iterator[tuple[Poll, Machine]
         where = ("-m", "rtu", "-b", "19200", "-P", "even", "-a", str(unit), listener.reached_by.split()[1])
     stop = threading.Event()
     with Machine(QUIET_RIG, load_modbus_profile(name), stepped=False) as machine:
-        thread = threading.Thread(target=Server(machine, unit, listener, gateway=line == "tcp").run, args=(stop,))
+        thread = threading.Thread(target=DriveServer(machine, unit, listener, gateway=line == "tcp").run, args=(stop,))
         thread.start()
         try:
             yield Poll(*where), machine

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim_bus.cia402 import Application, Mode
+from sim_bus.cia402 import Application, OperationMode
 from sim_bus.inverter import Inverter
 from sim_bus.modbus.control_words import FAMILIES, Wiring
 from tests.sim_bus.modbus_host import QUIET_RIG
@@ -16,7 +16,7 @@ class Bench:
 
     def __init__(self, family: str, **wiring: object) -> None:
         self.application = Application(Inverter(QUIET_RIG, np.random.default_rng(0)))
-        self.application.set_mode(Mode.CYCLIC_VELOCITY)
+        self.application.set_mode(OperationMode.CYCLIC_VELOCITY)
         self.words = FAMILIES[family](self.application, Wiring(**wiring))  # type: ignore[arg-type]
 
     def send(self, word: int, for_s: float = 0.02) -> int:

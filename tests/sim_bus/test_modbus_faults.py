@@ -20,7 +20,7 @@ from sim_bus.fault_script import FaultRefused
 from sim_bus.modbus.faults import KINDS, ONLY_ON, WRONGS, Faults, parse_all
 from sim_bus.modbus.lines import RtuListener, TcpListener, crc
 from sim_bus.modbus.machine import Machine
-from sim_bus.modbus.server import Server
+from sim_bus.modbus.server import DriveServer
 from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, drive
 
 READ = struct.pack(">BHH", 3, 42, 2)
@@ -269,7 +269,7 @@ def served(line: str, *faults: str) -> Iterator[str]:
         listener = TcpListener("127.0.0.1", 0) if line == "tcp" else RtuListener(
             None, baud=19200, parity="N", stop_bits=1)
         script = Faults(machine, GENERIC, parse_all(faults, line))
-        server = Server(machine, 1, listener, gateway=line == "tcp", faults=script)
+        server = DriveServer(machine, 1, listener, gateway=line == "tcp", faults=script)
         thread = threading.Thread(target=server.run, args=(stop,))
         thread.start()
         try:

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_bus.modbus.lines import NotModbus, Request, RtuReceiver, crc, rtu_reply, tcp_reply, tcp_requests
+from sim_bus.modbus.lines import NotModbus, ReceivedRequest, RtuReceiver, crc, rtu_reply, tcp_reply, tcp_requests
 
 HOME = Path(__file__).parents[2]
 READ = struct.pack(">BHH", 3, 42, 2)
@@ -170,7 +170,7 @@ def test_frames_survive_any_split(requests: list[tuple[int, bytes]], data: st.Da
     for piece in pieces(tcp, data):
         buffer += piece
         heard += tcp_requests(buffer)
-    assert heard == [Request(unit, pdu, at) for at, (unit, pdu) in enumerate(requests)] and not buffer
+    assert heard == [ReceivedRequest(unit, pdu, at) for at, (unit, pdu) in enumerate(requests)] and not buffer
 
 
 def pieces(stream: bytes, data: st.DataObject) -> list[bytes]:
@@ -184,15 +184,15 @@ def test_garbage_does_no_harm_and_silence_clears_it(chunks: list[bytes]) -> None
     for at, chunk in enumerate(chunks):
         list(receiver.feed(chunk, 0.01 * at))
     asked = framed(b"\x01" + READ)
-    assert list(receiver.feed(asked, 1.0)) == [Request(1, READ)]
+    assert list(receiver.feed(asked, 1.0)) == [ReceivedRequest(1, READ)]
 
 
 def test_broken_and_unknown_rtu_frames() -> None:
     receiver = RtuReceiver()
     asked = framed(b"\x01" + READ)
     assert list(receiver.feed(asked[:-1] + bytes([asked[-1] ^ 1]), 0.0)) == []
-    assert list(receiver.feed(asked, 0.001)) == [Request(1, READ)]            # as long as it should be: dropped whole
-    assert list(receiver.feed(framed(b"\x01\x41\x00\x07"), 0.002)) == [Request(1, b"\x41\x00\x07")]
+    assert list(receiver.feed(asked, 0.001)) == [ReceivedRequest(1, READ)]    # as long as it should be: dropped whole
+    assert list(receiver.feed(framed(b"\x01\x41\x00\x07"), 0.002)) == [ReceivedRequest(1, b"\x41\x00\x07")]
 
 
 @given(st.binary(min_size=7, max_size=64))
@@ -206,5 +206,5 @@ def test_anything_else_on_tcp_is_hung_up_on(data: bytes) -> None:
 
 
 def test_replies_carry_what_the_request_had() -> None:
-    assert tcp_reply(Request(5, READ, 0xABCD), REPLY) == bytes.fromhex("abcd00000007 05") + REPLY
-    assert rtu_reply(Request(5, READ), REPLY) == framed(b"\x05" + REPLY)
+    assert tcp_reply(ReceivedRequest(5, READ, 0xABCD), REPLY) == bytes.fromhex("abcd00000007 05") + REPLY
+    assert rtu_reply(ReceivedRequest(5, READ), REPLY) == framed(b"\x05" + REPLY)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from profiles.errors import TdhilError
 from profiles.modbus import ModbusProfile
-from sim_bus.modbus.codec import Layout
+from sim_bus.modbus.codec import RegisterLayout
 from sim_bus.params import DriveParams, ReportingParams, RigParams
 from tests.sim_bus.modbus_host import GENERIC, QUIET_RIG, GenericHost, Host, Refusal, drive
 
@@ -18,10 +18,10 @@ SOURCE = {"source": "for this test", "confidence": "verified"}
 
 
 @given(st.sampled_from(sorted(FORMATS)).flatmap(lambda kind: st.tuples(
-    st.just(kind), st.integers(Layout(0, kind).lowest, Layout(0, kind).highest))), st.booleans())
+    st.just(kind), st.integers(RegisterLayout(0, kind).lowest, RegisterLayout(0, kind).highest))), st.booleans())
 def test_every_number_of_every_type_is_stored_as_struct_does(case: tuple[str, int], high_first: bool) -> None:
     kind, number = case
-    layout = Layout(7, kind, high_first=high_first)
+    layout = RegisterLayout(7, kind, high_first=high_first)
     packed = struct.pack(">" + FORMATS[kind], number)
     words = struct.unpack(f">{len(packed) // 2}H", packed)
     assert layout.words(number) == (words if high_first else words[::-1])
@@ -31,7 +31,7 @@ def test_every_number_of_every_type_is_stored_as_struct_does(case: tuple[str, in
 
 @given(st.sampled_from(sorted(FORMATS)), st.floats(-1e13, 1e13))
 def test_what_does_not_fit_saturates(kind: str, value: float) -> None:
-    layout = Layout(0, kind)
+    layout = RegisterLayout(0, kind)
     number = layout.saturated(value)
     wanted = value if kind[0] == "i" else abs(value)
     assert layout.lowest <= number <= layout.highest

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from sim_bus.plant import rigid
-from sim_bus.plant.rigid import Params, State, step
+from sim_bus.plant.rigid import Params, ShaftState, step
 
 
 def torque_at(time_s: float) -> float:
@@ -20,9 +20,9 @@ def torque_at(time_s: float) -> float:
     return 40.0
 
 
-def simulate(params: Params, end_s: float = 7.0, dt_s: float = 0.002) -> tuple[np.ndarray, list[State]]:
+def simulate(params: Params, end_s: float = 7.0, dt_s: float = 0.002) -> tuple[np.ndarray, list[ShaftState]]:
     count = round(end_s / dt_s)
-    state, states = State(), [State()]
+    state, states = ShaftState(), [ShaftState()]
     for k in range(count):
         state = step(params, state, torque_at(k * dt_s), dt_s)
         states.append(state)
@@ -80,23 +80,23 @@ def test_agrees_with_an_independent_integration(params: Params, tolerance: float
 def test_sticks_exactly_and_without_chatter() -> None:
     _, states = simulate(Params())
     assert [state.speed_rad_s for state in states[-100:]] == [0.0] * 100
-    assert step(Params(), State(), 60.0, 0.002) == State()
-    assert step(Params(), State(), 60.1, 0.002).speed_rad_s > 0.0
+    assert step(Params(), ShaftState(), 60.0, 0.002) == ShaftState()
+    assert step(Params(), ShaftState(), 60.1, 0.002).speed_rad_s > 0.0
 
 
 def test_a_step_through_zero_is_as_good_as_many_small_ones() -> None:
     params = Params()
     for torque in (-300.0, -50.0):
-        coarse = step(params, State(0.003), torque, 0.002)
-        fine = State(0.003)
+        coarse = step(params, ShaftState(0.003), torque, 0.002)
+        fine = ShaftState(0.003)
         for _ in range(2000):
             fine = step(params, fine, torque, 1e-6)
         assert coarse.speed_rad_s == pytest.approx(fine.speed_rad_s, abs=1e-12)
 
 
 def test_viscous_limit_is_continuous() -> None:
-    tiny = step(Params(viscous_nm_s_rad=1e-9), State(0.01), -500.0, 0.002)
-    none = step(Params(viscous_nm_s_rad=0.0), State(0.01), -500.0, 0.002)
+    tiny = step(Params(viscous_nm_s_rad=1e-9), ShaftState(0.01), -500.0, 0.002)
+    none = step(Params(viscous_nm_s_rad=0.0), ShaftState(0.01), -500.0, 0.002)
     assert tiny.speed_rad_s == pytest.approx(none.speed_rad_s, abs=1e-12)
 
 
@@ -105,7 +105,7 @@ def test_viscous_limit_is_continuous() -> None:
        viscous=st.floats(0, 20))
 def test_energy_is_only_what_the_torque_brought(speed: float, torque: float, friction: str, viscous: float) -> None:
     params = Params(friction=friction, viscous_nm_s_rad=viscous)  # type: ignore[arg-type]
-    state = State(speed)
+    state = ShaftState(speed)
     stored = 0.5 * 104.0 * speed**2
     work = 0.0
     for _ in range(200):
@@ -120,7 +120,7 @@ def test_energy_is_only_what_the_torque_brought(speed: float, torque: float, fri
 @given(speed=st.floats(-1, 1), torque=st.floats(-60, 60))
 @settings(max_examples=60, deadline=None)
 def test_torque_below_friction_always_ends_at_rest(speed: float, torque: float) -> None:
-    params, state = Params(viscous_nm_s_rad=8.0), State(speed)
+    params, state = Params(viscous_nm_s_rad=8.0), ShaftState(speed)
     for _ in range(20000):
         state = step(params, state, 0.9 * torque, 0.002)
         if state.speed_rad_s == 0.0:
@@ -129,11 +129,12 @@ def test_torque_below_friction_always_ends_at_rest(speed: float, torque: float) 
 
 
 def test_friction_torque_and_loads() -> None:
-    assert rigid.friction_torque(Params(), State(-1.0)) == -60.0
-    assert rigid.friction_torque(Params(), State(), 25.0) == 25.0
-    assert rigid.friction_torque(Params(friction="dahl"), State(1.0, 0.0, 0.012)) == pytest.approx(60.0)
-    with_load = step(Params(load_nm=30.0), State(1.0), 100.0, 0.002)
-    assert with_load == step(Params(), State(1.0), 70.0, 0.002) == step(Params(), State(1.0), 100.0, 0.002, 30.0)
+    assert rigid.friction_torque(Params(), ShaftState(-1.0)) == -60.0
+    assert rigid.friction_torque(Params(), ShaftState(), 25.0) == 25.0
+    assert rigid.friction_torque(Params(friction="dahl"), ShaftState(1.0, 0.0, 0.012)) == pytest.approx(60.0)
+    with_load = step(Params(load_nm=30.0), ShaftState(1.0), 100.0, 0.002)
+    without = step(Params(), ShaftState(1.0), 70.0, 0.002)
+    assert with_load == without == step(Params(), ShaftState(1.0), 100.0, 0.002, 30.0)
 
 
 def test_parameters_are_checked() -> None:

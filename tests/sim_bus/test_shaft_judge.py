@@ -5,18 +5,18 @@ import pytest
 
 from sim_bus.lying_runs import PROGRAMS, UNKNOWABLE, product, sample, standard, unknowable
 from sim_bus.reports import LIES
-from sim_bus.shaft_judge import Machine, Outcome, Shaft, judge, outcome_of, read_shaft
-from sim_bus.trace import HEADER, Trace
+from sim_bus.shaft_judge import JudgedMachine, ProcessOutcome, TrueShaft, judge, outcome_of, read_shaft
+from sim_bus.trace import HEADER, ShaftTrace
 
-RIG = Machine(100.0, 20.0, 380.0, 10.0, string=False)
-FINE = Outcome(0, True, 20.0, "valid", 95.0, 105.0, removed=False, log_closed=True)
+RIG = JudgedMachine(100.0, 20.0, 380.0, 10.0, string=False)
+FINE = ProcessOutcome(0, True, 20.0, "valid", 95.0, 105.0, removed=False, log_closed=True)
 
 
 def shaft(speeds, *, disabled_s=(20.0,), stop_s=10.0):
     """Speed by knots of (time, speed), every 10 ms up to 30 s."""
     time_s = np.arange(0.0, 30.0, 0.01)
     speed = np.interp(time_s, [t for t, _ in speeds], [w for _, w in speeds])
-    return Shaft(time_s, speed, np.zeros_like(time_s), time_s < 20.0, disabled_s, stop_s)
+    return TrueShaft(time_s, speed, np.zeros_like(time_s), time_s < 20.0, disabled_s, stop_s)
 
 
 TURNED = shaft([(0, 0), (5, 8), (10, 8), (14, 0), (30, 0)])
@@ -25,7 +25,7 @@ RUNS_AWAY = shaft([(0, 0), (5, 8), (10, 8), (20, 12), (30, 12)])
 
 
 def otherwise(**changes):
-    return Outcome(**{**FINE.__dict__, **changes})
+    return ProcessOutcome(**{**FINE.__dict__, **changes})
 
 
 @pytest.mark.parametrize(("turned", "outcome", "rig", "rules"), [
@@ -37,9 +37,9 @@ def otherwise(**changes):
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None), RIG, "a"),
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True), RIG, ""),
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True),
-     Machine(100.0, 20.0, 380.0, 100.0, string=True), "a"),
+     JudgedMachine(100.0, 20.0, 380.0, 100.0, string=True), "a"),
     (RUNS_AWAY, otherwise(code=8, at_rest=False, seen_s=None, removed=True),      # beyond its limit: decision 0024
-     Machine(100.0, 20.0, 380.0, 10.0, string=True), ""),
+     JudgedMachine(100.0, 20.0, 380.0, 10.0, string=True), ""),
     (COASTS, otherwise(code=8, at_rest=False, seen_s=None, removed=True), RIG, "a"),
     (TURNED, otherwise(low_total=50.0, high_total=99.0), RIG, "c"),
     (TURNED, otherwise(verdict="valid_wide", low_total=101.0), RIG, "c"),
@@ -71,7 +71,7 @@ def test_the_reaction_that_was_used_is_told():
 def test_a_shaft_is_read_from_a_trace(tmp_path):
     from sim_bus.cia402 import DISABLED_BY_HOST
 
-    with Trace(tmp_path / "shaft.csv") as trace:
+    with ShaftTrace(tmp_path / "shaft.csv") as trace:
         for time_s, speed, state, event in (
             (0.0, 0.0, "switch on disabled", "power on"), (1.0, 4.0, "operation enabled", "state: operation enabled"),
             (2.0, 6.0, "quick stop active", "state: quick stop active"),

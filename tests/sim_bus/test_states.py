@@ -1,6 +1,6 @@
 import pytest
 
-from sim_bus.cia402 import STATUS, Command, State, decode, fault_reset_edge, next_state
+from sim_bus.cia402 import STATUS, DeviceCommand, State, decode, fault_reset_edge, next_state
 
 # Typed from CiA 402-2's table of transitions: number, from, command, to.
 TABLE = """
@@ -24,15 +24,15 @@ ROWS = {(row[1], row[2]): row[3] for row in (line.split() for line in TABLE.stri
 
 
 @pytest.mark.parametrize("state", list(State))
-@pytest.mark.parametrize("command", list(Command))
-def test_every_pair_of_state_and_command(state: State, command: Command) -> None:
+@pytest.mark.parametrize("command", list(DeviceCommand))
+def test_every_pair_of_state_and_command(state: State, command: DeviceCommand) -> None:
     wanted = ROWS.get((state.name, command.name), state.name)
     assert next_state(state, command, 6).name == wanted
 
 
 def test_leaving_quick_stop_needs_an_option_that_stays() -> None:
     for option in (0, 1, 2, 3):
-        assert next_state(State.QUICK_STOP, Command.ENABLE, option) is State.QUICK_STOP
+        assert next_state(State.QUICK_STOP, DeviceCommand.ENABLE, option) is State.QUICK_STOP
 
 
 @pytest.mark.parametrize(("word", "command"), [

@@ -10,7 +10,7 @@ from math import pi
 
 import numpy as np
 
-from tdhil.soft_torque import Bottom, Section, SpeedController, StringFile, TopDrive, string_of
+from tdhil.soft_torque import BottomEnd, PipeSection, SpeedController, StringFile, TopDrive, string_of
 
 FIVE_INCH = {"outer_diameter_m": 0.127, "inner_diameter_m": 0.1086}
 BIT = {"friction": "stribeck", "static_nm": 5000.0, "coulomb_nm": 2500.0, "stribeck_speed_rad_s": 2.5,
@@ -18,8 +18,8 @@ BIT = {"friction": "stribeck", "static_nm": 5000.0, "coulomb_nm": 2500.0, "strib
 
 
 def string_with(*, length_m: float = 3000.0, drag: float = 0.005, **bottom):
-    section = Section(length_m=length_m, drag_nm_s_rad_m=drag, **FIVE_INCH)
-    return string_of(StringFile(sections=(section,), bottom=Bottom(**{"inertia_kg_m2": 374.0, **BIT, **bottom})))
+    section = PipeSection(length_m=length_m, drag_nm_s_rad_m=drag, **FIVE_INCH)
+    return string_of(StringFile(sections=(section,), bottom=BottomEnd(**{"inertia_kg_m2": 374.0, **BIT, **bottom})))
 
 
 STRING = string_with()

@@ -13,14 +13,14 @@ from tdhil.soft_torque import (
     COLUMNS,
     RPM,
     EvaluationCase,
+    EvaluationOutcome,
     EvaluationRefused,
+    IdentifiedRig,
     Interval,
-    Outcome,
     Phase,
     Prediction,
-    Program,
-    Rig,
-    Window,
+    RigWindow,
+    SpeedProgram,
     case_of,
     evaluate,
     program_for,
@@ -29,9 +29,9 @@ from tdhil.soft_torque import (
 from tests.soft_torque.cases import DRIVE, SOFT_025, STIFF, STRING, string_with
 
 PREDICTED = Prediction("soft", Interval(57.0, 56.0, 59.0), Interval(0.226, 0.213, 0.240), (0.1299, 0.567, 1.079))
-CASE = EvaluationCase(STRING, DRIVE, SOFT_025, Rig(1500.0, 8.0, 60.0, 0.4), PREDICTED, 0.01)
-WINDOW = Window(0.5, 15.0, 15_000.0, 0.857)
-PROGRAM = Program(45.0 * RPM, 79.0 * RPM)
+CASE = EvaluationCase(STRING, DRIVE, SOFT_025, IdentifiedRig(1500.0, 8.0, 60.0, 0.4), PREDICTED, 0.01)
+WINDOW = RigWindow(0.5, 15.0, 15_000.0, 0.857)
+PROGRAM = SpeedProgram(45.0 * RPM, 79.0 * RPM)
 
 
 @pytest.mark.parametrize(("case", "period_s", "said"), [
@@ -61,8 +61,8 @@ def test_the_course_is_laid_where_the_shaft_can_bear_it():
     higher = program_for(CASE, replace(WINDOW, lowest_rad_s=2.55)).start_rad_s
     assert 46.0 * RPM <= higher <= 52.0 * RPM
     # at a motor eight times as fast, the same machine takes the same course with an eighth of the torque
-    geared = replace(CASE, rig=Rig(1500.0 / 64.0, 0.125, 7.5, 0.4, 8.0))
-    assert program_for(geared, Window(4.0, 120.0, 15_000.0 / 8.0, 0.857)) == program
+    geared = replace(CASE, rig=IdentifiedRig(1500.0 / 64.0, 0.125, 7.5, 0.4, 8.0))
+    assert program_for(geared, RigWindow(4.0, 120.0, 15_000.0 / 8.0, 0.857)) == program
 
 
 @pytest.mark.parametrize(("window", "said"), [
@@ -132,12 +132,12 @@ def test_two_modes_that_are_alike_are_told_apart_in_noise(seed):
     table[released, COLUMNS.index("top_rad_s")] = speed
     found = evaluate(table, CASE, PROGRAM)
     assert found.damping == pytest.approx(0.226, abs=0.01)
-    assert found.outcome is Outcome.AS_PREDICTED
+    assert found.outcome is EvaluationOutcome.AS_PREDICTED
 
 
 def test_critical_speed_and_damping_are_read_off_the_rows():
     found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.15), CASE, PROGRAM)
-    assert found.outcome is Outcome.DIFFERS                   # by the damping, which is 0.15
+    assert found.outcome is EvaluationOutcome.DIFFERS                   # by the damping, which is 0.15
     assert "damping" in found.why
     assert (found.critical_rpm.value, found.critical_rpm.low) == (pytest.approx(57.2), pytest.approx(56.3))
     assert [one.turns for one in found.trials] == [True, False, False, True, True]
@@ -146,17 +146,18 @@ def test_critical_speed_and_damping_are_read_off_the_rows():
     assert found.damped_hz == pytest.approx(0.13, abs=1e-3)
     assert found.turning_rms_nm == pytest.approx(1000.0 / np.sqrt(2.0), rel=0.02)
     found = evaluate(rows(57.0, (60.0, 52.5, 56.3, 58.1, 57.2), damping=0.22), CASE, PROGRAM)
-    assert found.outcome is Outcome.AS_PREDICTED
+    assert found.outcome is EvaluationOutcome.AS_PREDICTED
 
 
 @pytest.mark.parametrize(("log", "outcome", "said"), [
-    (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), Outcome.DIFFERS, "critical speed 66.1 rpm, predicted 56 to 59"),
-    (rows(49.0, (49.5, 48.6), damping=0.22), Outcome.DIFFERS, "critical"),
-    (rows(40.0, ()), Outcome.NOT_FOUND, "did not stick"),
-    (rows(99.0, (60.0, 70.0)), Outcome.NOT_FOUND, "ended at 70 rpm, before the bit had ended turning"),
-    (rows(99.0, (60.0, 79.0)), Outcome.NOT_FOUND, "never ended turning"),
-    (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), Outcome.INVALID, "torque limit"),
-    (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), Outcome.INVALID, "nobody commanded"),
+    (rows(66.0, (68.0, 65.2, 66.1), damping=0.22), EvaluationOutcome.DIFFERS,
+     "critical speed 66.1 rpm, predicted 56 to 59"),
+    (rows(49.0, (49.5, 48.6), damping=0.22), EvaluationOutcome.DIFFERS, "critical"),
+    (rows(40.0, ()), EvaluationOutcome.NOT_FOUND, "did not stick"),
+    (rows(99.0, (60.0, 70.0)), EvaluationOutcome.NOT_FOUND, "ended at 70 rpm, before the bit had ended turning"),
+    (rows(99.0, (60.0, 79.0)), EvaluationOutcome.NOT_FOUND, "never ended turning"),
+    (rows(57.0, (57.5, 56.6), damping=0.22, clamped=1.0), EvaluationOutcome.INVALID, "torque limit"),
+    (rows(57.0, (57.5, 56.6), damping=0.22, unknown_nm=200.0), EvaluationOutcome.INVALID, "nobody commanded"),
 ], ids=["higher", "lower", "never stuck", "cut short", "never turned", "clamped", "another rig"])
 def test_the_verdict(log, outcome, said):
     found = evaluate(log, CASE, PROGRAM)
@@ -165,7 +166,7 @@ def test_the_verdict(log, outcome, said):
 
 def test_a_log_that_ends_early_has_no_critical_speed():
     whole = rows(57.0, (57.5, 56.6))
-    assert evaluate(whole[:300], CASE, PROGRAM).outcome is Outcome.NOT_FOUND
+    assert evaluate(whole[:300], CASE, PROGRAM).outcome is EvaluationOutcome.NOT_FOUND
     assert evaluate(whole[:1], CASE, PROGRAM).critical_rpm is None
     with pytest.raises(ValueError, match="never"):
         evaluate(whole[:0], CASE, PROGRAM)

@@ -113,12 +113,12 @@ def test_modes_in_time_are_the_poles(name):
 @pytest.mark.parametrize("law", [STIFF, SOFT_025, HALF], ids=["stiff", "soft", "half"])
 def test_sections_in_time_against_the_chain(law):
     """A jump of the set speed, through pipe, heavy pipe and collars, to the bit."""
-    from tdhil.soft_torque import Bottom, Section, StringFile, string_of
+    from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
-    sections = tuple(Section(length_m=length, outer_diameter_m=outer, inner_diameter_m=inner)
+    sections = tuple(PipeSection(length_m=length, outer_diameter_m=outer, inner_diameter_m=inner)
                      for length, outer, inner in ((2000.0, 0.127, 0.1086), (300.0, 0.127, 0.0762)))
-    collars = Section(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
-    string = string_of(StringFile(sections=sections, bottom=Bottom(
+    collars = PipeSection(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
+    string = string_of(StringFile(sections=sections, bottom=BottomEnd(
         sections=(collars,), viscous_nm_s_rad=30.0, coulomb_nm=0.0)))
     drive = TopDrive(1500.0, 8.0, 0.0, DRIVE.inner_lags_s)
     start = np.zeros((1, 1))
@@ -169,11 +169,11 @@ def test_a_bit_sticks_and_breaks_away_as_an_integration_from_event_to_event_says
 
 def test_a_bit_below_collars_sticks_and_slips_alike_in_finer_steps():
     """Collars as lines leave the bit next to no inertia of its own: half a tick of them; half as much does the same."""
-    from tdhil.soft_torque import Bottom, Section, StringFile, string_of
+    from tdhil.soft_torque import BottomEnd, PipeSection, StringFile, string_of
 
-    pipe = Section(length_m=1500.0, outer_diameter_m=0.127, inner_diameter_m=0.1086)
-    collars = Section(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
-    string = string_of(StringFile(sections=(pipe,), bottom=Bottom(sections=(collars,), **BIT)))
+    pipe = PipeSection(length_m=1500.0, outer_diameter_m=0.127, inner_diameter_m=0.1086)
+    collars = PipeSection(length_m=180.0, outer_diameter_m=0.203, inner_diameter_m=0.0714)
+    string = string_of(StringFile(sections=(pipe,), bottom=BottomEnd(sections=(collars,), **BIT)))
     target = np.array([[60.0 * RPM]])
     coarse, fine = (simulate(string, [(DRIVE, STIFF)], Begin("stuck", target), target, 1.0, 12.0, 0.05, tick)
                     for tick in (0.006, 0.003))

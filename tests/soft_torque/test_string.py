@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from profiles import DataFileError
-from tdhil.soft_torque import ClosedSystem, DrillString, Line, load_string, spring_and_mass, string_modes_hz
+from tdhil.soft_torque import ClosedSystem, DrillString, WaveLine, load_string, spring_and_mass, string_modes_hz
 from tests.soft_torque.cases import STRING, Pipe, chain_modes, lumped_chain, string_with
 
 GOOD = """\
@@ -131,7 +131,7 @@ def test_sections_of_different_impedance_against_the_chain(tmp_path, stuck):
 
 def test_cutting_a_section_changes_nothing():
     whole = STRING.lines[0]
-    parts = tuple(Line(length, whole.inertia_kg_m, whole.compliance_rad_nm_m, whole.drag_nm_s_rad_m)
+    parts = tuple(WaveLine(length, whole.inertia_kg_m, whole.compliance_rad_nm_m, whole.drag_nm_s_rad_m)
                   for length in (700.0, 1.0, 2299.0))
     cut = DrillString(parts, STRING.bottom_inertia_kg_m2, STRING.bottom_viscous_nm_s_rad)
     s = np.array([0.1j, 3.0 + 2.0j, -1.0 + 12.0j, 1e-7])
@@ -147,7 +147,7 @@ def test_every_string_takes_energy_and_gives_none(sections, inertia, viscous):
     lines = []
     for length, outer, bore, drag in sections:
         polar = pi / 32 * outer**4 * (1 - bore**4)
-        lines.append(Line(length, 7850 * polar, 1 / (79.3e9 * polar), drag))
+        lines.append(WaveLine(length, 7850 * polar, 1 / (79.3e9 * polar), drag))
     string = DrillString(tuple(lines), inertia, viscous)
     s = np.array([0.01 + 0.3j, 0.2 + 2.0j, 0.001 + 7.0j, 1.0, 0.5 + 30.0j])
     seen = string.impedance_at(s)

@@ -10,13 +10,13 @@ import pytest
 from tdhil.soft_torque import (
     RPM,
     Begin,
-    Course,
     HostController,
     HostLoop,
-    Observer,
+    IdentifiedRig,
     Phase,
-    Program,
-    Rig,
+    ProgramCourse,
+    RotorObserver,
+    SpeedProgram,
     TopDrive,
     VirtualString,
     control_law,
@@ -104,7 +104,7 @@ def test_the_controller_of_the_host_has_the_law_that_it_was_given(period_s):
 @pytest.mark.parametrize(("lag_s", "period_s"), [(0.4, 0.01), (0.4, 0.05), (0.02, 0.02), (0.0, 0.02)])
 def test_the_observer_finds_a_speed_that_is_reported_late_and_a_torque_that_nobody_told_it(lag_s, period_s):
     drive = TopDrive(1500.0, 8.0, 60.0)
-    observer = Observer(drive, lag_s, period_s)
+    observer = RotorObserver(drive, lag_s, period_s)
     observer.begin(5.0)
     speed = reported = 6.0
     fine = 50
@@ -142,8 +142,8 @@ def through(course, turns_from, *, sticks=True, longest_s=5000.0, period_s=0.1):
 
 @pytest.mark.parametrize("turns_from_rpm", [43.2, 50.0, 61.7])
 def test_the_course_finds_the_speed_from_which_the_bit_turns_to_one_rpm(turns_from_rpm):
-    program = Program(40.0 * RPM, 80.0 * RPM)
-    course = Course(program, 0.1)
+    program = SpeedProgram(40.0 * RPM, 80.0 * RPM)
+    course = ProgramCourse(program, 0.1)
     trials, phases = through(course, turns_from_rpm * RPM)
     assert phases[:7] == [Phase.ARM, Phase.HOLD, Phase.RAMP, Phase.STEADY, Phase.RELEASED, Phase.FADE_OUT, Phase.MOVE]
     assert phases[-2:] == [Phase.FADE_OUT, Phase.DONE]
@@ -154,17 +154,17 @@ def test_the_course_finds_the_speed_from_which_the_bit_turns_to_one_rpm(turns_fr
 
 
 def test_the_course_ends_where_the_bit_never_sticks_or_never_turns():
-    _, phases = through(Course(Program(40.0 * RPM, 60.0 * RPM), 0.1), 1e9, sticks=False)
+    _, phases = through(ProgramCourse(SpeedProgram(40.0 * RPM, 60.0 * RPM), 0.1), 1e9, sticks=False)
     assert phases == [Phase.ARM, Phase.HOLD, Phase.FADE_OUT, Phase.DONE]
-    trials, phases = through(Course(Program(40.0 * RPM, 60.0 * RPM), 0.1), 1e9)
+    trials, phases = through(ProgramCourse(SpeedProgram(40.0 * RPM, 60.0 * RPM), 0.1), 1e9)
     assert Phase.STEADY not in phases and phases[-1] is Phase.DONE
     assert max(trials) == pytest.approx(60.0 * RPM)
     assert len(trials) <= 8
 
 
 def test_the_set_speed_only_moves_on_ramps_and_the_string_only_fades():
-    program = Program(40.0 * RPM, 80.0 * RPM)
-    course = Course(program, 0.1)
+    program = SpeedProgram(40.0 * RPM, 80.0 * RPM)
+    course = ProgramCourse(program, 0.1)
     set_before, share_before = course.set_rad_s, course.share
     for tick in range(6000):
         course.step(course.set_rad_s < 55.0 * RPM and tick % 60 < 20)
@@ -198,13 +198,14 @@ def on_ideal_rotor(loop, program, rig, period_s, seconds, unknown_nm=0.0):
 
 
 @pytest.mark.parametrize("rig", [
-    Rig(1500.0, 8.0, 60.0, 0.4),
-    Rig(104.0, 8.0, 60.0, 0.4),                                # a bench of a fifteenth of the inertia
-    Rig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0),      # itself, at a motor that turns eight times as fast
+    IdentifiedRig(1500.0, 8.0, 60.0, 0.4),
+    IdentifiedRig(104.0, 8.0, 60.0, 0.4),                                # a bench of a fifteenth of the inertia
+    IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0),
+    # itself, at a motor that turns eight times as fast
 ], ids=["itself", "bench", "geared"])
 def test_the_loop_is_the_simulation_of_the_machine_that_is_meant(rig):
     """Bit and top over the first swings, at 50 rpm under a soft controller, against `simulate` with the same law."""
-    program = Program(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=2.0, hold_s=15.0)
+    program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=2.0, hold_s=15.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 1e6)
     rows, speeds = on_ideal_rotor(loop, program, rig, 0.02, 18.0)
     begun = int(np.flatnonzero(rows[:, 1] == Phase.HOLD)[0])
@@ -220,8 +221,8 @@ def test_the_loop_is_the_simulation_of_the_machine_that_is_meant(rig):
 
 
 def test_a_torque_limit_that_acts_shows_in_the_row():
-    rig = Rig(1500.0, 8.0, 60.0, 0.4)
-    program = Program(50.0 * RPM, 80.0 * RPM, settle_s=0.2, fade_s=1.0, hold_s=6.0)
+    rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)
+    program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=0.2, fade_s=1.0, hold_s=6.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 800.0)
     rows, _ = on_ideal_rotor(loop, program, rig, 0.02, 7.0)
     assert rows[:, 11].any()
@@ -230,8 +231,8 @@ def test_a_torque_limit_that_acts_shows_in_the_row():
 
 def test_fading_in_and_out_leaves_the_shaft_alone():
     """What comes in of the string's torque is met by as much of the drive's."""
-    rig = Rig(1500.0, 8.0, 60.0, 0.4)
-    program = Program(70.0 * RPM, 90.0 * RPM, settle_s=1.0, fade_s=3.0, hold_s=30.0)
+    rig = IdentifiedRig(1500.0, 8.0, 60.0, 0.4)
+    program = SpeedProgram(70.0 * RPM, 90.0 * RPM, settle_s=1.0, fade_s=3.0, hold_s=30.0)
     loop = HostLoop(STRING, DRIVE, SOFT_025, rig, program, 0.02, 1e6)
     rows, speeds = on_ideal_rotor(loop, program, rig, 0.02, 38.0)
     arming = rows[:, 1] == Phase.ARM
@@ -244,8 +245,8 @@ def test_fading_in_and_out_leaves_the_shaft_alone():
 @pytest.mark.parametrize(("gains", "unknown_nm"), [(1.0, (0.0, 120.0)), (1.6, (300.0, 2000.0))])
 def test_in_the_drives_own_loop_the_string_goes_through_the_offset_and_other_gains_show(gains, unknown_nm):
     """A drive under its own PI, with counts of the set speed that the host doesn't see."""
-    rig, period_s, fine = Rig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0), 0.02, 10
-    program = Program(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=8.0, armed_s=8.0, hold_s=15.0)
+    rig, period_s, fine = IdentifiedRig(1500.0 / 64.0, 8.0 / 64.0, 60.0 / 8.0, 0.4, 8.0), 0.02, 10
+    program = SpeedProgram(50.0 * RPM, 80.0 * RPM, settle_s=1.0, fade_s=8.0, armed_s=8.0, hold_s=15.0)
     host = HostLoop(STRING, DRIVE, SOFT_025, rig, program, period_s, 1e6, own_loop=True)
     speed = reported = program.start_rad_s * 8.0
     integral = 7.5 + 0.125 * speed

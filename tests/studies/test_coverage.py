@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tdhil.studies.coverage.bound import Bounds, Watched, bound_of, cramer_rao, density, information, slopes_of_unknown
-from tdhil.studies.coverage.plants import FLEET, Noise, Report
+from tdhil.studies.coverage.bound import (
+    Bounds,
+    WatchedSpeed,
+    bound_of,
+    cramer_rao,
+    density,
+    information,
+    slopes_of_unknown,
+)
+from tdhil.studies.coverage.plants import FLEET, PlantNoise, ReportFilter
 from tdhil.studies.coverage.simulate import SimulatedRun
 from tdhil.studies.coverage.study import (
     COVERAGE,
@@ -46,11 +54,12 @@ def test_the_fleet_spans_what_the_proof_asks() -> None:
 
 def test_the_bound_of_two_parameters_is_the_hand_computed_one() -> None:
     """One line, J and B free, all else known: F = 2|W|²/v · diag(ω², 1), so sd(J) = √(v/2)/(ω|W|)."""
-    plant = replace(PLANT["field"], speed_report=Report(), torque_report=Report(), noise=Noise(reported_torque_nm=2.0))
+    plant = replace(PLANT["field"], speed_report=ReportFilter(), torque_report=ReportFilter(),
+                    noise=PlantNoise(reported_torque_nm=2.0))
     hertz, wave, seconds = np.array([0.2]), 0.5, 100.0
     v = 4.0 * 2.0**2 / (plant.reading.rate_hz * seconds)      # of a complex line: 4 σ²/N
     assert density(plant, hertz)[0] == pytest.approx(2.0**2 / plant.reading.rate_hz)
-    one = Watched(3.0, np.array([wave + 0j]), seconds)
+    one = WatchedSpeed(3.0, np.array([wave + 0j]), seconds)
     fisher = information(plant, hertz, [one])
     levels = np.outer([3.0, 1.0], [3.0, 1.0]) * seconds * plant.reading.rate_hz / 2.0**2
     lines = fisher[:2, :2] - np.diag([0.0, levels[0, 0]])
@@ -74,10 +83,10 @@ def test_the_notes_design_has_about_the_notes_bound() -> None:
 def test_equal_poles_are_no_more_told_apart_for_being_equal() -> None:
     """Three equal poles leave the bound of who counts them singular, and hardly change that of who doesn't."""
     hertz = 0.1 * np.array([1.0, 2.0, 3.0, 5.0, 7.0, 10.0])
-    watched = [Watched(speed, np.full(6, 0.3 + 0j), 100.0) for speed in (3.0, 5.0)]
+    watched = [WatchedSpeed(speed, np.full(6, 0.3 + 0j), 100.0) for speed in (3.0, 5.0)]
     bounds = []
     for lags in ((0.20, 0.20, 0.20), (0.19, 0.20, 0.21)):
-        plant = replace(PLANT["three_poles"], speed_report=Report(lags))
+        plant = replace(PLANT["three_poles"], speed_report=ReportFilter(lags))
         slopes, plausible = slopes_of_unknown(plant, hertz)
         bounds.append(bound_of(information(plant, hertz, watched, slopes) + plausible))
     assert bound_of(information(PLANT["three_poles"], hertz, watched)) is None

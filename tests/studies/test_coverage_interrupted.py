@@ -141,4 +141,4 @@ def dies(task):
 def test_a_process_that_dies_ends_the_benchmark(monkeypatch):
     monkeypatch.setattr(simulate, "run_task", dies)
     with pytest.raises(TdhilError, match=r"process .* died.*SIGABRT.*fewer of them"):
-        list(simulate.run_all([simulate.Task(FLEET[0], 0, 1, 1, 2, 0.95)], 2))
+        list(simulate.run_all([simulate.SimulationTask(FLEET[0], 0, 1, 1, 2, 0.95)], 2))

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tdhil.studies.coverage.plants import FLEET, FloatArray, Noise, Reading, Report
+from tdhil.studies.coverage.plants import FLEET, FloatArray, HostSampling, PlantNoise, ReportFilter
 from tdhil.studies.coverage.simulate import coloured, lagged, quiet_shaft, shown, simulate
 
 STEP = 0.002
 PLANT = {plant.name: plant for plant in FLEET}
 
 
-def poles_by_scipy(report: Report, omega: float) -> complex:
+def poles_by_scipy(report: ReportFilter, omega: float) -> complex:
     """The poles from scipy; average and delay by their textbook forms."""
     from scipy.signal import freqs
 
@@ -27,18 +27,18 @@ def poles_by_scipy(report: Report, omega: float) -> complex:
 @pytest.mark.parametrize(
     "report",
     [
-        Report(),
-        Report((0.4,)),
-        Report((0.2, 0.07)),
-        Report((), 0.4),
-        Report((0.1,), 0.5),
-        Report((0.2,), 0.0, 0.04),
-        Report((0.15,), 0.3, 0.0137),
+        ReportFilter(),
+        ReportFilter((0.4,)),
+        ReportFilter((0.2, 0.07)),
+        ReportFilter((), 0.4),
+        ReportFilter((0.1,), 0.5),
+        ReportFilter((0.2,), 0.0, 0.04),
+        ReportFilter((0.15,), 0.3, 0.0137),
     ],
     ids=str,
 )
 @pytest.mark.parametrize("hertz", [0.1, 0.4, 2.0])
-def test_a_report_has_its_closed_form_frequency_response(report: Report, hertz: float) -> None:
+def test_a_report_has_its_closed_form_frequency_response(report: ReportFilter, hertz: float) -> None:
     time = np.arange(round(30.0 / STEP)) * STEP
     wave = np.cos(2.0 * np.pi * hertz * time)
     rng = np.random.default_rng(3)
@@ -129,6 +129,6 @@ def test_rounding_drops_and_rate_are_as_stated() -> None:
 
 
 def test_a_plant_whose_speed_reaches_zero_is_refused() -> None:
-    wild = replace(PLANT["field"], noise=Noise(load_nm=400.0, load_time_s=5.0), reading=Reading())
+    wild = replace(PLANT["field"], noise=PlantNoise(load_nm=400.0, load_time_s=5.0), reading=HostSampling())
     with pytest.raises(ValueError, match="reaches zero"):
         simulate(wild, [(1,), (2,)], 4)

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from scipy import integrate, signal
 
-from tdhil.studies.paper.loop import Chirp, LoopSettings, Multisine, Sine, Step, changed, reference_of, simulate
+from tdhil.studies.paper.loop import (
+    ChirpReference,
+    LoopSettings,
+    MultisineReference,
+    SineReference,
+    StepReference,
+    changed,
+    reference_of,
+    simulate,
+)
 from tdhil.studies.paper.processing import torque_line
 
 QUIET = LoopSettings(noise_power_nm2_s=0.0, coulomb_nm=0.0, duration_s=4.0)
@@ -26,7 +35,7 @@ def test_without_dry_friction_it_is_a_linear_system():
 def test_with_dahl_friction_it_is_the_papers_equations():
     """Integrated by another program: e, ∫e, ω and z of equations 4, 6, 9 and 10."""
     run = changed(QUIET, coulomb_nm=82.4, duration_s=3.0)
-    reference = Sine(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
+    reference = SineReference(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
     limit = run.coulomb_nm / run.dahl_stiffness_nm_rad
 
     def slope(t, x):
@@ -83,12 +92,12 @@ def test_progress_runs_from_zero_towards_one():
 
 def test_references():
     time = np.linspace(0.0, 10.0, 10_001)
-    assert np.allclose(Sine(2.0, 0.5, 0.25).at(time), 2.0 + 0.5 * np.sin(0.5 * np.pi * time))
-    step = Step(1.0, 3.0, 2.5).at(time)
+    assert np.allclose(SineReference(2.0, 0.5, 0.25).at(time), 2.0 + 0.5 * np.sin(0.5 * np.pi * time))
+    step = StepReference(1.0, 3.0, 2.5).at(time)
     assert (step[2499], step[2500]) == (1.0, 3.0)
-    chirp = Chirp(0.0, 2.0, 0.5, 2.0, 10.0)
+    chirp = ChirpReference(0.0, 2.0, 0.5, 2.0, 10.0)
     assert np.allclose(chirp.at(time), 2.0 * signal.chirp(time, 0.5, 10.0, 2.0, phi=-90.0), atol=1e-9)
-    many = Multisine(3.0, 0.5, 0.1)
+    many = MultisineReference(3.0, 0.5, 0.1)
     assert np.abs(many.at(time) - 3.0).max() == pytest.approx(0.5, rel=1e-4)
     lines = np.abs(np.fft.rfft(many.at(time[:-1]) - 3.0))
     assert set(np.flatnonzero(lines > 1e-6 * lines.max())) == {1, 2, 3, 4}
@@ -96,8 +105,8 @@ def test_references():
 
 def test_each_signal_by_name():
     kinds = {name: reference_of(changed(QUIET, signal=name)) for name in ("sine", "step", "chirp", "multisine")}
-    assert {name: type(kind).__name__.lower() for name, kind in kinds.items()} == {name: name for name in kinds}
-    assert kinds["step"] == Step(QUIET.offset_rad_s, QUIET.offset_rad_s + 1.0, 0.25)
+    assert [type(kind).__name__.lower() for kind in kinds.values()] == [f"{name}reference" for name in kinds]
+    assert kinds["step"] == StepReference(QUIET.offset_rad_s, QUIET.offset_rad_s + 1.0, 0.25)
     assert kinds["chirp"].period_s is None
     for name in kinds:
         record = simulate([changed(QUIET, signal=name, duration_s=2.0)])

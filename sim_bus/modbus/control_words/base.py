@@ -9,14 +9,14 @@ the profile says only how the drive has been wired by its user (`Wiring`).
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_bus.cia402 import FAULT_RESET, Application, Command, Mode, State
+from sim_bus.cia402 import FAULT_RESET, Application, DeviceCommand, OperationMode, State
 
 _WORDS = {
-    Command.SHUTDOWN: 0x0006,
-    Command.SWITCH_ON: 0x0007,
-    Command.ENABLE: 0x000F,
-    Command.QUICK_STOP: 0x0002,
-    Command.DISABLE_VOLTAGE: 0x0000,
+    DeviceCommand.SHUTDOWN: 0x0006,
+    DeviceCommand.SWITCH_ON: 0x0007,
+    DeviceCommand.ENABLE: 0x000F,
+    DeviceCommand.QUICK_STOP: 0x0002,
+    DeviceCommand.DISABLE_VOLTAGE: 0x0000,
 }
 AT_SETPOINT_RAD_S = 0.1
 
@@ -48,7 +48,7 @@ class Extra:
     write: Callable[[int], None] | None = None
 
 
-class Words:
+class ControlWords:
     """A family. `write` takes a control word, `status` gives the status word."""
 
     shutdown_option = 1
@@ -92,7 +92,7 @@ class Words:
 
     # -- for the families ----------------------------------------------------------------------------------
 
-    def order(self, command: Command, *, reset: bool = False) -> None:
+    def order(self, command: DeviceCommand, *, reset: bool = False) -> None:
         """A command to the power side."""
         self.set_quick_stop()
         self.application.write_controlword(_WORDS[command] | (FAULT_RESET if reset else 0))
@@ -117,8 +117,8 @@ class Words:
         """Torque where everything that selects says so; no change while enabled on drives that don't allow it."""
         wiring = self.wiring
         said = [self._word_says_torque] * bool(wiring.torque_bits) + [self.register_says_torque] * wiring.mode_register
-        speed = Mode.PROFILE_VELOCITY if self.wiring.ramps else Mode.CYCLIC_VELOCITY
-        mode = Mode.CYCLIC_TORQUE if said and all(said) else speed
+        speed = OperationMode.PROFILE_VELOCITY if self.wiring.ramps else OperationMode.CYCLIC_VELOCITY
+        mode = OperationMode.CYCLIC_TORQUE if said and all(said) else speed
         if mode is not self.application.mode and (wiring.switch_while_enabled or not self.application.energised):
             self.application.set_mode(mode.value)
             self.set_quick_stop()
@@ -133,7 +133,7 @@ class Words:
     @property
     def torque(self) -> bool:
         """Torque is regulated, or would be."""
-        return self.application.mode is Mode.CYCLIC_TORQUE
+        return self.application.mode is OperationMode.CYCLIC_TORQUE
 
     @property
     def state(self) -> State:
@@ -162,7 +162,7 @@ class Words:
         return self.follows and not self.torque and abs(control.reference - control.filtered_rad_s) < AT_SETPOINT_RAD_S
 
 
-class StartStop(Words):
+class StartStop(ControlWords):
     """A family whose word says run or stop by level.
 
     After the drive has stopped by itself a run command must be seen to go before it counts again; manuals say so of
@@ -181,25 +181,25 @@ class StartStop(Words):
         if self._blocked or self.faulted:
             return
         if self.state is not State.ENABLED:
-            self.order(Command.SHUTDOWN)
-        self.order(Command.ENABLE)
+            self.order(DeviceCommand.SHUTDOWN)
+        self.order(DeviceCommand.ENABLE)
 
     def ramp_stop(self) -> None:
         """Down a ramp, then no torque."""
         self._blocked = False
-        self.order(Command.SHUTDOWN)
+        self.order(DeviceCommand.SHUTDOWN)
 
     def quick_stop(self) -> None:
         """Down the quick-stop ramp, then no torque."""
         self._blocked = False
-        self.order(Command.QUICK_STOP)
+        self.order(DeviceCommand.QUICK_STOP)
 
     def coast(self) -> None:
         """No torque at once."""
         self._blocked = False
-        self.order(Command.DISABLE_VOLTAGE)
+        self.order(DeviceCommand.DISABLE_VOLTAGE)
 
     def reset(self) -> None:
         """Out of fault."""
-        self.order(Command.DISABLE_VOLTAGE)
-        self.order(Command.DISABLE_VOLTAGE, reset=True)
+        self.order(DeviceCommand.DISABLE_VOLTAGE)
+        self.order(DeviceCommand.DISABLE_VOLTAGE, reset=True)

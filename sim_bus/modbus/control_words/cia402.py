@@ -1,11 +1,11 @@
 """CiA 402 words over Modbus (CiA 402-2; Schneider's CMD and ETA, Lenze's, our own generic map)."""
 
-from sim_bus.modbus.control_words.base import Words
+from sim_bus.modbus.control_words.base import ControlWords
 
 _OF_THE_MODE = 0x3000
 
 
-class Cia402Words(Words):
+class Cia402Words(ControlWords):
     """Controlword and statusword as in `sim_bus.cia402`; the power side speaks them by itself.
 
     Option codes are the standard's defaults: shutdown coasts, disabling operation goes down the ramp. Whether the drive

@@ -21,14 +21,14 @@ acts, and bit 1 goes on ABB (OFF1 active) and stays on PROFIdrive. Bits 4 to 6 o
 ramp is simulated.
 """
 
-from sim_bus.cia402 import Command, State
-from sim_bus.modbus.control_words.base import Words
+from sim_bus.cia402 import DeviceCommand, State
+from sim_bus.modbus.control_words.base import ControlWords
 
 _OFF1, _OFF2, _OFF3, _ENABLE, _RESET, _BUS = 0x0001, 0x0002, 0x0004, 0x0008, 0x0080, 0x0400
 _EXT2 = 0x0800
 
 
-class ProfidriveWords(Words):
+class ProfidriveWords(ControlWords):
     """SINAMICS."""
 
     def obey(self, before: int, word: int) -> None:
@@ -42,13 +42,13 @@ class ProfidriveWords(Words):
     def _off_bits(self, before: int, word: int) -> None:
         reset = bool(word & ~before & _RESET)
         if not word & _OFF2:
-            self.order(Command.DISABLE_VOLTAGE, reset=reset)
+            self.order(DeviceCommand.DISABLE_VOLTAGE, reset=reset)
         elif not word & _OFF3:
-            self.order(Command.QUICK_STOP, reset=reset)
+            self.order(DeviceCommand.QUICK_STOP, reset=reset)
         elif not word & _OFF1:
-            self.order(Command.SHUTDOWN, reset=reset)
+            self.order(DeviceCommand.SHUTDOWN, reset=reset)
         else:
-            self.order(Command.ENABLE if word & _ENABLE else Command.SWITCH_ON, reset=reset)
+            self.order(DeviceCommand.ENABLE if word & _ENABLE else DeviceCommand.SWITCH_ON, reset=reset)
 
     def status(self) -> int:
         control = self.application.inverter.control

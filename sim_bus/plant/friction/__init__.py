@@ -1,6 +1,7 @@
 """Dry friction of one shaft: a file for each model, with its equation, units and source.
 
-Each has the same two functions, of a `Shaft` and its state, under a torque ``drive`` that is constant over the step::
+Each has the same two functions, of a `ShaftParams` and its state, under a torque ``drive`` that is constant over the
+step::
 
     advance(shaft, speed, bristle, drive, dt) -> (speed, bristle, travel)      rad/s, rad, rad
     torque(shaft, speed, bristle, drive)      -> N·m against motion, viscous friction not in it
@@ -16,31 +17,31 @@ Each has the same two functions, of a `Shaft` and its state, under a torque ``dr
 from collections.abc import Callable
 
 from sim_bus.plant.friction import coulomb, dahl, lugre, stribeck
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction.shaft import ShaftParams
 
-__all__ = ["Advance", "Shaft", "advance", "advance_of", "torque"]
+__all__ = ["Advance", "ShaftParams", "advance", "advance_of", "torque"]
 
-Advance = Callable[[Shaft, float, float, float, float], tuple[float, float, float]]
+Advance = Callable[[ShaftParams, float, float, float, float], tuple[float, float, float]]
 
 _ADVANCE: dict[str, Advance] = {
     "coulomb": coulomb.advance, "stribeck": stribeck.advance, "dahl": dahl.advance, "lugre": lugre.advance,
 }
-_TORQUE: dict[str, Callable[[Shaft, float, float, float], float]] = {
+_TORQUE: dict[str, Callable[[ShaftParams, float, float, float], float]] = {
     "coulomb": coulomb.torque, "stribeck": stribeck.torque, "dahl": dahl.torque, "lugre": lugre.torque,
 }
 
 
-def advance_of(shaft: Shaft) -> Advance:
+def advance_of(shaft: ShaftParams) -> Advance:
     """The function that moves this shaft on; without dry friction it is Coulomb's, with F_c = 0."""
     return _ADVANCE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.advance
 
 
-def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     return advance_of(shaft)(shaft, speed, bristle, drive, dt_s)
 
 
-def torque(shaft: Shaft, speed: float, bristle: float, drive: float = 0.0) -> float:
+def torque(shaft: ShaftParams, speed: float, bristle: float, drive: float = 0.0) -> float:
     """Dry friction in N·m, as it acts against motion; where the model sticks, at rest it balances ``drive``."""
     of_model = _TORQUE[shaft.friction] if shaft.coulomb_nm > 0.0 else coulomb.torque
     return of_model(shaft, speed, bristle, drive)

@@ -23,14 +23,14 @@ The travel is the momentum's balance, B ∫ω dt = (u − s F_c) h − J (ω(h) 
 
 from math import copysign, expm1, log1p
 
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction.shaft import ShaftParams
 
 TINY = 1e-15
 """Below this share an exponential is its first term to the last bit, and quotients would underflow."""
 LIGHTLY_DAMPED = 0.02
 
 
-def advance(shaft: Shaft, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
     dry = shaft.coulomb_nm
     if speed == 0.0:
@@ -61,7 +61,7 @@ def advance(shaft: Shaft, speed: float, _bristle: float, drive: float, dt_s: flo
     return end, 0.0, travel + more
 
 
-def torque(shaft: Shaft, speed: float, _bristle: float, drive: float) -> float:
+def torque(shaft: ShaftParams, speed: float, _bristle: float, drive: float) -> float:
     """Dry friction, N·m, against motion; at rest it balances ``drive``."""
     if speed == 0.0:
         return max(-shaft.coulomb_nm, min(shaft.coulomb_nm, drive))

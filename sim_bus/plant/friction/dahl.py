@@ -21,12 +21,12 @@ slow against the piece; σ h²/J ≤ 0.005 keeps them exact to 1e-4, a stiffer o
 from math import ceil, copysign, exp, expm1, sqrt
 
 from sim_bus.plant.friction.coulomb import TINY
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction.shaft import ShaftParams
 
 _SLOW = 0.005
 
 
-def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     stiff = shaft.dahl_stiffness_nm_rad * dt_s * dt_s
     if stiff > _SLOW * shaft.inertia_kg_m2:
@@ -46,12 +46,12 @@ def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: floa
     return end, bristle_end, 0.5 * (speed * crossing + end * rest)
 
 
-def torque(shaft: Shaft, _speed: float, bristle: float, _drive: float) -> float:
+def torque(shaft: ShaftParams, _speed: float, bristle: float, _drive: float) -> float:
     """Dry friction, N·m."""
     return shaft.dahl_stiffness_nm_rad * bristle
 
 
-def _piece(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float]:
+def _piece(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float]:
     """(speed, bristle) after ``dt_s`` in which the speed keeps its sign."""
     stiffness = shaft.dahl_stiffness_nm_rad
     limit = shaft.coulomb_nm / stiffness

@@ -25,7 +25,7 @@ by σ0 h · min(h/2J, 1/(B + σ1)), which pieces keep below 0.1; pieces are cut 
 
 from math import ceil, copysign, exp, expm1, sqrt
 
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction.shaft import ShaftParams
 from sim_bus.plant.friction.stribeck import sliding
 
 _CONTRACTION = 0.1
@@ -34,7 +34,7 @@ _MOST_PIECES = 400
 _SHORT = 1e-3
 
 
-def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def advance(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, bristle, travel) after ``dt_s`` under the constant torque ``drive``."""
     count = _pieces(shaft, dt_s)
     travel = 0.0
@@ -44,13 +44,13 @@ def advance(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: floa
     return speed, bristle, travel
 
 
-def torque(shaft: Shaft, speed: float, bristle: float, _drive: float) -> float:
+def torque(shaft: ShaftParams, speed: float, bristle: float, _drive: float) -> float:
     """Dry friction with the bristle's damper, N·m; viscous friction is not in it."""
     bend = speed - shaft.lugre_stiffness_nm_rad * abs(speed) * bristle / sliding(shaft, speed)
     return shaft.lugre_stiffness_nm_rad * bristle + shaft.lugre_damping_nm_s_rad * bend
 
 
-def _pieces(shaft: Shaft, dt_s: float) -> int:
+def _pieces(shaft: ShaftParams, dt_s: float) -> int:
     """How many pieces make the passes converge, on the spring and on the falling branch (at most 0.86 ΔF/ω_s)."""
     inertia, stiffness = shaft.inertia_kg_m2, shaft.lugre_stiffness_nm_rad
     damping = shaft.viscous_nm_s_rad + shaft.lugre_damping_nm_s_rad
@@ -60,7 +60,9 @@ def _pieces(shaft: Shaft, dt_s: float) -> int:
     return max(1, min(_MOST_PIECES, ceil(dt_s * max(min(by_inertia, by_damping), falling))))
 
 
-def _through_zero(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def _through_zero(
+    shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float
+) -> tuple[float, float, float]:
     end, bristle_end, travel = _piece(shaft, speed, bristle, drive, dt_s)
     if speed * end >= 0.0:
         return end, bristle_end, travel
@@ -70,7 +72,7 @@ def _through_zero(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s
     return end, bristle_end, travel + more
 
 
-def _piece(shaft: Shaft, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def _piece(shaft: ShaftParams, speed: float, bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, bristle, travel) after ``dt_s`` in which the speed keeps its sign."""
     stiffness, damping = shaft.lugre_stiffness_nm_rad, shaft.lugre_damping_nm_s_rad
     viscous, inertia = shaft.viscous_nm_s_rad, shaft.inertia_kg_m2

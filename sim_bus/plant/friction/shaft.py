@@ -7,7 +7,7 @@ from pydantic import model_validator
 from profiles import NonNegative, Positive, Validated, refuse_if
 
 
-class Shaft(Validated):
+class ShaftParams(Validated):
     """One inertia with viscous friction and one model of dry friction; parameters of other models are not looked at.
 
     ``coulomb_nm`` of 0 switches dry friction off, whatever the model.

@@ -22,7 +22,7 @@ one or a few pieces per step of 2 ms on a rig of some kg·m², two hundred where
 
 from math import copysign, exp, expm1, log1p
 
-from sim_bus.plant.friction.shaft import Shaft
+from sim_bus.plant.friction.shaft import ShaftParams
 
 _SHORT = 1e-3
 _FINE = 0.02
@@ -31,13 +31,13 @@ _BENT = 3.0
 """Beyond this many ω_s friction is Coulomb's to 1e-4 of F_s − F_c."""
 
 
-def sliding(shaft: Shaft, speed: float) -> float:
+def sliding(shaft: ShaftParams, speed: float) -> float:
     """Torque against sliding at ``speed``, N·m, positive."""
     falls = shaft.static_nm - shaft.coulomb_nm
     return shaft.coulomb_nm + falls * exp(-((speed / shaft.stribeck_speed_rad_s) ** 2))
 
 
-def advance(shaft: Shaft, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
+def advance(shaft: ShaftParams, speed: float, _bristle: float, drive: float, dt_s: float) -> tuple[float, float, float]:
     """(speed, 0, travel) after ``dt_s`` under the constant torque ``drive``."""
     static, width = shaft.static_nm, shaft.stribeck_speed_rad_s
     viscous, inertia, coulomb = shaft.viscous_nm_s_rad, shaft.inertia_kg_m2, shaft.coulomb_nm
@@ -80,7 +80,7 @@ def advance(shaft: Shaft, speed: float, _bristle: float, drive: float, dt_s: flo
     return speed, 0.0, travel
 
 
-def torque(shaft: Shaft, speed: float, _bristle: float, drive: float) -> float:
+def torque(shaft: ShaftParams, speed: float, _bristle: float, drive: float) -> float:
     """Dry friction, N·m, against motion; at rest it balances ``drive``."""
     if speed == 0.0:
         return max(-shaft.static_nm, min(shaft.static_nm, drive))

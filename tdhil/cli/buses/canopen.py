@@ -10,7 +10,7 @@ from tdhil.cli.scan_common import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
     from profiles import Profile
-    from tdhil.cli.doctor_finding import Finding
+    from tdhil.cli.doctor_finding import DoctorFinding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
 
@@ -59,7 +59,7 @@ class CanopenCommands(BusCommands):
 
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
-    ) -> Iterator[Finding]:
+    ) -> Iterator[DoctorFinding]:
         """Link or bit rate, adapter, drive."""
         from drivers import TdhilError
         from tdhil.cli.buses import canopen_doctor

@@ -6,11 +6,11 @@ import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from drivers import NO_WATCHDOG_FLAG, CommunicationLost, MonotonicClock, ObjectRefused, Table
+from drivers import NO_WATCHDOG_FLAG, CommunicationLost, MonotonicClock, ObjectRefused, PreflightTable
 from drivers.canopen import CanLink, Objects, State, check_parameters, decode, find_units, name
 from profiles import MARKER_INDEX, MARKER_TEXT
 from profiles.canopen import CanopenProfile
-from tdhil.cli.doctor_finding import Finding, Grade, bad, note, of_check, ok
+from tdhil.cli.doctor_finding import DoctorFinding, Grade, bad, note, of_check, ok
 
 if TYPE_CHECKING:
     import can
@@ -25,7 +25,7 @@ _STATES: dict[str, tuple[Grade, str]] = {
 _UNKNOWN_STATE: tuple[Grade, str] = ("note", "")
 
 
-def link_findings(text: str | None, channel: str) -> Iterator[Finding]:
+def link_findings(text: str | None, channel: str) -> Iterator[DoctorFinding]:
     """What ``ip -details -json link show`` says of a SocketCAN link; None where it can't be asked."""
     link = _link(text, channel)
     if link is None:
@@ -37,7 +37,7 @@ def link_findings(text: str | None, channel: str) -> Iterator[Finding]:
     state = data.get("state")
     if isinstance(state, str):
         grade, step = _STATES.get(state, _UNKNOWN_STATE)
-        yield Finding(grade, "bus state", state, step.format(channel))
+        yield DoctorFinding(grade, "bus state", state, step.format(channel))
     counters = _below(data, "berr_counter")
     if counters:
         sent, received = counters.get("tx", 0), counters.get("rx", 0)
@@ -48,7 +48,7 @@ def link_findings(text: str | None, channel: str) -> Iterator[Finding]:
         )
 
 
-def rate_finding(bitrate: int | None, source: str) -> Finding:
+def rate_finding(bitrate: int | None, source: str) -> DoctorFinding:
     """Of an adapter that sets the bit rate itself."""
     if bitrate is None:
         return note("bit rate", "not named: the interface's own default", "Name the bus's with -b, such as -b 500000")
@@ -57,7 +57,7 @@ def rate_finding(bitrate: int | None, source: str) -> Finding:
 
 def drive_findings(
     bus: can.BusABC, profile: CanopenProfile, node: int, rated_torque_nm: float | None
-) -> Iterator[Finding]:
+) -> Iterator[DoctorFinding]:
     """The drive itself. Raises CommunicationLost where it doesn't answer; nothing is written."""
     link = CanLink(bus, MonotonicClock())
     objects = Objects(link, node)
@@ -75,7 +75,7 @@ def drive_findings(
     yield from _identity(objects, profile)
     yield from _watchdog(objects, profile)
     yield _modes(objects, profile)
-    table = Table()
+    table = PreflightTable()
     find_units(table, objects, profile, rated_torque_nm)
     check_parameters(table, objects, profile)
     yield from map(of_check, table.checks)
@@ -84,7 +84,7 @@ def drive_findings(
         yield note("error frames", f"{link.error_frames} seen", "Check bit rate, termination and cable")
 
 
-def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
+def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     found = {part: objects.read_if_there(0x1018, sub) for sub, part in ((1, "vendor"), (2, "product"), (3, "revision"))}
     text = ", ".join(f"{part} {value:X}h" for part, value in found.items() if value is not None) or "not told"
     wrong = [
@@ -101,7 +101,7 @@ def _identity(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
     yield note("peer", "SIMULATED: bears the simulator's marker") if marked else ok("peer", "no simulator")
 
 
-def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
+def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[DoctorFinding]:
     dog = profile.watchdog
     if dog.kind == "none":
         yield bad("watchdog", f"profile {profile.name} knows none",
@@ -120,7 +120,7 @@ def _watchdog(objects: Objects, profile: CanopenProfile) -> Iterator[Finding]:
             yield bad("watchdog", f"the drive has no {name(*at)}", step)
 
 
-def _modes(objects: Objects, profile: CanopenProfile) -> Finding:
+def _modes(objects: Objects, profile: CanopenProfile) -> DoctorFinding:
     supported = objects.read_if_there(0x6502)
     if supported is None:
         return note("modes", "the drive does not tell which it has (6502h)")
@@ -130,7 +130,7 @@ def _modes(objects: Objects, profile: CanopenProfile) -> Finding:
     return ok("modes", text) if speed else bad("modes", text, "None regulates speed: is this the drive's profile?")
 
 
-def _state(objects: Objects) -> Finding:
+def _state(objects: Objects) -> DoctorFinding:
     state = decode(objects.read(0x6041))
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
         code = objects.read_if_there(0x603F)

@@ -12,7 +12,7 @@ from tdhil.cli.scan_common import BusCommands, FoundDrive, ValueSeen
 
 if TYPE_CHECKING:
     from profiles import Profile
-    from tdhil.cli.doctor_finding import Finding
+    from tdhil.cli.doctor_finding import DoctorFinding
     from tdhil.config import Rig, RunOptions
     from tdhil.session import Connection, PeerPlan
 
@@ -48,7 +48,7 @@ class ModbusCommands(BusCommands):
 
     def findings(
         self, plan: PeerPlan, connection: Connection, options: RunOptions, rig: Rig | None, seen: list[ValueSeen]
-    ) -> Iterator[Finding]:
+    ) -> Iterator[DoctorFinding]:
         """Line, drive, and each register of the profile."""
         from drivers import Clock, MonotonicClock, SteppedClock, TdhilError
         from tdhil.cli.buses import modbus_doctor

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers import NO_WATCHDOG_FLAG, ObjectRefused, PowerState, Table
+from drivers import NO_WATCHDOG_FLAG, ObjectRefused, PowerState, PreflightTable
 from drivers.modbus import (
-    Access,
     Link,
+    RegisterAccess,
     check_name_plate,
     check_required,
     decode,
@@ -22,7 +22,7 @@ from drivers.modbus import (
     settle,
 )
 from profiles.modbus import ModbusProfile, Parameter
-from tdhil.cli.doctor_finding import Finding, bad, note, of_check, ok
+from tdhil.cli.doctor_finding import DoctorFinding, bad, note, of_check, ok
 from tdhil.cli.profile_text import RegisterUse, register_uses, unit_text, watchdog_text
 
 
@@ -57,12 +57,12 @@ class RegisterSeen:
         }
 
 
-def access_of(link: Link, profile: ModbusProfile, unit: int) -> Access:
+def access_of(link: Link, profile: ModbusProfile, unit: int) -> RegisterAccess:
     """The drive's registers, for reading."""
-    return Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
+    return RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
 
 
-def read_registers(access: Access, profile: ModbusProfile, given: dict[str, float]) -> tuple[RegisterSeen, ...]:
+def read_registers(access: RegisterAccess, profile: ModbusProfile, given: dict[str, float]) -> tuple[RegisterSeen, ...]:
     """Every register of the profile, one by one: one that is refused hides no other."""
     uses = register_uses(profile)
     counts: dict[str, int] = {}
@@ -86,9 +86,9 @@ def read_registers(access: Access, profile: ModbusProfile, given: dict[str, floa
 
 
 def drive_findings(
-    access: Access, profile: ModbusProfile, unit: int, given: dict[str, float], rated_torque_nm: float | None,
+    access: RegisterAccess, profile: ModbusProfile, unit: int, given: dict[str, float], rated_torque_nm: float | None,
     keep: Callable[[tuple[RegisterSeen, ...]], None],
-) -> Iterator[Finding]:
+) -> Iterator[DoctorFinding]:
     """Raises CommunicationLost where it doesn't answer. ``keep`` gets what stands in the registers."""
     try:
         word = access.read(profile.cycle.status.register_)
@@ -108,7 +108,7 @@ def drive_findings(
         yield bad("registers", said, f"Compare them with the drive's manual; is {profile.name} its profile?")
     else:
         yield ok("registers", f"all {len(found)} of profile {profile.name} can be read")
-    table = Table()
+    table = PreflightTable()
     parameters = read_parameters(table, access, profile, given)
     check_required(table, profile, parameters)
     rated_nm = find_rated_torque(table, profile, parameters, rated_torque_nm)
@@ -128,7 +128,7 @@ def _value(use: RegisterUse, raw: int | None, values: Mapping[str, float]) -> fl
     return None if factor is None else raw * use.per_lsb * factor
 
 
-def _state(profile: ModbusProfile, word: int) -> Finding:
+def _state(profile: ModbusProfile, word: int) -> DoctorFinding:
     """As the status word shows it."""
     state = power_state(decode(profile.control, word))
     said = f"{state.value} (status word {word:04X}h)"
@@ -142,7 +142,7 @@ def _state(profile: ModbusProfile, word: int) -> Finding:
     return ok("state", said)
 
 
-def _watchdog(profile: ModbusProfile, values: Mapping[str, float]) -> Finding:
+def _watchdog(profile: ModbusProfile, values: Mapping[str, float]) -> DoctorFinding:
     dog = profile.watchdog
     if dog.kind == "none":
         return bad("watchdog", f"profile {profile.name} knows none",

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from drivers import Clock, CommunicationLost, MonotonicClock, PreflightRefused, SteppedClock, Table
+from drivers import Clock, CommunicationLost, MonotonicClock, PreflightRefused, PreflightTable, SteppedClock
 from drivers.modbus import (
     READ_HOLDING,
     READ_INPUT,
-    Access,
     BadReply,
     Link,
     NoReply,
     Parameters,
+    RegisterAccess,
     check_name_plate,
     find_rated_torque,
     from_words,
@@ -54,7 +54,7 @@ _IDENTIFY = bytes((0x2B, 0x0E, 0x01, 0x00))
 
 
 @dataclass(frozen=True)
-class Fit:
+class ProfileFit:
     """How well a profile suits a drive: all its registers answer, and its name plate fits (None: it names none)."""
 
     profile: str
@@ -92,7 +92,7 @@ def identify(link: Link, unit: int, transport: str, line: dict[str, Any]) -> Fou
     """Name and profile of a unit that answered."""
     vendor, product, revision = device_identification(link, unit)
     said = " ".join(part for part in (vendor, product, revision) if part)
-    plain = Access(link, unit, "high_first", frozenset({READ_HOLDING}))
+    plain = RegisterAccess(link, unit, "high_first", frozenset({READ_HOLDING}))
     simulated = False
     with contextlib.suppress(CommunicationLost):
         simulated = read_marker(plain).simulated
@@ -102,7 +102,7 @@ def identify(link: Link, unit: int, transport: str, line: dict[str, Any]) -> Fou
                       profile, why, line=line)
 
 
-def choose(fits: Sequence[Fit]) -> tuple[str | None, str]:
+def choose(fits: Sequence[ProfileFit]) -> tuple[str | None, str]:
     """(profile, why): by name and name plate. Registers that merely answer are no reason."""
     good = [fit for fit in fits if fit.plate is not False]
     ranked = sorted(good, key=lambda fit: (fit.plate is True, fit.named), reverse=True)
@@ -146,10 +146,10 @@ def _profiles(transport: str) -> list[ModbusProfile]:
     return [profile for profile in found if transport in profile.line.transports]
 
 
-def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> Fit | None:
+def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> ProfileFit | None:
     """None as soon as one of the profile's registers can't be read."""
     counts: dict[str, int] = {}
-    access = Access(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
+    access = RegisterAccess(link, unit, profile.line.word_order, frozenset(profile.cycle.functions))
     for use in register_uses(profile):
         try:
             raw = _read_once(access, use.register, profile)
@@ -158,10 +158,10 @@ def _fit(link: Link, unit: int, profile: ModbusProfile, vendor: str) -> Fit | No
         if use.name.startswith("parameters."):
             counts[use.name.partition(".")[2]] = raw
     maker = profile.name.partition("/")[0]
-    return Fit(profile.name, _plate(profile, counts), bool(vendor) and maker in vendor.lower())
+    return ProfileFit(profile.name, _plate(profile, counts), bool(vendor) and maker in vendor.lower())
 
 
-def _read_once(access: Access, register: Register, profile: ModbusProfile) -> int:
+def _read_once(access: RegisterAccess, register: Register, profile: ModbusProfile) -> int:
     """Without the patience of a preflight: a scan asks many that aren't there."""
     function = READ_HOLDING if register.table == "holding" else READ_INPUT
     words = access.once(read(function, register.address, register.count), ANSWER_S).words
@@ -171,7 +171,7 @@ def _read_once(access: Access, register: Register, profile: ModbusProfile) -> in
 def _plate(profile: ModbusProfile, counts: dict[str, int]) -> bool | None:
     if profile.name_plate is None:
         return None
-    table = Table()
+    table = PreflightTable()
     found = Parameters(counts, settle(profile, counts, {}))
     rated_nm = find_rated_torque(table, profile, found, None)
     if rated_nm is None and profile.parameter(profile.name_plate.torque).unit == "rated":

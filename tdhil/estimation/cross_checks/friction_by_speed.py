@@ -1,6 +1,6 @@
 """Friction over speed, at every steady speed that the run saw, and whether it is the straight line that B takes it for.
 
-Over a stretch with weight w(t) (`momentum_rows`) the balance of momentum gives friction free of lags,
+Over a stretch with weight w(t) (`momentum.BalanceRow`) the balance of momentum gives friction free of lags,
 
     T_f = (∫w T − J (Δω + δ Δα)) / ∫w     at     ω = ∫w ω / ∫w,     variance D ∫w² / (∫w)²,
 
@@ -22,8 +22,8 @@ import numpy as np
 
 from tdhil.estimation.cross_checks.momentum import (
     KNOT_S,
-    Kind,
-    Row,
+    BalanceKind,
+    BalanceRow,
     balances,
     block_means,
     drifting_spans,
@@ -56,7 +56,7 @@ class Inertia:
 
 
 @dataclass(frozen=True)
-class Point:
+class FrictionStretch:
     """Speed (rad/s) and friction torque (N·m) of one stretch, or of several at one speed."""
 
     speed: float
@@ -65,7 +65,7 @@ class Point:
     swing: float              # var ω, (rad/s)²
 
 
-def steady_points(recording: Recording, samples: Samples, inertia: Inertia, density: float) -> list[Point]:
+def steady_points(recording: Recording, samples: Samples, inertia: Inertia, density: float) -> list[FrictionStretch]:
     """One for each stretch, in order of kind and time; ``density``: the disturbance's, (N·m)²·s."""
     blocks = block_means(samples)
     if blocks is None:
@@ -86,7 +86,7 @@ def steady_points(recording: Recording, samples: Samples, inertia: Inertia, dens
     return found
 
 
-def _point(row: Row, inertia: Inertia, density: float, swing: float) -> Point:
+def _point(row: BalanceRow, inertia: Inertia, density: float, swing: float) -> FrictionStretch:
     change = row.change_rad_s + inertia.delay.seconds * row.change_rad_s2
     variances = (
         density * row.energy_s,
@@ -94,14 +94,14 @@ def _point(row: Row, inertia: Inertia, density: float, swing: float) -> Point:
         (inertia.value * inertia.delay.sd_s * row.change_rad_s2) ** 2,
     )
     torque = (row.impulse_nm_s - inertia.value * change) / row.time_s
-    return Point(row.travel_rad / row.time_s, torque, sum(variances) / row.time_s**2, swing)
+    return FrictionStretch(row.travel_rad / row.time_s, torque, sum(variances) / row.time_s**2, swing)
 
 
-def merged(points: list[Point]) -> list[Point]:
+def merged(points: list[FrictionStretch]) -> list[FrictionStretch]:
     """In rising speed; neighbours that are one speed, and both calm or both swung, put together by their weights."""
     ordered = sorted(points, key=lambda point: point.speed)
     fastest = max((abs(point.speed) for point in ordered), default=0.0)
-    found: list[Point] = []
+    found: list[FrictionStretch] = []
     for point in ordered:
         near = [k for k, other in enumerate(found)
                 if point.speed - other.speed < _ALIKE * fastest and (other.swing > 0.0) == (point.swing > 0.0)]
@@ -190,12 +190,13 @@ def _density(recording: Recording, samples: Samples, levels: Levels, delay: Dela
     own = Density(levels.density, levels.dof)
     if own.dof < _LEAST_DOF:
         found = balances(recording, samples)
-        fit = None if found is None else fit_momentum(found, Kind.TURNING, own, delay, Resolution(0.0, 0.0), 0.95)
+        fit = None if found is None else fit_momentum(found, BalanceKind.TURNING, own, delay, Resolution(0.0, 0.0),
+                                                      0.95)
         own = own if fit is None else fit.density
     return own if own.dof >= _LEAST_DOF and own.value > 0.0 else None
 
 
-def _columns(points: list[Point]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _columns(points: list[FrictionStretch]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Per point (K,): speed and its square, the swing's part included, (K, 2); torque; 1/σ.
 
     With them come one column for each direction of rotation: Coulomb friction differs.
@@ -208,7 +209,7 @@ def _columns(points: list[Point]) -> tuple[FloatArray, FloatArray, FloatArray]:
     return design, np.array([point.torque for point in points]), weight
 
 
-def _straight(points: list[Point], density: Density) -> float:
+def _straight(points: list[FrictionStretch], density: Density) -> float:
     """The p-value of a straight line: F test of what it leaves against the disturbance's density."""
     design, torque, weight = _columns(points)
     design = np.delete(design, 1, axis=1)
@@ -220,7 +221,7 @@ def _straight(points: list[Point], density: Density) -> float:
     return fisher_tail(rest / left, left, density.dof)
 
 
-def _bend(points: list[Point]) -> tuple[float, float]:
+def _bend(points: list[FrictionStretch]) -> tuple[float, float]:
     """Coefficient c of ω², N·m·s²/rad², and its standard deviation; 0 and 0 where the points are too few to tell."""
     design, torque, weight = _columns(points)
     if len(points) < design.shape[1]:
@@ -232,6 +233,6 @@ def _bend(points: list[Point]) -> tuple[float, float]:
     return float(fitted[1]), math.sqrt(max(float(spread[1, 1]), 0.0))
 
 
-def _mean_speeds(points: list[Point], levels: Levels) -> FloatArray:
+def _mean_speeds(points: list[FrictionStretch], levels: Levels) -> FloatArray:
     """The levels' mean speeds, between which B is a chord; without two of them, the whole curve's."""
     return levels.speed if len(levels.speed) > 1 else np.array([point.speed for point in points])

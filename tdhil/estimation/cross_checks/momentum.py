@@ -15,7 +15,7 @@ from tdhil.recording import BoolArray, FloatArray, Recording, Segment
 #
 # Calm is what every reporting lag agrees on: while speed hardly changes, reported and true speed and torque are the
 # same, whatever filters stand between. Between two calm stretches a momentum balance needs no model of the reports
-# (`momentum_rows`). Coasting is motion without torque: there the torque's lag has nothing to act on.
+# (`balance`). Coasting is motion without torque: there the torque's lag has nothing to act on.
 
 
 BLOCK_S = 0.5
@@ -164,7 +164,7 @@ _LONGEST_GAP_S = 0.3
 _CHUNK = 65_536           # samples worked on at once: a long row never stands in memory as a whole
 
 
-class Kind(Enum):
+class BalanceKind(Enum):
     """What a row is for."""
 
     TURNING = "turning"       # steady or changing speed under torque
@@ -186,7 +186,7 @@ class Knot:
 
 
 @dataclass(frozen=True)
-class Row:
+class BalanceRow:
     """One balance: integrals over w(t). Speeds rad/s, times s, torque impulse N·m·s; ``energy_s`` is ∫w².
 
     ``stepped_rad_s``: the part of ``change_rad_s`` in which a speed setpoint moved the shaft, a step a cycle.
@@ -194,7 +194,7 @@ class Row:
 
     first: Knot
     second: Knot
-    kind: Kind
+    kind: BalanceKind
     change_rad_s: float
     change_rad_s2: float
     travel_rad: float         # ∫w ω
@@ -204,7 +204,7 @@ class Row:
     stepped_rad_s: float = 0.0
 
 
-def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
+def balance(samples: Samples, first: Knot, second: Knot) -> BalanceRow | None:
     """The row from one knot to the next; None where samples are missing."""
     begin, end = (int(i) for i in np.searchsorted(samples.time_s, (first.start_s - 1e-9, second.end_s - 1e-9)))
     if end - begin < 8:
@@ -225,10 +225,10 @@ def balance(samples: Samples, first: Knot, second: Knot) -> Row | None:
         return None
     (mean_a, slope_a), (mean_b, slope_b) = (reading for reading in readings if reading is not None)
     middle = second.start_s - first.end_s
-    return Row(
+    return BalanceRow(
         first,
         second,
-        Kind.COASTING if first.coasting and second.coasting else Kind.TURNING,
+        BalanceKind.COASTING if first.coasting and second.coasting else BalanceKind.TURNING,
         change_rad_s=mean_b - mean_a,
         change_rad_s2=slope_b - slope_a,
         travel_rad=float(totals[1]),
@@ -265,12 +265,13 @@ def _reading(samples: Samples, knot: Knot) -> tuple[float, float] | None:
     return (mean, float(width @ (lever * speed)) / spread) if spread > 0.0 else None
 
 
-def overlap_s(earlier: Row, later: Row) -> float:
+def overlap_s(earlier: BalanceRow, later: BalanceRow) -> float:
     """∫w_i w_{i+1} of two neighbouring rows, s."""
     return earlier.second.length_s / 6.0 if earlier.second == later.first else 0.0
 
 
-def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *, periodic: bool = False) -> Row | None:
+def through(samples: Samples, start_s: float, end_s: float, knot_s: float, *,
+            periodic: bool = False) -> BalanceRow | None:
     """The balance over one stretch, from a knot at its start to one at its end; None where samples are missing."""
     return balance(samples, Knot(start_s, start_s + knot_s, periodic), Knot(end_s - knot_s, end_s, periodic))
 
@@ -292,7 +293,7 @@ _BEYOND = 0.8             # friction is taken as known down to this share of the
 class Balances:
     """All rows of a run, in order of time, turning in ``direction`` (±1); ``calm`` is where speed was steady."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[BalanceRow, ...]
     direction: float
     calm: tuple[Span, ...]
 
@@ -325,11 +326,11 @@ def balances(recording: Recording, samples: Samples, *, alone: bool = False) -> 
     return Balances(tuple(found), direction, calm) if found else None
 
 
-def _stepped_rad_s(recording: Recording, samples: Samples, row: Row) -> float:
+def _stepped_rad_s(recording: Recording, samples: Samples, row: BalanceRow) -> float:
     """Change of speed in the parts of a row that a run of ours spent in speed mode. 0 for a trace of another tool: its
     setpoint is not known.
     """
-    if row.kind is Kind.COASTING or not recording.stages:
+    if row.kind is BalanceKind.COASTING or not recording.stages:
         return 0.0
     commanded = recording.commanded_torque_nm
     if commanded is None:

@@ -1,9 +1,9 @@
 """Inertia and friction from balances of momentum: generalised least squares with a disturbance of unknown density.
 
-Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum_rows`: C is tridiagonal). D is known twice:
-from the scatter of the excited periods' mean torque (`friction.Levels.density`), and from the residuals of the rows
-themselves. They are pooled, unless the rows scatter more than the periods allow (F test, 1 %): then friction or load
-behave otherwise in the changes of speed, and the rows' own scatter is what the interval must be built on.
+Rows y = A x + e, x = (J, B, T_c), cov e = D C (`momentum.BalanceRow`: C is tridiagonal). D is known twice:
+from the scatter of the excited periods' mean torque (`friction_levels.Levels.density`), and from the residuals of the
+rows themselves. They are pooled, unless the rows scatter more than the periods allow (F test, 1 %): then friction or
+load behave otherwise in the changes of speed, and the rows' own scatter is what the interval must be built on.
 """
 
 import math
@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.estimation.cross_checks.momentum import KNOT_S, Balances, Kind, Row, overlap_s
+from tdhil.estimation.cross_checks.momentum import KNOT_S, Balances, BalanceKind, BalanceRow, overlap_s
 from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray
@@ -72,7 +72,7 @@ class MomentumFit:
 
 
 def fit_momentum(
-    found: Balances, kind: Kind, levels: Density, delay: Delay, resolution: Resolution, confidence: float,
+    found: Balances, kind: BalanceKind, levels: Density, delay: Delay, resolution: Resolution, confidence: float,
     reading: ReadingShare = EXACT_READING,
 ) -> MomentumFit | None:
     """J from the rows of one kind; the others serve for friction where their speed hardly changes. None if they can't.
@@ -82,7 +82,7 @@ def fit_momentum(
     """
     fastest = max(abs(row.travel_rad) / row.time_s for row in found.rows)
 
-    def changes(row: Row) -> bool:
+    def changes(row: BalanceRow) -> bool:
         return abs(row.change_rad_s) >= _LEAST_CHANGE * fastest
 
     rows = [row for row in found.rows if row.kind is kind or not changes(row)]
@@ -145,7 +145,7 @@ def fit_momentum(
 
 
 def _bent(
-    solve: Callable[..., tuple[FloatArray, FloatArray, float]], rows: list[Row], delay_s: float, inertia: float,
+    solve: Callable[..., tuple[FloatArray, FloatArray, float]], rows: list[BalanceRow], delay_s: float, inertia: float,
     further: tuple[FloatArray, ...], prior: float, rest: float, density: float,
 ) -> float:
     """By how much J may change, kg·m², with friction that has a part ∝ ω|ω|: all of it where the rows show that part.
@@ -161,18 +161,18 @@ def _bent(
     return change if rest - left > _BEND_SHOWS * density else min(change, _UNSEEN_BEND * inertia)
 
 
-def _covariance(rows: list[Row]) -> FloatArray:
+def _covariance(rows: list[BalanceRow]) -> FloatArray:
     covariance = np.diag([row.energy_s for row in rows])
     for i, (earlier, later) in enumerate(pairwise(rows)):
         covariance[i, i + 1] = covariance[i + 1, i] = overlap_s(earlier, later)
     return covariance
 
 
-def _design(rows: list[Row], delay_s: float, direction: float, share: float) -> FloatArray:
+def _design(rows: list[BalanceRow], delay_s: float, direction: float, share: float) -> FloatArray:
     """(rows, 3): columns J, B, T_c; ``share`` of J is read too much where a setpoint moved the shaft."""
     table = []
     for row in rows:
-        delay = 0.0 if row.kind is Kind.COASTING else delay_s
+        delay = 0.0 if row.kind is BalanceKind.COASTING else delay_s
         table.append([
             row.change_rad_s + delay * row.change_rad_s2 + share * row.stepped_rad_s,
             row.travel_rad + delay * row.change_rad_s,

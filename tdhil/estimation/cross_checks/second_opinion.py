@@ -18,7 +18,7 @@ import numpy as np
 from tdhil.config import has_plateaus
 from tdhil.estimation.case import Case, Finding
 from tdhil.estimation.cross_checks.friction_by_speed import Inertia, friction_curve
-from tdhil.estimation.cross_checks.momentum import Balances, Kind, balances
+from tdhil.estimation.cross_checks.momentum import BalanceKind, Balances, balances
 from tdhil.estimation.cross_checks.momentum_fit import (
     UNKNOWN_DELAY,
     Delay,
@@ -189,8 +189,9 @@ def _opinions(case: Case, found: Balances, finding: Finding) -> Fitted:
     steps = recording.excitation is not None and has_plateaus(recording.excitation.kind)
     reading = _reading(case, finding)
     opinions = []
-    for kind, route in ((Kind.TURNING, "torque steps" if steps else "speed change"), (Kind.COASTING, "coast-down")):
-        if kind is Kind.COASTING and not any(row.kind is kind for row in found.rows):
+    for kind, route in ((BalanceKind.TURNING, "torque steps" if steps else "speed change"),
+                        (BalanceKind.COASTING, "coast-down")):
+        if kind is BalanceKind.COASTING and not any(row.kind is kind for row in found.rows):
             continue
         fit = fit_momentum(found, kind, density, delay, resolution, case.options.confidence, reading)
         if fit is None or not fit.half_width < _OPEN * fit.inertia:
@@ -309,9 +310,9 @@ def _times_wider(confidence: float, miss_share: float) -> float:
     return student_quantile(1.0 - miss_share, 1e6) / student_quantile(confidence, 1e6)
 
 
-def _note(fit: MomentumFit, kind: Kind, delay: Delay) -> str:
+def _note(fit: MomentumFit, kind: BalanceKind, delay: Delay) -> str:
     changes = f"{fit.rows} change{'s' if fit.rows > 1 else ''} of speed"
-    if kind is Kind.COASTING:
+    if kind is BalanceKind.COASTING:
         return f"{changes} without torque, friction from steady speeds; free of every reporting lag"
     lags = f"delay between the reports {delay.seconds * 1e3:.0f} ± {delay.sd_s * 1e3:.0f} ms (1 sd)"
     if not delay.known:

@@ -56,7 +56,7 @@ _RATIO, _OFFSET, _FIRST, _SECOND, _THIRD = range(5)
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _RatioFit:
     """Ratio k with its standard deviation, its degrees of freedom, and how far noise in the reference may draw it."""
 
     ratio: float
@@ -69,7 +69,7 @@ class _Fit:
         return student_quantile(confidence, self.dof) * self.sd + self.lean
 
 
-def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) -> _Fit | None:
+def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) -> _RatioFit | None:
     """K of ``torque_nm`` over ``reference_nm`` (N,) each; None where the reference moves too little to show it."""
     bins = joined([
         measure(window) for window in place_windows(tuple(_stretches(Samples(time_s, reference_nm, torque_nm))))
@@ -101,7 +101,7 @@ def _ratio(time_s: FloatArray, reference_nm: FloatArray, torque_nm: FloatArray) 
     seen = float(np.sum(np.abs(x[_RATIO] * chosen.speed[:, 0]) ** 2 / variance))
     lean = abs(float(x[_RATIO])) * len(chosen) / seen
     sd = math.sqrt(max(float(spread[_RATIO, _RATIO]), 0.0))
-    return _Fit(float(x[_RATIO]), sd, max(2.0 * len(chosen) - len(x), _LEAST_DOF), lean)
+    return _RatioFit(float(x[_RATIO]), sd, max(2.0 * len(chosen) - len(x), _LEAST_DOF), lean)
 
 
 def _stretches(samples: Samples) -> Iterator[OneWayStretch]:

@@ -25,9 +25,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tdhil.estimation.case import Finding, PeriodicCase, Words
+from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
 from tdhil.estimation.frequency_domain.inference import (
     estimate,
     grown_lines,
@@ -40,7 +40,7 @@ from tdhil.estimation.frequency_domain.rigid import fitted_points, known_structu
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS
 from tdhil.estimation.result import BudgetLine, Compliant, Refused, ResidualTest, rejects
 from tdhil.estimation.samples import STICK_SLIP_REGULAR, STICK_SLIP_SHARE, repeats
-from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines, pooled_lines
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines
 from tdhil.recording import FloatArray, LagPrior, Pipe, Recording, TorqueAnswer
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ _NEIGHBOURS = 2
 _SURER = 3.0        # times the degrees of freedom of one line's scatter, so averaged
 
 
-def unleaked(lines: tuple[Line, ...], fits: tuple[PeriodLines, ...]) -> tuple[Line, ...]:
+def unleaked(lines: tuple[SpectralLine, ...], fits: tuple[PeriodLines, ...]) -> tuple[SpectralLine, ...]:
     """The pooled lines of ``fits`` with the scatter that their means have; themselves where they aren't dense."""
     if len(lines) < 2 * _NEIGHBOURS + 1 or any(len(fit.lines_hz) != len(lines) for fit in fits):
         return lines
@@ -162,7 +162,7 @@ def unleaked(lines: tuple[Line, ...], fits: tuple[PeriodLines, ...]) -> tuple[Li
 # ---------------------------------------------------------------------------------------------------------------------
 
 _LAGS_S = ((0.40, 0.15), (0.05, 0.05), (0.15, 0.40))       # to begin with
-_WORDS = Words(
+_WORDS = ModelWords(
     "a string whose echo may be anything",
     "is the pipe as rig.yaml has it, from the top down to where its section changes?",
     "excite for longer (--periods), or lift the bit off bottom",
@@ -215,7 +215,7 @@ def identify_before_echo(case: PeriodicCase) -> Finding:
 
 
 def problem_of(
-    lines: tuple[Line, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
+    lines: tuple[SpectralLine, ...], pipe: Pipe, prior: LagPrior, answer: TorqueAnswer | None = None
 ) -> Likelihood:
     """``answer``: of the torque, where nobody states its lag.
 
@@ -307,7 +307,7 @@ def echo_shaft(problem: Likelihood) -> EchoShaft:
     return problem.model.shaft
 
 
-def fit_before_echo(problem: Likelihood, prior: LagPrior) -> Fitted:
+def fit_before_echo(problem: Likelihood, prior: LagPrior) -> FittedModel:
     """Raises Refused where the arithmetic breaks down."""
     model, shaft = problem.model, echo_shaft(problem)
     moved = model.mechanical - Model().mechanical
@@ -325,13 +325,13 @@ def fit_before_echo(problem: Likelihood, prior: LagPrior) -> Fitted:
         raise Refused("the lines before the echo leave the inertia open", _WORDS.if_wide) from error
 
 
-def _apparent_inertia(lines: tuple[Line, ...]) -> float:
+def _apparent_inertia(lines: tuple[SpectralLine, ...]) -> float:
     """|T/(ω W)| where the motor turns all but alone: of the faster half of the lines."""
     upper = lines[len(lines) // 2 :]
     return float(np.median([abs(np.mean(line.torque / line.speed)) / (2.0 * np.pi * line.hertz) for line in upper]))
 
 
-def residual_of(fitted: Fitted) -> ResidualTest | None:
+def residual_of(fitted: FittedModel) -> ResidualTest | None:
     """Of the lines alone, less as many numbers as they were fitted with: beliefs about an echo aren't measured."""
     from scipy.special import chdtrc
 
@@ -382,7 +382,7 @@ def refuse_stick_slip(case: PeriodicCase) -> None:
             )
 
 
-def _budget(fitted: Fitted, low: float, high: float, confidence: float, scale: float) -> tuple[BudgetLine, ...]:
+def _budget(fitted: FittedModel, low: float, high: float, confidence: float, scale: float) -> tuple[BudgetLine, ...]:
     at, size = fitted.problem.model.at, fitted.problem.model.mechanical
     lags = tuple(at(index) for index in (signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW))
     echo = tuple(range(ECHO, size))

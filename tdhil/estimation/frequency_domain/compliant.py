@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.case import Finding, PeriodicCase, Words
+from tdhil.estimation.case import Finding, ModelWords, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.compliant_fit import (
     SLOWEST_SEEN,
@@ -47,7 +47,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.result import REJECT_P, BudgetLine, Compliant, Estimate, Refusal, rejects
-from tdhil.estimation.spectrum import Line
+from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import Pipe
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -56,7 +56,7 @@ from tdhil.recording import Pipe
 # Two masses are a string that weighs nothing. A light string is, to first order in its weight, two masses with other
 # shares of the same total: a third of it seems to turn with the motor. Only its second swing, near one half of the
 # wave's frequency 1/T, tells. So where two masses explain the data, J_r and J_L are theirs, but their intervals hold
-# whatever string the data do not contradict (`result.py`; one whose lowest swing the lines can see, `fit.too_slow`);
+# whatever string the data do not contradict (`result_of`; one whose lowest swing the lines can see, `too_slow`);
 # J_r + J_L is the same in both. Only who says ``--model two-mass`` takes the spring's weight for nothing.
 #
 # So little is lost by holding on to two masses too long, and J_r moves by what the string weighs if they are given up
@@ -68,7 +68,7 @@ _DOUBT = 0.3                 # of the residual test's p, above which a rigid sha
 _MUCH = 9.0                  # of −2 ln L, for one parameter more than the rigid shaft's lags have
 _REPORTS = 3                 # unknown besides the shaft: two lags and the skew
 _BY_PIPE = 2                 # known where the pipe is: its inertia and its stiffness
-_SIGNIFICANT = 25.0          # |mean|² over its variance, as `Line.excited`
+_SIGNIFICANT = 25.0          # |mean|² over its variance, as `SpectralLine.excited`
 _LEAST_LOAD = 0.01           # of the total: less hangs on one line's error
 _NEAR = (SLOWEST_SEEN, 2.0)  # where a swing can be seen, of the lowest and the highest line
 
@@ -89,7 +89,7 @@ class Chosen:
     unlike_hz: tuple[float, ...] = ()
 
 
-def usable_lines(every: tuple[Line, ...], least_nu: float) -> tuple[Line, ...]:
+def usable_lines(every: tuple[SpectralLine, ...], least_nu: float) -> tuple[SpectralLine, ...]:
     """Lines where speed or torque stands clear of its scatter: at a resonance one of them all but vanishes.
 
     The likelihood treats both alike, so either will do.
@@ -97,14 +97,15 @@ def usable_lines(every: tuple[Line, ...], least_nu: float) -> tuple[Line, ...]:
     return tuple(line for line in every if line.nu >= least_nu and _clear(line))
 
 
-def _clear(line: Line) -> bool:
+def _clear(line: SpectralLine) -> bool:
     speed = np.abs(line.speed) ** 2 * line.periods > _SIGNIFICANT * line.s_ww
     torque = np.abs(line.torque) ** 2 * line.periods > _SIGNIFICANT * line.s_tt
     return bool(np.all(speed | torque))
 
 
 def choose(
-    asked: str, lines: tuple[Line, ...], constraint: ViscousConstraint | None, priors: tuple[GaussianPrior, ...],
+    asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
+    priors: tuple[GaussianPrior, ...],
     fixed: Fixed, pipe: Pipe | None = None
 ) -> Chosen | Refusal:
     """``asked``: by its name, a compliant shaft; or two masses and the string are tried. ``priors`` and ``fixed`` as
@@ -154,7 +155,7 @@ _LEAST_NU = 2.0              # complex degrees of freedom of a difference, at le
 
 
 def choose_unlike(
-    found: Chosen, asked: str, lines: tuple[Line, ...], constraint: ViscousConstraint | None,
+    found: Chosen, asked: str, lines: tuple[SpectralLine, ...], constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...], fixed: Fixed, pipe: Pipe | None = None
 ) -> Chosen:
     """What stands in place of ``found``, which is rejected, with lines that count by how the mean speeds differ."""
@@ -167,7 +168,7 @@ def choose_unlike(
     return replace(again, unlike_hz=unlike) if isinstance(again, Chosen) and not again.rejected else found
 
 
-def _by_difference(line: Line) -> Line:
+def _by_difference(line: SpectralLine) -> SpectralLine:
     """With the scatter that the segments' T/ω have between them, where that is beyond the scatter of their periods."""
     weight = line.periods * np.abs(line.speed) ** 2
     g = complex(np.sum(line.periods * line.torque * line.speed.conj()) / np.sum(weight))
@@ -233,12 +234,12 @@ def plausible(fit: CompliantFit) -> bool:
 
 def _refuse_count(
     model: ShaftModel,
-    lines: tuple[Line, ...],
+    lines: tuple[SpectralLine, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
     known: int = 0,
 ) -> Refusal | None:
-    """Equations and unknowns, as `identifiable.refuse_count` has them for a rigid shaft; ``known`` of the load."""
+    """Equations and unknowns, as `rigid.refuse_count` has them for a rigid shaft; ``known`` of the load."""
     assert model.compliant is not None
     equations = 2 * len(lines) + (constraint is not None) + len(priors) + known
     unknowns = len(model.compliant().names) + _REPORTS
@@ -448,9 +449,9 @@ def name_of(fit: CompliantFit, asked: str) -> str:
     return "string" if fit.is_string else "two-mass"
 
 
-def _words(name: str) -> Words:
+def _words(name: str) -> ModelWords:
     model = shaft_model(name)
-    return Words(model.text, f"{_LOOK_FOR}; try --model auto", _WIDE, model.explain)
+    return ModelWords(model.text, f"{_LOOK_FOR}; try --model auto", _WIDE, model.explain)
 
 
 _OTHER_PIPE = (

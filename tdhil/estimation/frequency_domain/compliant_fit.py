@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
 from tdhil.estimation.frequency_domain.inference import estimate, residual_of
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
@@ -26,7 +26,7 @@ from tdhil.estimation.frequency_domain.shafts import (
 )
 from tdhil.estimation.friction_levels import ViscousConstraint
 from tdhil.estimation.result import REJECT_P, Estimate, ResidualTest
-from tdhil.estimation.spectrum import ComplexArray, Line
+from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def _theta(problem: Likelihood, shape: FloatArray, x: FloatArray, skew: float) -
 
 
 @dataclass(frozen=True)
-class View:
+class ParameterView:
     """``of`` m: what takes the place of m[index]; ``back`` from m with it there: (m[index], its gradient (M,))."""
 
     index: int
@@ -202,15 +202,15 @@ def _resonance_back(m: FloatArray) -> tuple[float, FloatArray]:
     return swing, slope
 
 
-TOTAL = View(INERTIA, lambda m: float(m[INERTIA] + m[LOAD]), _total_back)
-STIFFNESS = View(SWING, lambda m: float(m[SWING] ** 2 * m[LOAD] * _light(m)), _stiffness_back)
-RESONANCE = View(SWING, lambda m: float(m[SWING] * math.sqrt(1.0 + m[LOAD] / m[INERTIA])), _resonance_back)
+TOTAL = ParameterView(INERTIA, lambda m: float(m[INERTIA] + m[LOAD]), _total_back)
+STIFFNESS = ParameterView(SWING, lambda m: float(m[SWING] ** 2 * m[LOAD] * _light(m)), _stiffness_back)
+RESONANCE = ParameterView(SWING, lambda m: float(m[SWING] * math.sqrt(1.0 + m[LOAD] / m[INERTIA])), _resonance_back)
 
 
 class ViewedShaft:
     """A compliant shaft through a view."""
 
-    def __init__(self, inner: Shaft, view: View) -> None:
+    def __init__(self, inner: Shaft, view: ParameterView) -> None:
         self.inner, self.view = inner, view
         self.names = inner.names
         slope = _total_back(np.ones(len(inner.names)))[1] if view is TOTAL else None
@@ -257,7 +257,7 @@ class ViewedShaft:
         return inside, slope
 
 
-def viewed(fitted: Fitted, view: View) -> Fitted:
+def viewed(fitted: FittedModel, view: ParameterView) -> FittedModel:
     """The same fits in the view's parameters; `view.index` is where the interval is asked for."""
     old = fitted.problem
     problem = Likelihood(old.lines, Model(ViewedShaft(old.model.shaft, view)), old.constraint, old.priors)
@@ -293,7 +293,7 @@ _HEAVIER = (0.02, 0.2, 0.4, 0.7)      # shares of the load from which a string's
 class CompliantFit:
     """Two lumps or the string, fitted; with the test of its residuals."""
 
-    fitted: Fitted
+    fitted: FittedModel
     residual: ResidualTest | None
 
     @property
@@ -322,7 +322,7 @@ class CompliantIntervals:
 
 def fit_compliant(
     shaft: Shaft,
-    lines: tuple[Line, ...],
+    lines: tuple[SpectralLine, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
     fixed: Fixed,

@@ -40,7 +40,7 @@ _SHAPES = ((SPEED_SHAPE, 0.25), (TORQUE_SHAPE, 0.25), (AVERAGE, 0.1), (AVERAGE, 
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedModel:
     """A model's two fits. ``fixed``: parameters that are known for certain, whatever the structure."""
 
     problem: Likelihood
@@ -83,7 +83,7 @@ def fit_model(
     starts: Sequence[FloatArray],
     rivals_of: Callable[[FloatArray], list[FloatArray]] | None = None,
     apart: Apart | None = None,
-) -> Fitted:
+) -> FittedModel:
     """Fit ``problem`` from several ``starts`` (P,) each; ``rivals_of`` an answer: where another may be.
 
     ``apart``: answers that stand only where they gain more on the others than they must.
@@ -95,7 +95,7 @@ def fit_model(
     open_structure = [index for index in model.structure if index not in fixed]
     others = tuple(minimise(problem, limits, start, fixed) for start in (rivals_of(simple.theta) if rivals_of else []))
     if not open_structure:
-        return Fitted(problem, limits, fixed, simple, simple, 1.0, others)
+        return FittedModel(problem, limits, fixed, simple, simple, 1.0, others)
     begin = [simple.theta]
     for shape, value in _SHAPES:
         if model.at(shape) not in fixed:
@@ -104,7 +104,7 @@ def fit_model(
     whole = best_fit(problem, limits, fixed, begin, apart, [simple])
     gain = (simple.objective - whole.objective) / excess_rise(problem, model.size - len(fixed))
     weight = simple_weight(gain, len(open_structure), problem.numbers)
-    return Fitted(problem, limits, fixed, simple, whole, weight, others)
+    return FittedModel(problem, limits, fixed, simple, whole, weight, others)
 
 
 def simple_weight(gain: float, more: int, numbers: int) -> float:
@@ -123,7 +123,7 @@ def excess_rise(problem: Likelihood, fitted: int) -> float:
     return 1.0 + (fitted - problem.held) / (4.0 * max(nu, 1.0))
 
 
-def unit(fitted: Fitted, index: int) -> FloatArray:
+def unit(fitted: FittedModel, index: int) -> FloatArray:
     """The row (P,) that picks one parameter."""
     row = np.zeros(fitted.problem.model.size)
     row[index] = 1.0

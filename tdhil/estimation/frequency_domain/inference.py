@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, excess_rise, unit
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, excess_rise, unit
 from tdhil.estimation.frequency_domain.likelihood import Likelihood
 from tdhil.estimation.frequency_domain.optimiser import Box, Fit, Fixed, lowest, minimise, other_poles
 from tdhil.estimation.frequency_domain.shafts import INERTIA
 from tdhil.estimation.result import REJECT_P, BudgetLine, Estimate, InertiaEstimate, ResidualTest
-from tdhil.estimation.spectrum import Line
+from tdhil.estimation.spectrum import SpectralLine
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -38,7 +38,7 @@ from tdhil.recording import FloatArray
 _AT_BOUND = 1e-6      # of the natural scale
 
 
-def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:
+def residual_of(fitted: FittedModel, chosen: int = 0) -> ResidualTest | None:
     """Of the whole family's fit; what counts as fitted are the free parameters inside their bounds.
 
     ``chosen``: how many more were, by a choice among models.
@@ -49,7 +49,7 @@ def residual_of(fitted: Fitted, chosen: int = 0) -> ResidualTest | None:
     return residual_test(fitted.problem, theta, int(np.count_nonzero(inside[fitted.free])) + chosen)
 
 
-def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[Line, ...]) -> bool:
+def contradicted(problem: Likelihood, theta: FloatArray, others: tuple[SpectralLine, ...]) -> bool:
     """Do lines that were not fitted contradict theta (P,)? For lines that were too weak in one signal.
 
     A shaft that swings stands still at its antiresonance while the torque goes on: that line has no speed to speak of,
@@ -190,7 +190,7 @@ def profile_edge(
 # tried in its place, and misses where a second pole is just not to be seen (docs/accuracy.md).
 
 
-def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
+def quantile_of(fitted: FittedModel, index: int, confidence: float) -> float:
     """The root of how far −2 ln L may rise: Student's quantile, enlarged for what is fitted besides.
 
     Its degrees of freedom are those of the first-order fit (the whole family's would be spread over directions that the
@@ -204,7 +204,7 @@ def quantile_of(fitted: Fitted, index: int, confidence: float) -> float:
     return student_quantile(confidence, dof) * math.sqrt(excess_rise(fitted.problem, len(fitted.free)))
 
 
-def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0) -> Estimate:
+def estimate(fitted: FittedModel, index: int, confidence: float, behind: float = 0.0) -> Estimate:
     """Value and interval of theta[index]; infinite on a side that the data leave open. Fixed: no width.
 
     ``behind``: by how much −2 ln L lies above that of another model's fit, to which this one is a rival.
@@ -225,7 +225,7 @@ def estimate(fitted: Fitted, index: int, confidence: float, behind: float = 0.0)
     return Estimate(value, min(seen), max(seen))
 
 
-def first_order_estimate(fitted: Fitted, index: int, confidence: float) -> Estimate:
+def first_order_estimate(fitted: FittedModel, index: int, confidence: float) -> Estimate:
     """Value and interval of theta[index] if the lags are first order: for the lags themselves, whose meaning it is.
 
     (Over the whole family a lag is open above, since what both reports share can't be seen.)
@@ -239,7 +239,7 @@ def first_order_estimate(fitted: Fitted, index: int, confidence: float) -> Estim
 
 
 def _edges(
-    fitted: Fitted, fit: Fit, fixed: Fixed, index: int, quantile: float, behind: float
+    fitted: FittedModel, fit: Fit, fixed: Fixed, index: int, quantile: float, behind: float
 ) -> tuple[float, float]:
     problem, limits = fitted.problem, fitted.limits
     sd, _ = standard_deviation(problem, fit.theta, index, [i for i in range(len(fit.theta)) if i not in fixed])
@@ -259,7 +259,7 @@ def _edges(
     return low, high
 
 
-def half_width_first_order(fitted: Fitted, index: int, confidence: float, known: tuple[int, ...] = ()) -> float:
+def half_width_first_order(fitted: FittedModel, index: int, confidence: float, known: tuple[int, ...] = ()) -> float:
     """Half-width in the quadratic approximation, with first-order lags and the parameters ``known`` at their values."""
     free = [i for i in range(fitted.problem.model.size) if i not in fitted.simple_held and i not in known]
     if index not in free:
@@ -318,7 +318,7 @@ def widened_most_by_scale(inertia: InertiaEstimate) -> bool:
 
 
 def budget_of(
-    fitted: Fitted, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
+    fitted: FittedModel, inertia: Estimate, confidence: float, torque_scale_rel_sd: float
 ) -> tuple[BudgetLine, ...]:
     """The lines, in the order of the derivation above; the torque scale last, which is in no interval but the total."""
     model = fitted.problem.model

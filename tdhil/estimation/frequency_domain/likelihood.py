@@ -9,9 +9,9 @@ true lines and the true covariance concentrated out of the Gaussian likelihood
 
 M segments. This is a complex t-distribution: what the weights don't know is in its tails, and for ν → ∞ it is Σ 2q,
 a χ². It is a sum of squares of φ(q)·r/√v with φ² = 2(ν + M) ln(1 + q/ν)/q, smooth at q = 0, for least squares.
-What acts on the shaft besides and doesn't go with the speed at the line, c N_s of a bent friction (`Load`), is taken
-off T̄_s first. The tie of B to the levels is a real t-distribution, (n + 1) ln(1 + z²/n); what is known of the lags is
-Gaussian.
+What acts on the shaft besides and doesn't go with the speed at the line, c N_s of a bent friction (`TorqueLoad`), is
+taken off T̄_s first. The tie of B to the levels is a real t-distribution, (n + 1) ln(1 + z²/n); what is known of the
+lags is Gaussian.
 """
 
 import math
@@ -25,14 +25,14 @@ from tdhil.estimation.frequency_domain import signal_filters
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.shafts import Believing
 from tdhil.estimation.friction_levels import ViscousConstraint
-from tdhil.estimation.spectrum import ComplexArray, Line
+from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import FloatArray
 
 _SERIES = 1e-4          # of q/ν
 
 
 @dataclass(frozen=True)
-class Load:
+class TorqueLoad:
     """Torque in proportion to theta[index]: N·m per its unit in every segment mean of every line, in their order."""
 
     index: int
@@ -44,11 +44,11 @@ class Likelihood:
 
     def __init__(
         self,
-        lines: tuple[Line, ...],
+        lines: tuple[SpectralLine, ...],
         model: Model,
         constraint: ViscousConstraint | None,
         priors: tuple[GaussianPrior, ...],
-        load: Load | None = None,
+        load: TorqueLoad | None = None,
     ) -> None:
         self.lines, self.model, self.constraint, self.priors = lines, model, constraint, priors
         self.s: ComplexArray = 2j * np.pi * np.array([line.hertz for line in lines])
@@ -98,7 +98,7 @@ class Likelihood:
         off, slopes = self._believing.beliefs(theta[: self.model.mechanical])
         return off, np.pad(slopes, ((0, 0), (0, self.model.size - slopes.shape[1])))
 
-    def unloaded(self, theta: FloatArray) -> tuple[Line, ...]:
+    def unloaded(self, theta: FloatArray) -> tuple[SpectralLine, ...]:
         """The lines without the torque of the load."""
         if self._load is None:
             return self.lines

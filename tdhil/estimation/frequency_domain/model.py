@@ -78,7 +78,7 @@ class Model:
         """G (K,), and what gives ∂G/∂theta (P, K) should it be asked for."""
         mechanical = len(theta) - signal_filters.COUNT
         m = theta[:mechanical]
-        reports = signal_filters.Ratio(theta[mechanical:], s)
+        reports = signal_filters.FilterRatio(theta[mechanical:], s)
         g: ComplexArray = self.shaft.impedance(m, s) * reports.value
 
         def slopes() -> ComplexArray:

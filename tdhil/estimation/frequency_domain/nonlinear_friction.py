@@ -13,7 +13,7 @@ import numpy as np
 
 from tdhil.estimation.case import Finding, PeriodicCase
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
     estimate,
@@ -21,14 +21,14 @@ from tdhil.estimation.frequency_domain.inference import (
     residual_of,
     student_quantile,
 )
-from tdhil.estimation.frequency_domain.likelihood import Likelihood, Load
+from tdhil.estimation.frequency_domain.likelihood import Likelihood, TorqueLoad
 from tdhil.estimation.frequency_domain.model import GaussianPrior, Model
 from tdhil.estimation.frequency_domain.optimiser import Fit, Fixed, box, minimise, rigid_rivals, rough_inertia_of
 from tdhil.estimation.frequency_domain.rigid import RIGID, RigidResult, lags_of, rigid_finding
 from tdhil.estimation.frequency_domain.shafts import INERTIA, VISCOUS, RigidShaft
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, slope_over_speed, tie_viscous
 from tdhil.estimation.result import BudgetLine, Estimate, Refusal, ResidualTest, rejects
-from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine
 from tdhil.recording import FloatArray, Segment
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -78,7 +78,8 @@ class BentShaft:
     """m = J, B, c.
 
     ``chord``: how much the levels' slope of friction over speed rises with c; ``typical``: c of a bend as large as B ω
-    is, over B. c is not in the impedance: what it adds at a line does not go with the speed there (`likelihood.Load`).
+    is, over B. c is not in the impedance: what it adds at a line does not go with the speed there
+    (`likelihood.TorqueLoad`).
     """
 
     chord: float
@@ -126,7 +127,7 @@ _POINTS = 16      # to a cycle of the fastest line
 
 
 @dataclass(frozen=True)
-class Wave:
+class SegmentWave:
     """One segment: ``lines_hz`` (K,) rising or not, ``speed`` (K,) complex as reported, its mean, and its period."""
 
     lines_hz: tuple[float, ...]
@@ -148,7 +149,7 @@ class Wave:
         return turned
 
     def over_period(self, phi: FloatArray) -> FloatArray:
-        """The shaft's own speed behind the report ``phi`` (6,) (`reports`), (N,) rad/s."""
+        """The shaft's own speed behind the report ``phi`` (6,) (`signal_filters`), (N,) rad/s."""
         found: FloatArray = self.mean + (self._turned @ (self.speed / signal_filters.filters(phi, self._s)[0])).real
         return found
 
@@ -159,9 +160,9 @@ class Wave:
         return signal_filters.filters(phi, self._s)[1] * lines, float(torque.mean())
 
 
-def wave_of(fit: PeriodLines, segment: Segment) -> Wave:
+def wave_of(fit: PeriodLines, segment: Segment) -> SegmentWave:
     """Of all its periods together."""
-    return Wave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
+    return SegmentWave(fit.lines_hz, fit.speed.mean(axis=0), float(fit.speed_mean.mean()), segment.period_s)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -181,12 +182,12 @@ _SLOWEST = 0.1      # of the mean speed: what comes nearer to rest than that is 
 
 
 @dataclass(frozen=True)
-class Motion:
+class ShaftMotion:
     """What the shaft did: a wave for each segment, the levels (the segments' first, in their order), the lines."""
 
-    waves: tuple[Wave, ...]
+    waves: tuple[SegmentWave, ...]
     levels: Levels
-    lines: tuple[Line, ...]
+    lines: tuple[SpectralLine, ...]
     constraint: ViscousConstraint | None
 
 
@@ -195,7 +196,7 @@ class BentFit:
     """One shape, fitted."""
 
     bend: Bend
-    fitted: Fitted
+    fitted: FittedModel
     residual: ResidualTest | None
 
     @property
@@ -203,7 +204,8 @@ class BentFit:
         return self.fitted.whole.objective
 
 
-def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, rigid: RigidResult) -> list[BentFit]:
+def fit_bends(motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fixed,
+              rigid: RigidResult) -> list[BentFit]:
     """Every shape, the best first; none where the shaft comes too near to rest. ``priors``, ``fixed``: as rigid."""
     # with first-order lags: a whole family of filters, made to explain a bend, ends in corners
     starts = starts_of(motion, rigid.fitted.simple.theta)
@@ -230,7 +232,7 @@ def fit_bends(motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, r
     return sorted(found, key=lambda one: one.objective)
 
 
-def starts_of(motion: Motion, straight: FloatArray) -> list[FloatArray]:
+def starts_of(motion: ShaftMotion, straight: FloatArray) -> list[FloatArray]:
     """Where the descents begin: the straight fit, and the same without the lag that both reports have in common.
 
     A straight fit bends long lags that all but cancel to the friction's shape. They change its ratio little, but the
@@ -241,7 +243,7 @@ def starts_of(motion: Motion, straight: FloatArray) -> list[FloatArray]:
     return [theta for theta in (straight, apart) if theta is not None and _keeps_turning(motion, theta[_RIGID:])]
 
 
-def _keeps_turning(motion: Motion, phi: FloatArray) -> bool:
+def _keeps_turning(motion: ShaftMotion, phi: FloatArray) -> bool:
     """Does the shaft behind the reports ``phi`` (6,) stay away from rest?"""
     least = _SLOWEST * min(abs(wave.mean) for wave in motion.waves)
     return all(np.min(wave.over_period(phi) * np.sign(wave.mean)) > least for wave in motion.waves)
@@ -285,7 +287,7 @@ def _between(tried: list[_Near], near: Callable[[Bend, FloatArray], _Near]) -> l
 
 
 def _near(
-    bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], fixed: Fixed, theta: FloatArray
+    bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...], fixed: Fixed, theta: FloatArray
 ) -> _Near:
     """With first-order lags, one descent in each round, from where the last one ended."""
     for _ in range(_ROUNDS):
@@ -307,7 +309,7 @@ def _apart(theta: FloatArray, mechanical: int) -> FloatArray | None:
     return found
 
 
-def _problem(bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], phi: FloatArray) -> Likelihood:
+def _problem(bend: Bend, motion: ShaftMotion, priors: tuple[GaussianPrior, ...], phi: FloatArray) -> Likelihood:
     """With the bend's lines as the filters ``phi`` (6,) have them."""
     seen = [wave.through(bend, phi) for wave in motion.waves]
     by_hertz = [
@@ -319,7 +321,7 @@ def _problem(bend: Bend, motion: Motion, priors: tuple[GaussianPrior, ...], phi:
     friction = np.concatenate([[mean for _, mean in seen], bend.over(levels.speed[len(seen) :])])
     typical = float(np.mean(np.abs(levels.speed)) / np.max(np.abs(friction)))
     shaft = BentShaft(slope_over_speed(levels, friction), typical)
-    return Likelihood(motion.lines, Model(shaft), motion.constraint, priors, Load(BEND, entries))
+    return Likelihood(motion.lines, Model(shaft), motion.constraint, priors, TorqueLoad(BEND, entries))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -340,7 +342,7 @@ def identify_bent(case: PeriodicCase, rigid: RigidResult) -> Finding | None:
         wave_of(fit, one.segment) for fit, one in zip(case.fits, case.stretches, strict=True) if len(fit.speed)
     )
     straight = rigid.fitted
-    motion = Motion(waves, case.levels, straight.problem.lines, constraint)
+    motion = ShaftMotion(waves, case.levels, straight.problem.lines, constraint)
     try:
         found = fit_bends(motion, straight.problem.priors, straight.fixed, rigid)
         if not found or found[0].residual is None or rejects(found[0].residual):
@@ -397,7 +399,7 @@ def _budget(
     return (*lines, BudgetLine("friction's shape", 0.5 * grown, "other shapes that the data allow"), scale)
 
 
-def _told(best: BentFit, motion: Motion) -> str:
+def _told(best: BentFit, motion: ShaftMotion) -> str:
     width = best.bend.width_rad_s
     shape = "with the square of speed" if width is None else f"by a bell of about {width:.2g} rad/s (Stribeck)"
     return (

@@ -1,7 +1,7 @@
 """Least squares by Levenberg and Marquardt's damped Gauss-Newton steps, within bounds, some parameters held.
 
 Written out because the profile of an interval asks for hundreds of small descents, each from a good start: a general
-solver's set-up costs more than the few steps that they take. scipy's `least_squares` is the oracle in the tests.
+solver's set-up costs more than the few steps that they take. `scipy.optimize.least_squares` is the oracle in the tests.
 
 A step solves (AᵀA + λ diag AᵀA) δ = −Aᵀ r for the parameters that are free and do not push against a bound. What it
 would take beyond a bound goes to the bound, and the rest is solved again (cut alone, the rest would go where they only
@@ -294,7 +294,7 @@ def _start(problem: Likelihood, lags: tuple[float, float, float]) -> FloatArray:
     """With the lags given, J and B follow from the lines by linear least squares: G/filters = J s + B."""
     phi = np.zeros(signal_filters.COUNT)
     phi[[signal_filters.SPEED_LAG, signal_filters.TORQUE_LAG, signal_filters.SKEW]] = lags
-    seen = problem.torque / (signal_filters.Ratio(phi, problem.s).value[problem.owner] * problem.speed)
+    seen = problem.torque / (signal_filters.FilterRatio(phi, problem.s).value[problem.owner] * problem.speed)
     s = problem.s[problem.owner]
     weight = np.abs(problem.speed)
     inertia = float(np.sum(weight * seen.imag * s.imag) / np.sum(weight * s.imag**2))

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tdhil.estimation.case import Case, Finding, Words
+from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.frequency_domain import signal_filters
-from tdhil.estimation.frequency_domain.filter_order import Fitted, fit_model
+from tdhil.estimation.frequency_domain.filter_order import FittedModel, fit_model
 from tdhil.estimation.frequency_domain.inference import (
     budget_of,
     estimate,
@@ -30,7 +30,7 @@ from tdhil.estimation.frequency_domain.signal_filters import (
 )
 from tdhil.estimation.friction_levels import Levels, ViscousConstraint, coulomb_level
 from tdhil.estimation.result import BudgetLine, Estimate, LinePoint, Refusal, ResidualTest, doubtful, rejects
-from tdhil.estimation.spectrum import ComplexArray, Line
+from tdhil.estimation.spectrum import ComplexArray, SpectralLine
 from tdhil.recording import LagPrior
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -122,13 +122,13 @@ def refuse_count(lines: int, constraint: ViscousConstraint | None, priors: tuple
 # part.
 
 
-def fitted_points(fitted: Fitted, confidence: float) -> tuple[LinePoint, ...]:
+def fitted_points(fitted: FittedModel, confidence: float) -> tuple[LinePoint, ...]:
     """The lines of a fit beside the likelier of its two answers."""
     problem, theta = fitted.problem, fitted.likelier.theta
     return line_points(problem.unloaded(theta), problem.model.impedance(theta, problem.s), confidence)
 
 
-def line_points(lines: tuple[Line, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:
+def line_points(lines: tuple[SpectralLine, ...], fitted: ComplexArray, confidence: float) -> tuple[LinePoint, ...]:
     """One for each line, in their order; ``fitted`` (K,) is the model's T/ω at them, N·m·s/rad."""
     found = []
     for line, model in zip(lines, fitted, strict=True):
@@ -181,11 +181,11 @@ class RigidResult:
     residual: ResidualTest | None
     budget: tuple[BudgetLine, ...]
     first_order: bool          # first-order lags are the likelier answer
-    fitted: Fitted
+    fitted: FittedModel
 
 
 def fit_rigid(
-    lines: tuple[Line, ...],
+    lines: tuple[SpectralLine, ...],
     levels: Levels,
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
@@ -214,12 +214,12 @@ def fit_rigid(
 
 
 def fit_inertia(
-    lines: tuple[Line, ...],
+    lines: tuple[SpectralLine, ...],
     constraint: ViscousConstraint | None,
     priors: tuple[GaussianPrior, ...],
     fixed: Fixed,
     confidence: float,
-) -> tuple[Estimate, ResidualTest | None, Fitted]:
+) -> tuple[Estimate, ResidualTest | None, FittedModel]:
     """`fit_rigid` as far as J goes, which is a third of it; J without width where the data reject the model."""
     problem = Likelihood(lines, Model(), constraint, priors)
     fitted = fit_model(problem, fixed, rigid_starts(problem), rigid_rivals)
@@ -230,7 +230,7 @@ def fit_inertia(
     return estimate(fitted, INERTIA, confidence), residual, fitted
 
 
-def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
+def _bare(fitted: FittedModel, residual: ResidualTest | None) -> RigidResult:
     """Of a model that the data reject: the values, for whoever wants to look, without width."""
     theta, at = fitted.whole.theta, fitted.problem.model.at
     point = [Estimate(float(x), float(x), float(x)) for x in theta]
@@ -241,7 +241,7 @@ def _bare(fitted: Fitted, residual: ResidualTest | None) -> RigidResult:
     )
 
 
-def lags_of(fitted: Fitted, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
+def lags_of(fitted: FittedModel, confidence: float) -> tuple[Estimate, Estimate, Estimate]:
     """Delay of slow motion in either report, and what torque is late besides.
 
     Where first-order lags are the answer, their intervals are those of first-order lags. The whole family counts half
@@ -264,7 +264,7 @@ def _shifted(one: Estimate, by: float) -> Estimate:
     return Estimate(one.value + by, one.low + by, one.high + by)
 
 
-def _coulomb(levels: Levels, fitted: Fitted, confidence: float) -> Estimate | None:
+def _coulomb(levels: Levels, fitted: FittedModel, confidence: float) -> Estimate | None:
     if len(levels.speed) == 0 or levels.dof < 1.0 or levels.direction == 0.0:
         return None
     free = [index for index in fitted.free if index not in fitted.simple_held]
@@ -302,9 +302,9 @@ def _turned(estimate: Estimate, value: float) -> Estimate:
     return replace(estimate, value=value, low=min(estimate.low, value), high=max(estimate.high, value))
 
 
-def _words(result: RigidResult, as_paper: bool, what: str) -> Words:
+def _words(result: RigidResult, as_paper: bool, what: str) -> ModelWords:
     tied = result.fitted.problem.constraint is not None
-    return Words(
+    return ModelWords(
         "the paper's model, without lags," if as_paper else what,
         if_rejected="identify with the rigid model, which includes reporting lags" if as_paper else
         "look for a compliant load, play, or friction that changes with speed or time; try lower lines",

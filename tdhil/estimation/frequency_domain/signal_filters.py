@@ -46,7 +46,7 @@ _SIGNS: Final = np.array([[1.0], [-1.0]])      # of ln P in the ratio: of speed,
 _SERIES: Final = 1e-3                          # of y², below which a is its series
 
 
-class Ratio:
+class FilterRatio:
     """F_T/F_w at some lines and its slopes, by Horner's rule and without logarithms: thousands are asked for a result.
 
     ``phi`` (6,) = τ_w (s), ρ_w, τ_T (s), ρ_T, u (s²), d (s); ``s`` (K,). ``value`` (K,).
@@ -88,7 +88,7 @@ class Ratio:
 
 
 def filters(phi: FloatArray, s: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is `Ratio`'s."""
+    """F_w and F_T, (K,) each, as far as ``phi`` (6,) tells them apart; their ratio is `FilterRatio`'s."""
     x, y = phi[SPEED_LAG] * s, phi[TORQUE_LAG] * s
     speed = 1.0 / (1.0 + x + phi[SPEED_SHAPE] * x * x)
     torque = np.exp(-phi[SKEW] * s) / (1.0 + y + phi[TORQUE_SHAPE] * y * y)

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tdhil.estimation.samples import Stretch
-from tdhil.estimation.spectrum import ComplexArray, Line, PeriodLines, pooled_lines, torque_lines
+from tdhil.estimation.spectrum import ComplexArray, PeriodLines, SpectralLine, pooled_lines, torque_lines
 from tdhil.recording import FloatArray
 
 MOST_MODES = 3
@@ -39,7 +39,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class _Swing:
+class _ModeShare:
     """The modes' share of a segment: ``left`` of the signals, (2, P, K), and how the lines' means depend on it.
 
     ``mean`` (2, K): of the signals without it. ``uncertain`` (2, K): by how much the variance of a mean is larger for
@@ -53,7 +53,7 @@ class _Swing:
 
 
 @dataclass(frozen=True)
-class _Segment:
+class _ScaledSegment:
     """Lines of P periods, speed and torque, (2, P, K), each divided by its scatter, (2, K)."""
 
     signals: ComplexArray
@@ -67,7 +67,7 @@ class _Segment:
         """What modes and means leave, (2, P, K)."""
         return _centred(self.signals) if not modes else self._fitted(modes)[0]
 
-    def swing(self, modes: Sequence[complex]) -> _Swing:
+    def swing(self, modes: Sequence[complex]) -> _ModeShare:
         """What the modes do here."""
         left, amplitudes, inverse, columns = self._fitted(modes)
         means, about = columns.mean(axis=1), _centred(columns)
@@ -78,7 +78,7 @@ class _Segment:
         at_mean = (means.real, means.imag)
         uncertain = np.sum([np.einsum("ikm,mn,ikn->ik", part, covariance, part) for part in at_mean], axis=0)
         fitted = np.sum([np.einsum("ipkm,mn,ipkn->ik", part, 0.5 * inverse, part) for part in parts], axis=0)
-        return _Swing(left, self.signals.mean(axis=1) - means @ amplitudes, uncertain / variance, fitted)
+        return _ModeShare(left, self.signals.mean(axis=1) - means @ amplitudes, uncertain / variance, fitted)
 
     def _fitted(self, modes: Sequence[complex]) -> tuple[ComplexArray, FloatArray, FloatArray, ComplexArray]:
         """What is left, (2, P, K); amplitudes (M,), the inverse of their normal matrix, and their columns."""
@@ -117,7 +117,7 @@ def _centred(values: ComplexArray) -> ComplexArray:
 
 def settled_lines(
     fits: tuple[PeriodLines, ...], cut: tuple[Stretch, ...], viscous: float, warming_nm_s: tuple[float, ...] = ()
-) -> tuple[Line, ...]:
+) -> tuple[SpectralLine, ...]:
     """As `pooled_lines`, without what dies away; those very lines where nothing does. ``fits`` of the stretches."""
     plain = pooled_lines(fits, viscous, warming_nm_s)
     rates = warming_nm_s or (0.0,) * len(fits)
@@ -134,18 +134,18 @@ def settled_lines(
     return tuple(_line(hertz, column, segments, swings, len(modes)) for column, hertz in enumerate(fits[0].lines_hz))
 
 
-def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: float) -> _Segment:
+def _segment(fit: PeriodLines, torque: ComplexArray, stretch: Stretch, viscous: float) -> _ScaledSegment:
     values = np.stack([fit.speed, torque])
     scatter = np.sqrt(np.mean(np.abs(_centred(values[:, values.shape[1] // 2 :])) ** 2, axis=1))
     scatter = np.maximum(scatter, _ROUNDING * np.max(np.abs(values), axis=(1, 2))[:, None])
     period_s = stretch.segment.period_s
     begin_s = period_s * (np.array(stretch.index, dtype=np.float64) - stretch.index[0])
-    return _Segment(
+    return _ScaledSegment(
         values / scatter[:, None, :], scatter, begin_s, period_s, 2.0 * np.pi * np.array(fit.lines_hz), viscous
     )
 
 
-def _modes(segments: Sequence[_Segment]) -> tuple[complex, ...]:
+def _modes(segments: Sequence[_ScaledSegment]) -> tuple[complex, ...]:
     """Those that are worth their parameters."""
     found: tuple[complex, ...] = ()
     now = _misfit(segments, found)
@@ -161,7 +161,7 @@ def _modes(segments: Sequence[_Segment]) -> tuple[complex, ...]:
     return found
 
 
-def _misfit(segments: Sequence[_Segment], modes: Sequence[complex]) -> float:
+def _misfit(segments: Sequence[_ScaledSegment], modes: Sequence[complex]) -> float:
     """−2 ln L with every line's variance concentrated out, but for a constant."""
     total = 0.0
     for segment in segments:
@@ -171,13 +171,13 @@ def _misfit(segments: Sequence[_Segment], modes: Sequence[complex]) -> float:
     return total
 
 
-def _grid(segment: _Segment) -> list[complex]:
+def _grid(segment: _ScaledSegment) -> list[complex]:
     low, high = _BEYOND[0] * segment.omega.min(), _BEYOND[1] * segment.omega.max()
     turns = np.geomspace(low, high, round(_PER_OCTAVE * np.log2(high / low)))
     return [complex(-decay / segment.period_s, turn) for turn in turns for decay in _DECAYS]
 
 
-def _refined(segments: Sequence[_Segment], modes: tuple[complex, ...]) -> tuple[complex, ...]:
+def _refined(segments: Sequence[_ScaledSegment], modes: tuple[complex, ...]) -> tuple[complex, ...]:
     from scipy.optimize import minimize
 
     period_s, omega = segments[0].period_s, float(segments[0].omega.min())
@@ -203,8 +203,8 @@ def _refined(segments: Sequence[_Segment], modes: tuple[complex, ...]) -> tuple[
 
 
 def _line(
-    hertz: float, column: int, segments: Sequence[_Segment], swings: Sequence[_Swing], modes: int
-) -> Line:
+    hertz: float, column: int, segments: Sequence[_ScaledSegment], swings: Sequence[_ModeShare], modes: int
+) -> SpectralLine:
     nu, means, counts = 0.0, [], []
     scatter = np.zeros((2, 2), dtype=np.complex128)
     for segment, swing in zip(segments, swings, strict=True):
@@ -218,7 +218,7 @@ def _line(
     nu = max(1.0, nu - modes / (2.0 * len(segments[0].omega)))
     speed, torque = np.array(means).T
     covariance = scatter / nu
-    return Line(
+    return SpectralLine(
         hertz, speed, torque, np.array(counts), float(covariance[0, 0].real), float(covariance[1, 1].real),
         complex(covariance[1, 0]), nu,
     )

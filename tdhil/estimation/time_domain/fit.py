@@ -51,7 +51,7 @@ _TOP_SHARE = 0.2      # of the bins, the highest: where a record moves least
 
 
 @dataclass(frozen=True)
-class Noise:
+class BinNoise:
     """``variance`` (M,) of every bin's residual, and ``count`` (M,): over how many bins it was averaged."""
 
     variance: FloatArray
@@ -76,21 +76,21 @@ def smoothed(hertz: FloatArray, power: FloatArray, width: float = _WIDTH) -> tup
     return mean, count
 
 
-def from_residuals(bins: Bins, error: ComplexArray, leverage: FloatArray) -> Noise:
+def from_residuals(bins: Bins, error: ComplexArray, leverage: FloatArray) -> BinNoise:
     """The noise that residuals with these leverages speak of."""
     power = np.abs(error) ** 2 / (bins.energy * np.maximum(1.0 - leverage, 0.05))
     mean, count = smoothed(bins.hertz, power)
     floor = 1e-12 * float(np.max(np.abs(bins.torque[:, 0]) ** 2 / bins.energy)) if len(bins) else 0.0
-    return Noise(bins.energy * np.maximum(mean, max(floor, 1e-300)), count)
+    return BinNoise(bins.energy * np.maximum(mean, max(floor, 1e-300)), count)
 
 
-def guessed(bins: Bins, inertia: float) -> Noise:
+def guessed(bins: Bins, inertia: float) -> BinNoise:
     """Before any fit: white noise in both signals as at the highest frequencies, and 3 % of the torque."""
     top = bins.hertz >= (1.0 - _TOP_SHARE) * float(np.max(bins.hertz))
     floors = [float(np.median(np.abs(x[top, 0]) ** 2 / bins.energy[top])) for x in (bins.torque, bins.speed)]
     share, count = smoothed(bins.hertz, (0.03 * np.abs(bins.torque[:, 0])) ** 2 / bins.energy)
     power = floors[0] + np.abs(inertia * bins.s) ** 2 * floors[1] + share
-    return Noise(bins.energy * np.maximum(power, 1e-300), count)
+    return BinNoise(bins.energy * np.maximum(power, 1e-300), count)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ _SHARED = 0.5         # of the residual
 
 
 @dataclass(frozen=True)
-class Problem:
+class FitProblem:
     """The equations, their noise, what is known beforehand, and which parameters are free."""
 
     bins: Bins
@@ -168,7 +168,7 @@ def box(inertia: float, middle_rad_s: float, torque_nm: float, priors: tuple[Gau
     return Box(low, high, scale)
 
 
-def minimise(problem: Problem, start: FloatArray, held: dict[int, float] | None = None) -> Fit:
+def minimise(problem: FitProblem, start: FloatArray, held: dict[int, float] | None = None) -> Fit:
     """One descent from ``start``; what is not free, or held, keeps its value."""
     from scipy.optimize import least_squares
 
@@ -203,7 +203,7 @@ def minimise(problem: Problem, start: FloatArray, held: dict[int, float] | None 
     return Fit(full, float(2.0 * found.cost))
 
 
-def covariance(problem: Problem, theta: FloatArray, free: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+def covariance(problem: FitProblem, theta: FloatArray, free: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
     """Of the free parameters in the quadratic approximation (F, F), and the leverage of every bin (M,)."""
     _, slopes = problem.stacked(theta)
     scale = problem.box.scale[list(free)]
@@ -242,16 +242,16 @@ _UNSEEN = 0.1            # standard deviations that friction as large as the who
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundFit:
     """The problem as it stands in the end, its fit, and of all bins those that stand clear; ``keep``: what was used."""
 
-    problem: Problem
+    problem: FitProblem
     fit: Fit
     clear: int
     keep: BoolArray
 
 
-def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> tuple[Found, ...]:
+def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float) -> tuple[FoundFit, ...]:
     """In a wide band and in a narrow one, in this order; none where too few bins stand clear of the noise.
 
     Filters are taken as one pole each.
@@ -262,7 +262,7 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
     levels = tuple(index for index, column in ((FORWARD, 0), (BACK, 1)) if np.any(bins.level[:, column]))
     free = (INERTIA, VISCOUS, SPEED_LAG, TORQUE_LAG, SKEW, *levels)
     limits = box(inertia, 1.0, torque_span_nm, priors)
-    every = Problem(bins, guessed(bins, inertia).variance, priors, free, limits)
+    every = FitProblem(bins, guessed(bins, inertia).variance, priors, free, limits)
     keep = _worth_a_look(every, inertia)
     problem = _part(every, keep)
     fit = min((minimise(problem, _start(inertia, lags, priors)) for lags in _STARTS), key=lambda one: one.objective)
@@ -273,7 +273,7 @@ def search(bins: Bins, priors: tuple[GaussianPrior, ...], torque_span_nm: float)
     return (narrow,) if wide is None or len(wide.problem.bins) <= len(narrow.problem.bins) else (wide, narrow)
 
 
-def _settled(every: Problem, keep: BoolArray, fit: Fit, phase: float) -> Found | None:
+def _settled(every: FitProblem, keep: BoolArray, fit: Fit, phase: float) -> FoundFit | None:
     """After some rounds from ``fit``, of the bins ``keep`` (M,); None where too few bins stand clear of the noise."""
     bins, free = every.bins, every.free
     problem = _part(every, keep)
@@ -296,10 +296,10 @@ def _settled(every: Problem, keep: BoolArray, fit: Fit, phase: float) -> Found |
     if unseen := _unseen_levels(problem, fit.theta):
         problem = replace(problem, free=tuple(index for index in problem.free if index not in unseen))
         fit = minimise(problem, _levelled(every, fit.theta, unseen))
-    return Found(problem, fit, clear, keep)
+    return FoundFit(problem, fit, clear, keep)
 
 
-def _starts_from(problem: Problem, theta: FloatArray) -> Iterator[FloatArray]:
+def _starts_from(problem: FitProblem, theta: FloatArray) -> Iterator[FloatArray]:
     """Theta, and where it has no lag to speak of on one signal the first lags once more.
 
     At no lag descents stand still, a minimum or not: the skew takes a short lag's delay back, and its square, which is
@@ -314,7 +314,7 @@ def _starts_from(problem: Problem, theta: FloatArray) -> Iterator[FloatArray]:
             yield start
 
 
-def _unseen_levels(problem: Problem, theta: FloatArray) -> tuple[int, ...]:
+def _unseen_levels(problem: FitProblem, theta: FloatArray) -> tuple[int, ...]:
     """A constant friction shows at frequency zero and next to it alone; without those bins its value is anything.
 
     What is then left of it in the others is the arithmetic's, and following it would leave everything open.
@@ -324,7 +324,7 @@ def _unseen_levels(problem: Problem, theta: FloatArray) -> tuple[int, ...]:
     return tuple(index for index in (FORWARD, BACK) if index in problem.free and weight[index] < _UNSEEN)
 
 
-def _levelled(every: Problem, theta: FloatArray, unseen: tuple[int, ...]) -> FloatArray:
+def _levelled(every: FitProblem, theta: FloatArray, unseen: tuple[int, ...]) -> FloatArray:
     """The same with the levels that no chosen bin sees as frequency zero has them, all else given."""
     if not unseen:
         return theta
@@ -336,13 +336,13 @@ def _levelled(every: Problem, theta: FloatArray, unseen: tuple[int, ...]) -> Flo
     return found
 
 
-def _plain(problem: Problem, fit: Fit) -> FloatArray:
+def _plain(problem: FitProblem, fit: Fit) -> FloatArray:
     """Without lags, where that does about as well: lags that are alike cancel, and would be found anywhere."""
     without = minimise(problem, fit.theta, {SPEED_LAG: 0.0, TORQUE_LAG: 0.0})
     return without.theta if without.objective - fit.objective <= _ABOUT_AS_WELL else fit.theta
 
 
-def _part(every: Problem, keep: BoolArray) -> Problem:
+def _part(every: FitProblem, keep: BoolArray) -> FitProblem:
     return replace(every, bins=every.bins.chosen(keep), variance=every.variance[keep])
 
 
@@ -355,7 +355,7 @@ def _rough(bins: Bins) -> float | None:
     return found if 0.0 < found < math.inf else None
 
 
-def _worth_a_look(every: Problem, inertia: float) -> BoolArray:
+def _worth_a_look(every: FitProblem, inertia: float) -> BoolArray:
     """For the first fit: where torque and acceleration stand above their noise at the highest frequencies."""
     bins = every.bins
     moved, _ = smoothed(bins.hertz, np.abs(inertia * bins.s * bins.speed[:, 0]) ** 2 / bins.energy, _NARROW)

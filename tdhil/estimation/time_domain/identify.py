@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from tdhil.estimation.case import Case, Finding, Words
+from tdhil.estimation.case import Case, Finding, ModelWords
 from tdhil.estimation.frequency_domain import (
     LAG_BOUND_S,
     SKEW_BOUND_S,
@@ -229,7 +229,7 @@ def _is_open(inertia: Estimate) -> bool:
 
 def _finding(solved: Solved, case: Case) -> Finding:
     most = max(solved.budget, key=lambda line: line.half_width_kg_m2).source if solved.budget else ""
-    words = Words(
+    words = ModelWords(
         "a rigid shaft seen through reporting lags",
         "look for a compliant load, play, or friction that changes with speed or time; try slower motion",
         _WIDE.get(

@@ -28,8 +28,8 @@ from tdhil.estimation.time_domain.equation import (
     VISCOUS,
     evaluate,
 )
-from tdhil.estimation.time_domain.fit import Found, Problem, covariance, minimise, search
-from tdhil.estimation.time_domain.windows import Bins, Window
+from tdhil.estimation.time_domain.fit import FitProblem, FoundFit, covariance, minimise, search
+from tdhil.estimation.time_domain.windows import Bins, TaperWindow
 from tdhil.recording import FloatArray
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -47,7 +47,7 @@ _GROUPS = (6, 4, 3)      # bins a group: the most that leave enough groups; a ma
 _FIRST = 2       # bins of a window below it are friction's, constant and all
 
 
-def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTest | None:
+def local_test(problem: FitProblem, theta: FloatArray, factor: float) -> ResidualTest | None:
     """F test of the model against local straight lines; None if there are not enough bins in a row.
 
     ``factor``: by how much more than its noise model says the inertia scatters over time. Noise that comes with the
@@ -57,7 +57,7 @@ def local_test(problem: Problem, theta: FloatArray, factor: float) -> ResidualTe
     return next((test for test in tests if test is not None), None)
 
 
-def _local_test(problem: Problem, theta: FloatArray, factor: float, group: int) -> ResidualTest | None:
+def _local_test(problem: FitProblem, theta: FloatArray, factor: float, group: int) -> ResidualTest | None:
     found = evaluate(theta, problem.bins)
     bins, variance = problem.bins, problem.variance
     by_model, by_line, dof_model, dof_line = 0.0, 0.0, 0, 0
@@ -105,14 +105,14 @@ _LEAST_BLOCKS = 10
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockVariance:
     """Of one direction in parameter space: the sandwich's variance, and how many blocks it rests on."""
 
     variance: float
     count: float
 
 
-def block_scores(problem: Problem, placed: tuple[Window, ...], theta: FloatArray) -> FloatArray:
+def block_scores(problem: FitProblem, placed: tuple[TaperWindow, ...], theta: FloatArray) -> FloatArray:
     """g_b (blocks, 10), in the order of time."""
     total = sum(window.hop_s for window in placed)
     length = max(total / _BLOCKS, min(_BLOCK_S, total / _LEAST_BLOCKS))
@@ -135,16 +135,16 @@ def block_scores(problem: Problem, placed: tuple[Window, ...], theta: FloatArray
     return np.concatenate(scores) if scores else np.zeros((0, len(theta)))
 
 
-def sandwich(scores: FloatArray, direction: FloatArray) -> Blocks:
+def sandwich(scores: FloatArray, direction: FloatArray) -> BlockVariance:
     """Of directionᵀ·theta, where ``direction`` = H⁻¹ e (10,)."""
     each = scores @ direction
     if len(each) < 3:
-        return Blocks(0.0, 1.0)
+        return BlockVariance(0.0, 1.0)
     square = float(each @ each)
     neighbours = float(each[1:] @ each[:-1])
     count = square**2 / max(float(np.sum(each**4)), 1e-300)
     # each block's share has lost what the fit took from it: about one part in their effective number
-    return Blocks(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
+    return BlockVariance(max(square + neighbours, 0.5 * square) * count / max(count - 1.0, 1.0), count)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -174,7 +174,7 @@ class Spread:
     lean: float
 
 
-def spread(problem: Problem, fit: Fit, scores: FloatArray, index: int, confidence: float) -> Spread:
+def spread(problem: FitProblem, fit: Fit, scores: FloatArray, index: int, confidence: float) -> Spread:
     """How uncertain a parameter is; ``scores`` of the blocks of time at this fit (`block_scores`)."""
     found, _ = covariance(problem, fit.theta, problem.free)
     at = problem.free.index(index)
@@ -191,7 +191,7 @@ def spread(problem: Problem, fit: Fit, scores: FloatArray, index: int, confidenc
     return Spread(sd, max(factor, 1.0), student_quantile(confidence, max(dof, _LEAST_DOF)), lean)
 
 
-def direction_gap(problem: Problem, theta: FloatArray) -> FloatArray:
+def direction_gap(problem: FitProblem, theta: FloatArray) -> FloatArray:
     """The score's shift, (10,), if all noise were in the speed instead of the torque.
 
     Least squares makes the residual e orthogonal to ∂G W, the speed as reported. If the noise moved the speed, T/G
@@ -207,13 +207,13 @@ def direction_gap(problem: Problem, theta: FloatArray) -> FloatArray:
     return np.asarray((logs.real * weight[:, None]).sum(axis=0), dtype=np.float64)
 
 
-def with_shapes(problem: Problem, stated: tuple[int, ...]) -> Problem:
+def with_shapes(problem: FitProblem, stated: tuple[int, ...]) -> FitProblem:
     """The same with the filters' structure free, but for a lag that was stated: that is a one-pole filter's."""
     shapes = [shape for lag, shape in ((SPEED_LAG, SPEED_SHAPE), (TORQUE_LAG, TORQUE_SHAPE)) if lag not in stated]
     return replace(problem, free=(*problem.free, *shapes))
 
 
-def best_shapes(problem: Problem, near: Fit) -> Fit:
+def best_shapes(problem: FitProblem, near: Fit) -> Fit:
     """The lowest of some descents from the one-pole fit."""
     fits = [near]
     for shapes in _SHAPE_STARTS:
@@ -225,7 +225,7 @@ def best_shapes(problem: Problem, near: Fit) -> Fit:
     return min(fits, key=lambda fit: fit.objective)
 
 
-def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) -> Estimate:
+def profile(problem: FitProblem, best: Fit, index: int, reach: float, step: float) -> Estimate:
     """Where the profile has risen by reach² on either side of ``best``; a bound, or ±inf, if it never does."""
 
     def refit(start: FloatArray, value: float) -> Fit:
@@ -245,7 +245,7 @@ def profile(problem: Problem, best: Fit, index: int, reach: float, step: float) 
     return Estimate(float(best.theta[index]), low, high)
 
 
-def _shares(problem: Problem, theta: FloatArray, direction: FloatArray) -> float:
+def _shares(problem: FitProblem, theta: FloatArray, direction: FloatArray) -> float:
     """On how many bins the parameter rests: (Σ c)²/Σ c² of their shares in its variance."""
     _, slopes = problem.stacked(theta)
     count = len(problem.bins)
@@ -284,7 +284,7 @@ class ShaftEquation:
     ``scores`` (blocks, 10) are those of the fit with one-pole filters.
     """
 
-    problem: Problem
+    problem: FitProblem
     fit: Fit
     scores: FloatArray
     spread: Spread
@@ -297,7 +297,8 @@ class ShaftEquation:
 
 
 def solve(
-    bins: Bins, placed: tuple[Window, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float, confidence: float
+    bins: Bins, placed: tuple[TaperWindow, ...], priors: tuple[GaussianPrior, ...], torque_span_nm: float,
+    confidence: float
 ) -> Solved | None:
     """In the wide band where it tells J, can be tested, and the model holds, else in the narrow one.
 
@@ -314,7 +315,8 @@ def solve(
 
 
 def _solve(
-    found: Found, placed: tuple[Window, ...], stated: tuple[int, ...], confidence: float, narrower: tuple[Found, ...]
+    found: FoundFit, placed: tuple[TaperWindow, ...], stated: tuple[int, ...], confidence: float,
+    narrower: tuple[FoundFit, ...]
 ) -> Solved:
     """What lies within a standard deviation of a narrower band's answer is part of the interval.
 
@@ -361,7 +363,7 @@ def _solve(
 
 
 def _shaft(
-    problem: Problem, fit: Fit, placed: tuple[Window, ...], stated: tuple[int, ...], confidence: float
+    problem: FitProblem, fit: Fit, placed: tuple[TaperWindow, ...], stated: tuple[int, ...], confidence: float
 ) -> ShaftEquation:
     """J's interval over every structure of the filters; its value of one pole each and of any, as each weighs."""
     scores = block_scores(problem, placed, fit.theta)
@@ -378,7 +380,7 @@ def _shaft(
     return ShaftEquation(open_problem if shaped else problem, best if shaped else fit, scores, own, inertia, shaped)
 
 
-def _deviation(found: Found) -> float:
+def _deviation(found: FoundFit) -> float:
     """Standard deviation of J, with one pole each."""
     spread_of, _ = covariance(found.problem, found.fit.theta, found.problem.free)
     at = found.problem.free.index(INERTIA)
@@ -393,7 +395,7 @@ def _estimate(shaft: ShaftEquation, index: int, confidence: float) -> Estimate:
     return Estimate(found.value, min(found.low, found.value), max(found.high, found.value))
 
 
-def _coulomb(problem: Problem, fit: Fit, own: Spread) -> Estimate | None:
+def _coulomb(problem: FitProblem, fit: Fit, own: Spread) -> Estimate | None:
     """T_c along the rotation; load included where it turned one way only."""
     both = [index for index in (FORWARD, BACK) if index in problem.free]
     if not both:

@@ -116,7 +116,7 @@ _LEAST_SAMPLES = 32
 
 
 @dataclass(frozen=True)
-class Window:
+class TaperWindow:
     """Where a window lies in its run: tapers of ``taper_s`` at both ends, ``hop_s`` from one window to the next.
 
     ``finer``: how many of the run's samples stand for one that was recorded.
@@ -180,9 +180,9 @@ def joined(parts: list[Bins]) -> Bins:
                   for name in ("s", "speed", "torque", "level", "bend", "energy", "window")))
 
 
-def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[Window, ...]:
+def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[TaperWindow, ...]:
     """All windows of all runs, in the order of time."""
-    placed: list[Window] = []
+    placed: list[TaperWindow] = []
     for run in found:
         length = run.length_s
         taper = min(_TAPER_S, _TAPER_SHARE * length)
@@ -191,7 +191,7 @@ def place_windows(found: tuple[OneWayStretch, ...]) -> tuple[Window, ...]:
         finer = math.ceil(_OF_TAPER * length / (taper * len(run.samples)))
         fine = _interpolated(run, finer) if finer > 1 else run
         for number in range(count):
-            window = Window(run, float(run.samples.time_s[0]) + number * hop, hop, taper, len(placed))
+            window = TaperWindow(run, float(run.samples.time_s[0]) + number * hop, hop, taper, len(placed))
             if len(window.part(0.0, hop + taper)) >= _LEAST_SAMPLES:
                 placed.append(replace(window, run=fine, finer=finer))
     return tuple(placed)
@@ -213,7 +213,7 @@ def _interpolated(run: OneWayStretch, finer: int) -> OneWayStretch:
     return replace(run, samples=Samples(even + start, fine[:, 0], fine[:, 1]))
 
 
-def measure(window: Window) -> Bins:
+def measure(window: TaperWindow) -> Bins:
     """Every frequency of a window."""
     part = window.part(0.0, window.length_s)
     time = part.time_s - window.start_s
@@ -224,7 +224,7 @@ def measure(window: Window) -> Bins:
     return seen_through(window, part, window.shape(time), s)
 
 
-def seen_through(window: Window, part: Samples, shape: FloatArray, s: ComplexArray) -> Bins:
+def seen_through(window: TaperWindow, part: Samples, shape: FloatArray, s: ComplexArray) -> Bins:
     """The samples ``part`` (N) through ``shape`` (N, 4), a test function and its derivatives, at ``s`` (M,)."""
     time, speed, torque = part.time_s - window.start_s, part.speed_rad_s, part.torque_nm
     step = np.empty_like(time)

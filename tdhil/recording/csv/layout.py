@@ -28,7 +28,7 @@ _TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True)
-class Unit:
+class ColumnUnit:
     """Of a column. ``factor`` into SI; ``of_rated``: the factor is a share of the rated torque."""
 
     quantity: str
@@ -37,9 +37,9 @@ class Unit:
     of_rated: bool = False
 
 
-_TURNS = Unit("speed", "1/s", _TURN)
-_PERCENT = Unit("torque", "%", 1e-2, of_rated=True)
-_PERMILLE = Unit("torque", "‰", 1e-3, of_rated=True)
+_TURNS = ColumnUnit("speed", "1/s", _TURN)
+_PERCENT = ColumnUnit("torque", "%", 1e-2, of_rated=True)
+_PERMILLE = ColumnUnit("torque", "‰", 1e-3, of_rated=True)
 
 # What a trace may say beyond `profiles.quantities`, which takes nothing that could mean two things.
 _ALSO = {
@@ -54,7 +54,7 @@ _BRACKETED = re.compile(r"^(.*?)\s*[\[(<]\s*([^\[\]()<>]*?)\s*[\])>]$")
 _IGNORED = re.compile(r"[\s·.*⋅_^⁻-]")
 
 
-def unit_of(quantity: str, text: str) -> Unit | None:
+def unit_of(quantity: str, text: str) -> ColumnUnit | None:
     """The unit that ``text`` spells for a quantity: ``rpm``, ``[1/min]``, ``N.m``; None if none of ours."""
     found = _BRACKETED.match(text.strip())
     inner = found.group(2) if found is not None and not found.group(1) else text
@@ -66,8 +66,8 @@ def unit_of(quantity: str, text: str) -> Unit | None:
     return _in_trace(known) if known is not None and known.dimension == quantity else None
 
 
-def _in_trace(unit: quantities.Unit) -> Unit:
-    return Unit(unit.dimension, unit.symbol, unit.times / unit.over)
+def _in_trace(unit: quantities.Unit) -> ColumnUnit:
+    return ColumnUnit(unit.dimension, unit.symbol, unit.times / unit.over)
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -76,7 +76,7 @@ def split_name(name: str) -> tuple[str, str]:
     return (found.group(1), found.group(2)) if found is not None and found.group(1) else (name, "")
 
 
-def unit_in_name(quantity: str, name: str) -> Unit | None:
+def unit_in_name(quantity: str, name: str) -> ColumnUnit | None:
     """The unit a column's name ends with: ``speed_rad_s``, ``n_rpm``, ``Torque [%]``; the longest ending counts."""
     base, bracketed = split_name(name)
     if bracketed:
@@ -101,21 +101,21 @@ _NEXT = "Such as: --columns time=t_s speed=n_rpm:rpm torque=m:Nm"
 
 
 @dataclass(frozen=True)
-class Choice:
+class ColumnChoice:
     """The column called ``name`` holds ``quantity``; ``unit`` None: as the file says. No name: the usual ones."""
 
     quantity: str
     name: str = ""
-    unit: Unit | None = None
+    unit: ColumnUnit | None = None
 
 
-Choices = tuple[Choice, Choice, Choice]
-USUAL: Choices = (Choice("time"), Choice("speed"), Choice("torque"))
+Choices = tuple[ColumnChoice, ColumnChoice, ColumnChoice]
+USUAL: Choices = (ColumnChoice("time"), ColumnChoice("speed"), ColumnChoice("torque"))
 
 
 def parse_columns(items: Iterable[str]) -> Choices:
     """Time, speed and torque, in this order; one that isn't named keeps its usual name. UsageError."""
-    found: dict[str, Choice] = {}
+    found: dict[str, ColumnChoice] = {}
     for item in items:
         quantity, equals, name = item.partition("=")
         quantity = quantity.strip().casefold()
@@ -131,21 +131,21 @@ def parse_columns(items: Iterable[str]) -> Choices:
     names = [choice.name.casefold() for choice in found.values()]
     if len(set(names)) < len(names):
         raise UsageError("one column can't hold two quantities", where=_WHERE, next_step=_NEXT)
-    time, speed, torque = (found.get(quantity, Choice(quantity)) for quantity in QUANTITIES)
+    time, speed, torque = (found.get(quantity, ColumnChoice(quantity)) for quantity in QUANTITIES)
     return time, speed, torque
 
 
-def _choice(quantity: str, text: str) -> Choice:
+def _choice(quantity: str, text: str) -> ColumnChoice:
     name, colon, spelt = text.rpartition(":")
     if not colon or spelt.startswith(" "):       # "Axis 1: speed" is a name
-        return Choice(quantity, text)
+        return ColumnChoice(quantity, text)
     unit = unit_of(quantity, spelt)
     if unit is None or not name:
         raise UsageError(
             f"{shown(spelt)!r} is no unit of {quantity}; there are {', '.join(known_units(quantity))}",
             where=_WHERE, next_step="If the colon belongs to the column's name, write the unit behind another colon",
         )
-    return Choice(quantity, name.strip(), unit)
+    return ColumnChoice(quantity, name.strip(), unit)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ def find_header(lines: Sequence[str], choices: Choices, file: str) -> Header:
     raise _no_column(missing, names, f"{file}:{number}")
 
 
-def _positions(names: Sequence[str], choice: Choice) -> list[int]:
+def _positions(names: Sequence[str], choice: ColumnChoice) -> list[int]:
     """The columns that answer to a choice: by the whole name, else by the name without its unit."""
     full = [_folded(name) for name in names]
     bare = [_folded(split_name(name)[0]) for name in names]
@@ -239,7 +239,7 @@ def _one_each(
     return time, speed, torque
 
 
-def _no_column(choice: Choice, names: Sequence[str], where: str) -> CsvMisnamed:
+def _no_column(choice: ColumnChoice, names: Sequence[str], where: str) -> CsvMisnamed:
     there = [name for name in names if name]
     listed = ", ".join(shown(name) for name in there[:12]) + (", …" if len(there) > 12 else "")
     wanted = choice.name or choice.quantity
@@ -260,18 +260,18 @@ _LOOKED_AT = 5000   # rows, for the decimal sign
 
 
 @dataclass(frozen=True)
-class Layout:
+class ColumnLayout:
     """``units`` of time, speed, torque; ``clock``: the time is written as such; ``comma``: the decimal sign."""
 
     header: Header
     first_line: int
-    units: tuple[Unit, Unit, Unit]
+    units: tuple[ColumnUnit, ColumnUnit, ColumnUnit]
     clock: bool
     comma: bool
     assumed: tuple[str, ...]
 
 
-def find_layout(lines: Sequence[str], choices: Choices, file: str) -> Layout:
+def find_layout(lines: Sequence[str], choices: Choices, file: str) -> ColumnLayout:
     """From the file's first block. CsvMisnamed for columns and units, CsvUnusable where no number follows."""
     header = find_header(lines, choices, file)
     below = range(header.line, min(header.line + _BELOW + 1, len(lines)))     # positions, so one line further
@@ -297,14 +297,14 @@ def find_layout(lines: Sequence[str], choices: Choices, file: str) -> Layout:
     units, assumed = [], [f"{file}: numbers were read with a decimal comma"] if sign == "," else []
     for position, choice in enumerate(choices):
         if clock and choice.quantity == "time":
-            units.append(Unit("time", "clock", 1.0))
+            units.append(ColumnUnit("time", "clock", 1.0))
             assumed.append(f"{file}: clock times; the first row is at 0 s")
             continue
         name = header.names[header.columns[position]]
         unit, notes = _unit(choice, name, stated[position], where)
         units.append(unit)
         assumed += [f"{file}: {note}" for note in notes]
-    return Layout(header, first + 1, (units[0], units[1], units[2]), clock, sign == ",", tuple(assumed))
+    return ColumnLayout(header, first + 1, (units[0], units[1], units[2]), clock, sign == ",", tuple(assumed))
 
 
 def _telling(lines: Sequence[str], delimiter: str) -> list[str]:
@@ -327,7 +327,7 @@ def _holds_data(row: Sequence[str]) -> bool:
     ) and timed + sum(values) >= 1
 
 
-def _unit(choice: Choice, name: str, stated: str, where: str) -> tuple[Unit, list[str]]:
+def _unit(choice: ColumnChoice, name: str, stated: str, where: str) -> tuple[ColumnUnit, list[str]]:
     """The unit of one column, and what has to be said about it."""
     quantity = choice.quantity
     below = unit_of(quantity, stated)

@@ -12,8 +12,17 @@ from numpy.typing import NDArray
 
 from tdhil.errors import CsvUnusable, UsageError
 from tdhil.recording.csv.excitation import load_excitation
-from tdhil.recording.csv.layout import USUAL, Choices, Layout, find_layout
-from tdhil.recording.csv.text import LARGEST, Block, ClockReader, blocks, encoding_of, is_missing, number, split_cells
+from tdhil.recording.csv.layout import USUAL, Choices, ColumnLayout, find_layout
+from tdhil.recording.csv.text import (
+    LARGEST,
+    ClockReader,
+    LineBlock,
+    blocks,
+    encoding_of,
+    is_missing,
+    number,
+    split_cells,
+)
 from tdhil.recording.recording import BoolArray, FloatArray, LagPrior, Recording
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -41,7 +50,7 @@ class Tally:
 class RowReader:
     """Reads a file's blocks in order; as the file has them, not yet in SI, but for clock times."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: ColumnLayout) -> None:
         header = layout.header
         self._layout = layout
         self._width = len(header.names)
@@ -50,7 +59,7 @@ class RowReader:
         self.ragged, self.missing, self.unreadable = Tally(), Tally(), Tally()
         self.rows = 0              # all that weren't blank
 
-    def read(self, block: Block) -> tuple[FloatArray, LineArray]:
+    def read(self, block: LineBlock) -> tuple[FloatArray, LineArray]:
         """(N, 3) time, speed, torque and (N,) line numbers of the usable rows at or below the layout's first line."""
         skipped = max(0, self._layout.first_line - block.first)
         lines, first = block.lines[skipped:], block.first + skipped
@@ -194,7 +203,7 @@ _MOST_ODD = 0.10           # of the rows, ragged or without a number where one s
 
 
 @dataclass(frozen=True)
-class Trace:
+class CsvTrace:
     """(N,) each, SI, time rising; ``warnings`` a line each."""
 
     time_s: FloatArray
@@ -203,7 +212,7 @@ class Trace:
     warnings: tuple[str, ...]
 
 
-def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | None = None) -> Trace:
+def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | None = None) -> CsvTrace:
     """The trace in ``path``. CsvMisnamed for columns and units, CsvUnusable for the rest, both with file and line.
 
     UsageError if the torque is a share of the rated torque, and that isn't given.
@@ -230,10 +239,10 @@ def read_trace(path: Path, choices: Choices = USUAL, rated_torque_nm: float | No
     keep, notes = rising(columns[0], lines, file)
     if not np.all(keep):
         columns = [column[keep] for column in columns]
-    return Trace(columns[0], columns[1], columns[2], (*warnings, *notes))
+    return CsvTrace(columns[0], columns[1], columns[2], (*warnings, *notes))
 
 
-def _factors(layout: Layout, rated_torque_nm: float | None, file: str) -> list[float]:
+def _factors(layout: ColumnLayout, rated_torque_nm: float | None, file: str) -> list[float]:
     factors = []
     for unit in layout.units:
         if unit.of_rated and rated_torque_nm is None:
@@ -247,7 +256,7 @@ def _factors(layout: Layout, rated_torque_nm: float | None, file: str) -> list[f
 
 
 def _collect(
-    source: Iterator[Block], reader: RowReader, warnings: list[str], file: str
+    source: Iterator[LineBlock], reader: RowReader, warnings: list[str], file: str
 ) -> tuple[list[FloatArray], LineArray]:
     """The three columns and the lines, at most `MAX_ROWS` of them."""
     parts: tuple[list[FloatArray], ...] = ([], [], [])
@@ -272,7 +281,7 @@ def _collect(
     return columns, np.concatenate(numbers)
 
 
-def _left_out(reader: RowReader, layout: Layout, file: str) -> list[str]:
+def _left_out(reader: RowReader, layout: ColumnLayout, file: str) -> list[str]:
     """Warnings for what was dropped; CsvUnusable where that is so much that the rest can't be trusted."""
     ragged, odd = reader.ragged, reader.unreadable
     if ragged.count > _MOST_ODD * reader.rows:

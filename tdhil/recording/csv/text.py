@@ -213,7 +213,7 @@ _PACKED = {
 
 
 @dataclass(frozen=True)
-class Block:
+class LineBlock:
     """Lines without their ends; ``first`` is the number of the first one, from 1."""
 
     first: int
@@ -258,7 +258,7 @@ def _unmarked(head: bytes) -> str:
     return "utf-8"
 
 
-def blocks(path: Path, encoding: str) -> Iterator[Block]:
+def blocks(path: Path, encoding: str) -> Iterator[LineBlock]:
     """The lines of the file, about a million characters at a time. CsvUnusable for a line beyond all measure."""
     first, rest = 1, ""
     try:
@@ -273,11 +273,11 @@ def blocks(path: Path, encoding: str) -> Iterator[Block]:
                         next_step="Look at the file in an editor",
                     )
                 if lines:
-                    yield Block(first, lines)
+                    yield LineBlock(first, lines)
                     first += len(lines)
     except OSError as error:
         raise CsvUnusable(f"can't be read ({error.strerror or error})", where=str(path)) from error
     except UnicodeError as error:
         raise CsvUnusable(f"can't be decoded as {encoding}", where=str(path)) from error
     if rest:
-        yield Block(first, [rest])
+        yield LineBlock(first, [rest])

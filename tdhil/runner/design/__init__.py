@@ -1,11 +1,11 @@
 """What to ask of the shaft: lines, amplitudes, mean speeds and periods for the tightest interval, and when to stop."""
 
 from tdhil.runner.design.choice import (
-    SOON_COUNTED as SOON_COUNTED, Choice as Choice, Knowledge as Knowledge, choose as choose,
+    SOON_COUNTED as SOON_COUNTED, Choice as Choice, DesignKnowledge as DesignKnowledge, choose as choose,
     choose_soonest as choose_soonest, refuse_unfit as refuse_unfit,
 )
 from tdhil.runner.design.prediction import (
-    Evidence as Evidence, Noise as Noise, assumed_noise as assumed_noise,
+    Evidence as Evidence, NoiseDensity as NoiseDensity, assumed_noise as assumed_noise,
     expected_half_width as expected_half_width, half_width as half_width, longer as longer,
     measured_noise as measured_noise, predicted as predicted,
 )

@@ -30,7 +30,7 @@ from tdhil.runner.design.prediction import (
     RIGID,
     SPEED_LAG_S,
     TORQUE_LAG_S,
-    Noise,
+    NoiseDensity,
     assumed_theta,
     expected_half_width,
     predicted,
@@ -39,10 +39,10 @@ from tdhil.runner.design.prediction import (
 from tdhil.runner.excitation import (
     LEAST_COUNTED,
     DriveMode,
-    ExcitationWish,
     MotionLimits,
     Plan,
     PlanRefused,
+    PlanRequest,
     RigGuess,
     Shape,
     make_plan,
@@ -65,7 +65,7 @@ _AVERAGE_SHARE = 4.0       # u of an average that delays as long as the longest 
 _CERTAIN = 1e-4
 
 
-def relative_sd(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> float:
+def relative_sd(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> float:
     """Least standard deviation of J after the plan, as a share of J; infinite where J can't be told."""
     first = plan.segments[0]
     period = first.reference.period_s
@@ -160,7 +160,7 @@ def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: Driv
 
     A search over random phases, narrowed around the best ones; seeded, so that the same rig gets the same motion.
     """
-    fit = _Room(proposal, limits, guess, mode)
+    fit = _AmplitudeRoom(proposal, limits, guess, mode)
     rng = np.random.default_rng(len(proposal.harmonics))
     phases = rng.uniform(0.0, 2.0 * np.pi, (_POPULATION, len(proposal.harmonics)))
     room = fit.of(phases)
@@ -173,7 +173,7 @@ def phased(proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: Driv
     return unit_peak(Shape(proposal.harmonics, proposal.amplitudes, tuple(float(phase) for phase in chosen)))
 
 
-class _Room:
+class _AmplitudeRoom:
     """How much of a proposal fits, by its phases."""
 
     def __init__(self, proposal: Proposal, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:
@@ -212,10 +212,10 @@ _SLACK = 1.02         # of the usual plan's time: a transition may take a second
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class DesignKnowledge:
     """What a design rests on besides limits and rough rig."""
 
-    noise: Noise
+    noise: NoiseDensity
     prior: LagPrior
     winds_up: bool = False    # a drill string hangs on the shaft
 
@@ -248,8 +248,8 @@ class Choice:
 def choose(
     limits: MotionLimits,
     guess: RigGuess,
-    wish: ExcitationWish,
-    known: Knowledge,
+    wish: PlanRequest,
+    known: DesignKnowledge,
     confidence: float,
     time_s: float | None = None,
 ) -> Choice:
@@ -302,8 +302,8 @@ def choose(
 def choose_soonest(
     limits: MotionLimits,
     guess: RigGuess,
-    wish: ExcitationWish,
-    known: Knowledge,
+    wish: PlanRequest,
+    known: DesignKnowledge,
     confidence: float,
     tolerance: float,
     time_s: float,
@@ -353,13 +353,13 @@ def _until_s(plan: Plan, width: float, tolerance: float) -> float:
     return plan.duration_s + counted_s * float(np.mean(missing))
 
 
-def _fixed(wish: ExcitationWish) -> bool:
+def _fixed(wish: PlanRequest) -> bool:
     """Does the wish leave no lines to choose?"""
     return not periodic_kind(wish.kind).tuned or wish.frequency_hz is not None or wish.periods is not None
 
 
 def refuse_unfit(
-    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float | None
+    limits: MotionLimits, guess: RigGuess, wish: PlanRequest, known: DesignKnowledge, time_s: float | None
 ) -> None:
     """PlanRefused where `choose` would find nothing, without weighing what it would find."""
     try:
@@ -385,14 +385,14 @@ def refuse_unfit(
 STRING = Proposal(0.08, tuple(range(1, 11)), 1.0)
 
 
-def _for_string(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, time_s: float) -> Plan:
+def _for_string(limits: MotionLimits, guess: RigGuess, wish: PlanRequest, time_s: float) -> Plan:
     shape = phased(STRING, limits, guess, wish.mode)
     asked = replace(wish, shape=shape, frequency_hz=STRING.lowest_hz, offset_share=OFFSET_SHARES[0])
     return _in_time(make_plan(limits, guess, asked), asked, time_s)
 
 
 def _candidates(
-    limits: MotionLimits, guess: RigGuess, wish: ExcitationWish, known: Knowledge, time_s: float, slope: float
+    limits: MotionLimits, guess: RigGuess, wish: PlanRequest, known: DesignKnowledge, time_s: float, slope: float
 ) -> Iterator[Plan]:
     speeds = 2 if wish.offsets_rad_s is None else len(wish.offsets_rad_s)
     for proposal in proposals(highest_line_hz(max(known.speed_lag_s, known.torque_lag_s)), slope):
@@ -408,7 +408,7 @@ def _candidates(
                 continue
 
 
-def _in_time(plan: Plan, wish: ExcitationWish, time_s: float | None) -> Plan:
+def _in_time(plan: Plan, wish: PlanRequest, time_s: float | None) -> Plan:
     """As many whole periods as fit; raises PlanRefused if those are too few to know the scatter."""
     if time_s is None or wish.periods is not None:
         return plan

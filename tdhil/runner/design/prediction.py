@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from tdhil.estimation import Levels, Line, Samples, Stretch, period_lines, tie_viscous
+from tdhil.estimation import Levels, Samples, SpectralLine, Stretch, period_lines, tie_viscous
 from tdhil.estimation.frequency_domain import (
     SPEED_LAG,
     TORQUE_LAG,
@@ -56,7 +56,7 @@ _LEAST_SHARE = 1e-3        # of the assumed density: less than that, and somethi
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseDensity:
     """Densities S_L, (N·m)²·s, and S_ω, (rad/s)²·s; the load's correlation time, s."""
 
     load_nm2_s: float
@@ -79,10 +79,10 @@ class Noise:
         return density
 
 
-def assumed_noise(torque_limit_nm: float, speed_max_rad_s: float, load_sd_nm: float | None = None) -> Noise:
+def assumed_noise(torque_limit_nm: float, speed_max_rad_s: float, load_sd_nm: float | None = None) -> NoiseDensity:
     """Shares of what the machine can do, which is what a range of machines show; or a load that somebody states."""
     load = LOAD_SHARE * torque_limit_nm if load_sd_nm is None else load_sd_nm
-    return Noise(2.0 * load**2 * LOAD_TIME_S, (SENSOR_SHARE * speed_max_rad_s) ** 2 * _SENSOR_STEP_S)
+    return NoiseDensity(2.0 * load**2 * LOAD_TIME_S, (SENSOR_SHARE * speed_max_rad_s) ** 2 * _SENSOR_STEP_S)
 
 
 def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior) -> FloatArray:
@@ -94,7 +94,7 @@ def assumed_theta(inertia_kg_m2: float, viscous_nm_s_rad: float, prior: LagPrior
     return theta
 
 
-def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noise) -> Noise:
+def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: NoiseDensity) -> NoiseDensity:
     """Densities from stretches of steady speed, at the harmonics of each stretch's own length.
 
     The error's line e = T − G W takes spectra and cross spectrum of the two signals at once, and stays the same under
@@ -113,13 +113,13 @@ def measured_noise(steady: tuple[Samples, ...], theta: FloatArray, fallback: Noi
         return fallback
     hertz, density = np.concatenate(frequencies), np.concatenate(readings)
     low = np.concatenate([np.arange(len(part)) < _LOW_LINES for part in readings])
-    unit_load = Noise(1.0, 0.0).error_density(hertz, theta)
-    unit_speed = Noise(0.0, 1.0).error_density(hertz, theta)
+    unit_load = NoiseDensity(1.0, 0.0).error_density(hertz, theta)
+    unit_speed = NoiseDensity(0.0, 1.0).error_density(hertz, theta)
     load = float(np.mean(density[low] / unit_load[low]))
     speed = float(np.mean((density[~low] - load * unit_load[~low]) / unit_speed[~low])) if np.any(~low) else 0.0
     if not (math.isfinite(load) and math.isfinite(speed)):
         return fallback
-    return Noise(max(load, _LEAST_SHARE * fallback.load_nm2_s), max(speed, 0.0), source="measured")
+    return NoiseDensity(max(load, _LEAST_SHARE * fallback.load_nm2_s), max(speed, 0.0), source="measured")
 
 
 def _readings(samples: Samples, theta: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -152,20 +152,20 @@ LEAST_NU = 2.0      # complex degrees of freedom of a line's weight, below which
 class Evidence:
     """What a fit rests on: lines, levels, and what is stated of the lags."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[SpectralLine, ...]
     levels: Levels
     prior: LagPrior
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedRigid:
     """The rigid model's parameters that the fit settled on, (8,), and J's relative half-width."""
 
     theta: FloatArray
     half_width: float
 
 
-def fit(evidence: Evidence, confidence: float) -> Fitted | None:
+def fit(evidence: Evidence, confidence: float) -> FittedRigid | None:
     """The estimator's own fit; None where it would refuse."""
     constraint = tie_viscous(evidence.levels)
     lines = tuple(line for line in evidence.lines if line.excited and line.nu >= LEAST_NU)
@@ -180,10 +180,10 @@ def fit(evidence: Evidence, confidence: float) -> Fitted | None:
     theta = found.likelier.theta
     if not (half > 0.0 and np.all(np.isfinite(theta))):
         return None
-    return Fitted(theta, half)
+    return FittedRigid(theta, half)
 
 
-def noise_free(evidence: Evidence, fitted: Fitted) -> Evidence:
+def noise_free(evidence: Evidence, fitted: FittedRigid) -> Evidence:
     """The same with torques that the parameters explain exactly, and scatter enlarged for what is missing."""
     lines = []
     for line in evidence.lines:
@@ -254,7 +254,7 @@ def safe_half_width(evidence: Evidence, confidence: float) -> float:
     return math.inf if found is None else found.half_width * usual / reach
 
 
-def whole_periods(lines: Sequence[Line]) -> float:
+def whole_periods(lines: Sequence[SpectralLine]) -> float:
     """Periods that count in all segments together."""
     return float(np.sum(lines[0].periods)) if lines else 0.0
 
@@ -263,7 +263,7 @@ def whole_periods(lines: Sequence[Line]) -> float:
 # What a plan should bring, before it is run: the lines and levels that its motion and the noise lead to.
 
 
-def predicted(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> Evidence:
+def predicted(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior) -> Evidence:
     """Lines without noise and the covariance to be expected of them.
 
     In torque mode the disturbance shows in speed alone (torque is what the host commands), in speed mode in torque
@@ -283,14 +283,15 @@ def predicted(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior) -> E
     for k, line_hz in enumerate(reference.lines_hz):
         gain = float(abs(g[k])) ** 2
         s_ww, s_tt = (variance[k] / gain, 1e-6 * variance[k]) if in_speed else (1e-6 * variance[k] / gain, variance[k])
-        lines.append(Line(line_hz, seen[:, k], g[k] * seen[:, k], counts, float(s_ww), float(s_tt), 0j, nu))
+        lines.append(SpectralLine(line_hz, seen[:, k], g[k] * seen[:, k], counts, float(s_ww), float(s_tt), 0j, nu))
     speeds = np.array([segment.reference.offset_rad_s for segment in plan.segments])
     torques = np.array([segment.reference.mean_torque_nm for segment in plan.segments])
     still = float(noise.error_density(np.zeros(1), theta)[0])
     levels = Levels(speeds, torques, np.zeros(len(speeds)), counts * reference.period_s, still, nu)
-    return noise_free(Evidence(tuple(lines), levels, prior), Fitted(theta, 0.0))
+    return noise_free(Evidence(tuple(lines), levels, prior), FittedRigid(theta, 0.0))
 
 
-def expected_half_width(plan: Plan, theta: FloatArray, noise: Noise, prior: LagPrior, confidence: float) -> float:
+def expected_half_width(plan: Plan, theta: FloatArray, noise: NoiseDensity, prior: LagPrior,
+                        confidence: float) -> float:
     """Of J, as a share of J, after the plan as it stands, other lags than the true ones allowed for."""
     return safe_half_width(predicted(plan, theta, noise, prior), confidence)

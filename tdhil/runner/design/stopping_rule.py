@@ -53,7 +53,7 @@ from tdhil.recording import FloatArray, Recording
 from tdhil.runner.design.prediction import (
     LEAST_NU,
     Evidence,
-    Fitted,
+    FittedRigid,
     fit,
     half_width,
     longer,
@@ -265,7 +265,7 @@ def look(
 
 def _look(
     evidence: Evidence,
-    fitted: Fitted,
+    fitted: FittedRigid,
     confidence: float,
     tolerance: float,
     most_scale: float,

@@ -1,12 +1,13 @@
 """What the shaft is asked to do in stage 5: pure numpy, planned before it moves, cheap to evaluate in a cycle."""
 
 from tdhil.runner.excitation.plan import (
-    LEAST_COUNTED as LEAST_COUNTED, ExcitationWish as ExcitationWish, Plan as Plan,
+    LEAST_COUNTED as LEAST_COUNTED, PlanRequest as PlanRequest, Plan as Plan,
     PlannedSegment as PlannedSegment, make_plan as make_plan, periodic_kind as periodic_kind,
     settling_periods as settling_periods,
 )
 from tdhil.runner.excitation.pulses import (
-    CALM_S as CALM_S, SwingKind as SwingKind, SwingPlan as SwingPlan, Way as Way, make_swings as make_swings,
+    CALM_S as CALM_S, SwingKind as SwingKind, SwingPlan as SwingPlan, SpeedChange as SpeedChange,
+    make_swings as make_swings,
 )
 from tdhil.runner.excitation.reference import (
     DriveMode as DriveMode, ExcitationKind as ExcitationKind, MotionLimits as MotionLimits,
@@ -18,5 +19,5 @@ from tdhil.runner.excitation.signals import (
     unit_peak as unit_peak,
 )
 from tdhil.runner.excitation.speed_loop import (
-    Following as Following, fit_following as fit_following, held_back_to as held_back_to,
+    SpeedFollowing as SpeedFollowing, fit_following as fit_following, held_back_to as held_back_to,
 )

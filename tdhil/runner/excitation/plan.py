@@ -30,7 +30,7 @@ SETTLE_S = 10.0          # at least this long before the first period that count
 
 
 @dataclass(frozen=True)
-class ExcitationWish:
+class PlanRequest:
     """What the user asks for; None means that the plan chooses.
 
     ``frequency_hz``: lowest line (multisine), tone (sine), square wave (step). ``amplitude_rad_s``: greatest
@@ -187,16 +187,16 @@ class Plan:
         return make_transition(from_rad_s, to, self.limits, self.guess, self.mode)
 
 
-def make_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish | None = None) -> Plan:
+def make_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest | None = None) -> Plan:
     """A plan that stays within the limits even if the rough inertia is wrong by its stated error.
 
     Raises PlanRefused, naming the limit, if what was asked for does not fit.
     """
-    wish = wish or ExcitationWish()
+    wish = wish or PlanRequest()
     shape, frequency = _shape_and_frequency(wish)
     period = 1.0 / frequency
     shape = begun_at_rest(shape, period, guess.inertia_kg_m2, guess.viscous_nm_s_rad)
-    fit = _Fit.of(shape, period, limits, guess, wish.mode)
+    fit = _FittedShape.of(shape, period, limits, guess, wish.mode)
     amplitude, offsets = _amplitude_and_offsets(fit, wish)
     settle = settling_periods(period, wish.settle_s)
     periods = _periods(wish, period, settle)
@@ -210,7 +210,7 @@ def make_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish | None
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _FittedShape:
     """A shape of peak 1 with its peaks, against the limits."""
 
     shape: Shape
@@ -225,7 +225,8 @@ class _Fit:
     foreseen: float      # like ``up``, as far ahead as the guard looks
 
     @classmethod
-    def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> "_Fit":
+    def of(cls, shape: Shape, period_s: float, limits: MotionLimits, guess: RigGuess,
+           mode: DriveMode) -> "_FittedShape":
         following = guess.following if mode == "speed" else None
         moved = shape if following is None else shape.followed(period_s, following)
         speed = shape.deviation()
@@ -270,7 +271,7 @@ class _Fit:
         return low, "standstill (as far ahead as the guard looks)"
 
     def _never_backwards(self, offset_rad_s: float, amplitude_rad_s: float) -> bool:
-        """Would the guard see the shaft turn backwards nowhere? As `guard.predicted_speed`, with the plan's torque."""
+        """Would the guard see the shaft turn backwards nowhere? As `Guard.predicted_speed`, with the plan's torque."""
         foresight_s, guess = self.limits.foresight_s, self.guess
         swung = amplitude_rad_s * self.swing
         speed = offset_rad_s + swung * self.shape.deviation()
@@ -303,7 +304,7 @@ class _Fit:
         )
 
 
-def _shape_and_frequency(wish: ExcitationWish) -> tuple[Shape, float]:
+def _shape_and_frequency(wish: PlanRequest) -> tuple[Shape, float]:
     kind = periodic_kind(wish.kind)
     frequency = kind.frequency_hz if wish.frequency_hz is None else wish.frequency_hz
     if not (math.isfinite(frequency) and frequency > 0.0):
@@ -331,7 +332,7 @@ def settling_periods(period_s: float, settle_s: float = SETTLE_S) -> int:
     return max(1, math.ceil(settle_s / period_s - 1e-9))
 
 
-def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
+def _periods(wish: PlanRequest, period_s: float, settle: int) -> int:
     if wish.periods is not None:
         if wish.periods < settle + 1:
             raise PlanRefused(
@@ -347,7 +348,7 @@ def _periods(wish: ExcitationWish, period_s: float, settle: int) -> int:
     return settle + max(LEAST_COUNTED, math.ceil(counted / period_s - 1e-9))
 
 
-def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tuple[float, ...]]:
+def _amplitude_and_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, tuple[float, ...]]:
     if wish.amplitude_rad_s is not None and not (math.isfinite(wish.amplitude_rad_s) and wish.amplitude_rad_s > 0.0):
         raise PlanRefused(f"amplitude must be positive, not {wish.amplitude_rad_s:g} rad/s")
     if wish.offsets_rad_s is not None and not wish.offsets_rad_s:
@@ -365,7 +366,7 @@ def _amplitude_and_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, tupl
     return amplitude, tuple(offsets)
 
 
-def _default_offsets(fit: _Fit, wish: ExcitationWish) -> tuple[float, ...]:
+def _default_offsets(fit: _FittedShape, wish: PlanRequest) -> tuple[float, ...]:
     """Two mean speeds (one where friction's slope isn't asked for), as far apart as the swing allows.
 
     The swing takes at most what the window leaves beside the offsets' least distance, and what the torque limit

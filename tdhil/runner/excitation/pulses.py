@@ -9,7 +9,7 @@ J dω/dt = −B ω − T_c tells the ratios only: multiply all three by anything
 the torque of the way back up, so every coast is paired with a powered ramp, and the ramps differ in steepness.
 
 Whatever the rough inertia's error, the swing stays within the window; in torque mode that includes what the guard
-foresees (`limits.foresight_s`) while the torque pushes.
+foresees (`Guard.foresight_s`) while the torque pushes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _TORQUE_SHARE = 0.9       # of the room that the torque limit leaves above frict
 
 
 @dataclass(frozen=True)
-class Way:
+class SpeedChange:
     """From one steady speed to the next, in ``duration_s``; ``coasting``: without torque, so about so long."""
 
     from_rad_s: float
@@ -72,7 +72,7 @@ class SwingKind(ExcitationKind):
     be, rad/s², and the rough rig. The first begins at the lowest speed.
     """
 
-    ways: Callable[[float, float, float, RigGuess], Iterator[Way]] = field(kw_only=True)
+    ways: Callable[[float, float, float, RigGuess], Iterator[SpeedChange]] = field(kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class SwingPlan:
     kind: str
     mode: DriveMode
     start_rad_s: float
-    ways: tuple[Way, ...]
+    ways: tuple[SpeedChange, ...]
     speed_min_rad_s: float
     speed_max_rad_s: float
     torque_min_nm: float
@@ -132,7 +132,7 @@ def make_swings(
     asked = swing_kind(kind)
     if asked.needs_torque_mode and mode != "torque":
         raise PlanRefused(f"{kind} needs a drive in torque mode: {asked.why_torque_mode}")
-    room = _Room(limits, guess, mode)
+    room = _SpeedRoom(limits, guess, mode)
     low, high, rate = room.swing(amplitude_rad_s, offset_rad_s)
     endless = asked.ways(low, high, rate, guess)
     total = TOTAL_S if time_s is None else time_s
@@ -165,30 +165,30 @@ def swing_kind(name: str) -> SwingKind:
     return kind
 
 
-def _again(ways: list[Way], rest: Iterator[Way]) -> Iterator[Way]:
+def _again(ways: list[SpeedChange], rest: Iterator[SpeedChange]) -> Iterator[SpeedChange]:
     yield from ways
     yield from rest
 
 
-def _pulses(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+def _pulses(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[SpeedChange]:
     """Up and down between the levels; each round another strength."""
     at, number = low, 0
     while True:
         number += 1
         to = low + _HEIGHTS[number % len(_HEIGHTS)] * (high - low)
         share = _SHARES[(number // len(_HEIGHTS)) % len(_SHARES)]
-        yield Way(at, to, max(_LEAST_S, abs(to - at) / (share * rate)), guess)
+        yield SpeedChange(at, to, max(_LEAST_S, abs(to - at) / (share * rate)), guess)
         at = to
 
 
-def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[Way]:
+def _coasts(low: float, high: float, rate: float, guess: RigGuess) -> Iterator[SpeedChange]:
     """Up under power, each time another steepness, and down without torque."""
     number = 0
     while True:
         share = _SHARES[number % len(_SHARES)]
         top = low + _TOPS[number % len(_TOPS)] * (high - low)
-        yield Way(low, top, max(_LEAST_S, (top - low) / (share * rate)), guess)
-        yield Way(top, low, coasting_s(top, low, guess), guess, coasting=True)
+        yield SpeedChange(low, top, max(_LEAST_S, (top - low) / (share * rate)), guess)
+        yield SpeedChange(top, low, coasting_s(top, low, guess), guess, coasting=True)
         number += 1
 
 
@@ -213,7 +213,7 @@ COAST_DOWN = SwingKind(
 )
 
 
-class _Room:
+class _SpeedRoom:
     """Lower and upper speed, and the steepest way between them, within the limits."""
 
     def __init__(self, limits: MotionLimits, guess: RigGuess, mode: DriveMode) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from tdhil.config import EXCITATIONS, load
-from tdhil.runner.excitation.speed_loop import Following
+from tdhil.runner.excitation.speed_loop import SpeedFollowing
 
 DriveMode = Literal["torque", "speed"]
 
@@ -113,7 +113,7 @@ class RigGuess:
     viscous_nm_s_rad: float = 0.0
     coulomb_nm: float = 0.0
     inertia_rel_error: float = 0.2
-    following: Following | None = None
+    following: SpeedFollowing | None = None
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.inertia_kg_m2) and self.inertia_kg_m2 > 0.0):

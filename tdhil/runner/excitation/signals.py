@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tdhil.runner.excitation.reference import ExcitationKind
-from tdhil.runner.excitation.speed_loop import Following
+from tdhil.runner.excitation.speed_loop import SpeedFollowing
 
 _GRID = 1024
 
@@ -39,7 +39,7 @@ class Shape:
         omega = 2.0 * np.pi * np.asarray(self.harmonics, dtype=np.float64) / period_s
         return self._wave((viscous_nm_s_rad + 1j * omega * inertia_kg_m2) * np.asarray(self.amplitudes), 0.0)
 
-    def followed(self, period_s: float, following: Following) -> "Shape":
+    def followed(self, period_s: float, following: SpeedFollowing) -> "Shape":
         """What the shaft makes of it, as a setpoint under the drive's speed control."""
         gains = following.shaft(np.asarray(self.harmonics, dtype=np.float64) / period_s)
         return Shape(

@@ -3,7 +3,7 @@
 A speed loop with integral action makes H(s) = (1 + b s)/(1 + a₁ s + a₂ s²) of setpoint to speed: flat at low frequency,
 often a little above one near its bandwidth, falling beyond; the report adds its lag. It is fitted to the ramp between
 the two mean speeds of stage 2, sampled as slowly as the line has it. It plans, and bounds what slow sampling between
-the setpoint's steps may do to J (`setpoint_sampling`); J itself is not read off it.
+the setpoint's steps may do to J (`tdhil.estimation.setpoint_sampling`); J itself is not read off it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _HELD_BACK = 1.12         # times the commanded time from a fifth to four fifths
 
 
 @dataclass(frozen=True)
-class Following:
+class SpeedFollowing:
     """Of setpoint to the shaft's speed; behind ``speed_lag_s`` it is reported."""
 
     zero_s: float
@@ -51,7 +51,7 @@ def fit_following(
     reported_rad_s: FloatArray,
     speed_lag_s: float = 0.0,
     ramp_rad_s2: float = math.inf,
-) -> Following | None:
+) -> SpeedFollowing | None:
     """From one change of setpoint that begins and ends steadily, (N,) each; None where the model does not fit.
 
     ``ramp_rad_s2``: of the drive's own ramp, which the setpoint passes first.
@@ -78,7 +78,7 @@ def fit_following(
     if math.sqrt(2.0 * float(best.cost) / len(time_s)) > _GOOD:
         return None
     zero, first, second = (float(x) for x in np.exp(best.x))
-    return Following(zero, first, second, speed_lag_s)
+    return SpeedFollowing(zero, first, second, speed_lag_s)
 
 
 def held_back_to(

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         reference_plan as reference_plan, run_offset as run_offset, run_pilot as run_pilot,
     )
     from tdhil.runner.stages.setup import measure_offsets as measure_offsets, probe_sign as probe_sign
-    from tdhil.runner.stages.speed import Course as Course, SpeedResult as SpeedResult, run_speed as run_speed
+    from tdhil.runner.stages.speed import RampCourse as RampCourse, SpeedResult as SpeedResult, run_speed as run_speed
     from tdhil.runner.stages.torque import TorqueResult as TorqueResult, run_torque as run_torque
     from tdhil.runner.stages.virtual_string import (
         course_of as course_of, go_to as go_to, refuse_other_rig as refuse_other_rig,

@@ -14,7 +14,7 @@ from drivers import Command, Mode, Sample
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.adaptive_duration import Decision, Enough
 from tdhil.runner.control_loop import ControlLoop
-from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SwingPlan, Way
+from tdhil.runner.excitation import CALM_S, Plan, PlannedSegment, RigGuess, SpeedChange, SwingPlan
 from tdhil.runner.guard import kept_within
 from tdhil.runner.settings import ControlAssumptions, MachineLimits
 from tdhil.runner.stages.hold import MeanSpeedControl
@@ -124,7 +124,7 @@ def run_acquire(
     """
     begun_s = loop.now_s
     dither_rad_s = _dither_of(plan, speed_resolution_rad_s, begun_s)
-    course = _Course(loop, plan, Follower(loop, limits, Mode(plan.mode), control, dither_rad_s), announce)
+    course = _SegmentCourse(loop, plan, Follower(loop, limits, Mode(plan.mode), control, dither_rad_s), announce)
     for index in range(len(plan.segments)):
         course.go_to(index)
     while enough is not None:
@@ -146,7 +146,7 @@ def _dither_of(plan: Plan, resolution_rad_s: float, begun_s: float) -> Callable[
     return lambda time_s: dither(time_s - begun_s, period_s, peak_rad_s)
 
 
-class _Course:
+class _SegmentCourse:
     """Where stage 5 is: the segments that are done, and the one that the shaft is in."""
 
     def __init__(self, loop: ControlLoop, plan: Plan, follower: Follower, announce: Announce) -> None:
@@ -234,7 +234,7 @@ def _calm(speed_rad_s: float, guess: RigGuess) -> Callable[[float], tuple[float,
     return lambda _: steady
 
 
-def _coast(loop: ControlLoop, way: Way, follower: Follower, assumptions: ControlAssumptions) -> None:
+def _coast(loop: ControlLoop, way: SpeedChange, follower: Follower, assumptions: ControlAssumptions) -> None:
     """Zero torque down to the lower speed."""
     command = Command(Mode.TORQUE, way.to_rad_s, 0.0)
     # The report comes late, so that the shaft is slower already: by half of the longest plausible lag, say.

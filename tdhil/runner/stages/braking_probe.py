@@ -2,8 +2,8 @@
 
 The sign probe of stage 1 only ever pushes forward. A drive (or a profile) that takes a torque setpoint below zero for
 one above it passes that, and would speed the shaft up where it is to brake it. Stage 2 ends at its lower speed; there,
-at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`braking_pulse`), and the answer awaited
-(`braking_answer`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
+at the beginning of stage 3, a pulse is tried whose worst is known beforehand (`plan_pulse`), and the answer awaited
+(`BrakingListener`). Before it has been given, and in the whole run where there is no safe pulse, the guard lets no
 torque below zero through in torque mode.
 """
 
@@ -230,7 +230,7 @@ NOISE_SD, NOISE_QUANTA = 3.0, 1.5
 """Standard deviations, or quanta, that don't count as a change."""
 
 
-class Answer(Enum):
+class BrakingAnswer(Enum):
     """Which way the shaft went."""
 
     SLOWER = "slower"
@@ -242,7 +242,7 @@ def speed_noise_rad_s(steady: Sequence[Sample], resolution_rad_s: float) -> floa
     return max(NOISE_SD * float(trace(steady).speed_rad_s.std()), NOISE_QUANTA * resolution_rad_s)
 
 
-class Listener:
+class BrakingListener:
     """Compares what comes with the steady rotation before; ``why`` says in words what was seen last."""
 
     def __init__(
@@ -262,7 +262,7 @@ class Listener:
         self._recent: deque[tuple[float, float]] = deque(maxlen=max(1, round(MEAN_S / period_s)))
         self.why = ""
 
-    def hear(self, sample: Sample) -> Answer | None:
+    def hear(self, sample: Sample) -> BrakingAnswer | None:
         """None as long as it isn't clear."""
         if not sample.fresh:
             return None
@@ -272,19 +272,19 @@ class Listener:
         full = len(self._recent) == self._recent.maxlen
         self.why = f"the speed went from {self.before_rad_s:.3f} to {self.speed_rad_s:.3f} rad/s"
         if full and self.speed_rad_s >= self.before_rad_s + self._change_rad_s:
-            return Answer.FASTER
+            return BrakingAnswer.FASTER
         if full and self.torque_nm >= self.before_nm + self._rise_nm:
             self.why = f"the reported torque went from {self.before_nm:.1f} to {self.torque_nm:.1f} N·m"
-            return Answer.FASTER
+            return BrakingAnswer.FASTER
         demand = sample.torque_demand_nm
         risen = demand is not None and demand >= self._pulse.flowing_nm + self._rise_nm
         # Deaf at most until the reaction time is over, and no longer than until the demand has once been what flows.
         self._demand_deaf = self._demand_deaf - 1 if risen or demand is None else 0
         if risen and self._demand_deaf <= 0:
             self.why = f"the drive's torque demand went from {self._pulse.flowing_nm:.1f} to {demand:.1f} N·m"
-            return Answer.FASTER
+            return BrakingAnswer.FASTER
         if full and self.speed_rad_s <= self.before_rad_s - self._change_rad_s:
-            return Answer.SLOWER
+            return BrakingAnswer.SLOWER
         return None
 
 
@@ -374,17 +374,17 @@ def probe_braking(
             loop.log.event(loop.now_s, "probe", f"no braking torque in this run: {pulse.why}")
             return samples
         demand_nm = None if loop.last is None else loop.last.torque_demand_nm
-        listener = Listener(pulse, steady, loop.period_s, assumptions.reaction_s, demand_nm)
+        listener = BrakingListener(pulse, steady, loop.period_s, assumptions.reaction_s, demand_nm)
         answer, seen = _try(loop, pulse, listener, before.speed_rad_s, assumptions)
         samples += seen
-        if answer is Answer.FASTER:
+        if answer is BrakingAnswer.FASTER:
             raise PreflightRefused(
                 f"the drive takes a negative torque for a positive one: on {pulse.torque_nm:.1f} N·m {listener.why}",
                 where=f"braking probe, {where}",
                 next_step="Is the setpoint signed there as the profile says, in two's complement, and does no direction"
                 " bit turn it round? Correct the profile or the drive's settings",
             )
-        if answer is Answer.SLOWER:
+        if answer is BrakingAnswer.SLOWER:
             loop.log.event(
                 loop.now_s, "probe",
                 f"the shaft slowed down: {listener.why}, reported torque down to {listener.lowest_nm:.1f} N·m",
@@ -401,8 +401,8 @@ def probe_braking(
 
 
 def _try(
-    loop: ControlLoop, pulse: Pulse, listener: Listener, speed_rad_s: float, assumptions: ControlAssumptions
-) -> tuple[Answer | None, list[Sample]]:
+    loop: ControlLoop, pulse: Pulse, listener: BrakingListener, speed_rad_s: float, assumptions: ControlAssumptions
+) -> tuple[BrakingAnswer | None, list[Sample]]:
     """The pulse in full, then what flowed before it until the reports have caught up; cut short by a faster shaft."""
     loop.log.event(
         loop.now_s, "probe",
@@ -411,13 +411,13 @@ def _try(
         f" {pulse.highest_rad_s:.2f} rad/s at most)",
     )
     loop.guard.no_braking = ""
-    answer: Answer | None = None
+    answer: BrakingAnswer | None = None
     seen: list[Sample] = []
     late = loop.cycles(2.0 * assumptions.largest_speed_lag_s + assumptions.reaction_s)
     for torque_nm in (*pulse.setpoints_nm(), *[pulse.flowing_nm] * late):
         seen.append(loop.cycle(Command(Mode.TORQUE, speed_rad_s, torque_nm)))
         heard = listener.hear(seen[-1])
-        if heard is Answer.FASTER:
+        if heard is BrakingAnswer.FASTER:
             return heard, seen
         answer = answer or heard
         if answer is not None and torque_nm == pulse.flowing_nm:

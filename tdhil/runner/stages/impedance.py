@@ -21,11 +21,11 @@ from drivers import Command, LimitHit, Mode, Sample
 from tdhil.recording import Excitation, Segment
 from tdhil.runner.control_loop import ControlLoop
 from tdhil.runner.excitation import (
-    ExcitationWish,
     MotionLimits,
     PeriodicReference,
     Plan,
     PlannedSegment,
+    PlanRequest,
     RigGuess,
     Shape,
     make_plan,
@@ -80,7 +80,7 @@ def largest_offset_nm(limits: MachineLimits) -> float:
     return LARGEST_SHARE * limits.torque_nm
 
 
-def reference_plan(limits: MotionLimits, guess: RigGuess, wish: ExcitationWish) -> Plan:
+def reference_plan(limits: MotionLimits, guess: RigGuess, wish: PlanRequest) -> Plan:
     """The multisine of the speed reference: lines that take about equal torque, about one mean speed.
 
     Raises PlanRefused where it doesn't fit.
@@ -100,7 +100,7 @@ def run_pilot(
     room: MotionLimits,
     guess: RigGuess,
     assumptions: ControlAssumptions,
-    wish: ExcitationWish,
+    wish: PlanRequest,
     string_nm_s_rad: float,
     speed_resolution_rad_s: float,
 ) -> OffsetPlan:
@@ -118,7 +118,7 @@ def run_pilot(
     wait_until_steady(loop, steady, mean, max(2.0 * speed_resolution_rad_s, 0.01 * mean), timeout_s=60.0)
     loop.guard.allow_torque_offset(largest_offset_nm(limits))
     size = PILOT_SHARE * limits.torque_nm / _peak(np.ones(len(HARMONICS)), PHASES_RAD)
-    drive = _Drive(loop, _Wave(np.full(len(HARMONICS), size), PHASES_RAD, mean, speed_resolution_rad_s))
+    drive = _WaveSender(loop, _ExcitationWave(np.full(len(HARMONICS), size), PHASES_RAD, mean, speed_resolution_rad_s))
     seen = drive.run(PILOT_PERIODS * PERIOD_S, fade_in_s=PERIOD_S)
     drive.fade_out(FADE_S)
     left_s = loop.guard.left_s(loop.now_s) - RESERVE_S
@@ -133,7 +133,7 @@ def run_offset(loop: ControlLoop, plan: OffsetPlan, announce: Announce, speed_re
     """Stage 5 by the torque offset, which is faded in and at the end faded out."""
     segment = plan.segment
     sizes, mean = np.asarray(plan.torque_amplitudes_nm), segment.reference.offset_rad_s
-    drive = _Drive(loop, _Wave(sizes, plan.phases_rad, mean, speed_resolution_rad_s))
+    drive = _WaveSender(loop, _ExcitationWave(sizes, plan.phases_rad, mean, speed_resolution_rad_s))
 
     def recorded(start_s: float, end_s: float | None = None) -> Excitation:
         told: Segment = replace(segment.recorded(start_s, end_s), torque_amplitudes_nm=plan.torque_amplitudes_nm)
@@ -148,7 +148,7 @@ def run_offset(loop: ControlLoop, plan: OffsetPlan, announce: Announce, speed_re
 
 # ---------------------------------------------------------------------------------------------------------------------
 
-class _Wave:
+class _ExcitationWave:
     """Torque offset and speed reference over time; ``sizes`` (K,) N·m."""
 
     def __init__(
@@ -177,10 +177,10 @@ def _peak(lines: NDArray[Any], phases_rad: Sequence[float]) -> float:
     return float(np.max(np.abs((_GRID @ (lines * np.exp(1j * np.asarray(phases_rad)))).real)))
 
 
-class _Drive:
+class _WaveSender:
     """Sends a wave, cycle by cycle, counted from its beginning."""
 
-    def __init__(self, loop: ControlLoop, wave: _Wave) -> None:
+    def __init__(self, loop: ControlLoop, wave: _ExcitationWave) -> None:
         self._loop, self._wave = loop, wave
         last = loop.last
         self.time_s = last.time_s if last else loop.now_s
@@ -231,7 +231,7 @@ def _planned(
     room: MotionLimits,
     guess: RigGuess,
     largest_lag_s: float,
-    wish: ExcitationWish,
+    wish: PlanRequest,
     string_nm_s_rad: float,
     largest_nm: float,
     most_periods: int,

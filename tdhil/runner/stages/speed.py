@@ -74,7 +74,7 @@ _TOO_RESTLESS = (
 
 
 @dataclass(frozen=True)
-class Course:
+class RampCourse:
     """Setpoint and reported speed of the ramp between the levels, with the calm at both ends, (N,) each."""
 
     time_s: FloatArray
@@ -93,7 +93,7 @@ class SpeedResult:
     ramp: Ramp
     last: tuple[Sample, ...]           # the steady samples at the higher speed: what flows before the switch
     steady: tuple[Samples, ...] = ()   # both levels, torque less its offset: what disturbs the motion
-    course: Course | None = None       # how the drive followed the ramp
+    course: RampCourse | None = None       # how the drive followed the ramp
     swing: Swing | None = None         # of a drill string that gets no calmer
 
     @property
@@ -230,7 +230,7 @@ class _Held:
     swing: Swing | None = None
 
 
-def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tuple[float, float]) -> Course:
+def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tuple[float, float]) -> RampCourse:
     low_rad_s, high_rad_s = speeds_rad_s
     setpoint = np.concatenate([
         np.full(len(low), low_rad_s),
@@ -240,7 +240,7 @@ def _course(low: list[Sample], ramp: list[Sample], high: _Held, speeds_rad_s: tu
     after = (*high.settling, *high.level)
     rows = np.array([(one.time_s, one.speed_rad_s, one.fresh) for one in (*low, *ramp, *after)], dtype=np.float64)
     fresh = rows[:, 2] > 0.0
-    return Course(rows[fresh, 0], setpoint[fresh], rows[fresh, 1])
+    return RampCourse(rows[fresh, 0], setpoint[fresh], rows[fresh, 1])
 
 
 def _samples(held: list[Sample], torque_offset_nm: float) -> Samples:

@@ -28,7 +28,7 @@ class SteadyLevel:
 
 
 @dataclass(frozen=True)
-class Trace:
+class SampleTrace:
     """Samples as arrays (N,), only the fresh ones."""
 
     time_s: FloatArray
@@ -36,11 +36,11 @@ class Trace:
     torque_nm: FloatArray
 
 
-def trace(samples: Iterable[Sample]) -> Trace:
+def trace(samples: Iterable[Sample]) -> SampleTrace:
     """Arrays of the fresh samples."""
     rows = [(sample.time_s, sample.speed_rad_s, sample.torque_nm) for sample in samples if sample.fresh]
     table = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return Trace(table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy())
+    return SampleTrace(table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy())
 
 
 def steady_level(samples: Sequence[Sample]) -> SteadyLevel:

@@ -24,8 +24,8 @@ from tdhil.soft_torque import (
     EvaluationCase,
     HostLoop,
     Phase,
-    Program,
-    Window,
+    RigWindow,
+    SpeedProgram,
     program_for,
     refuse_untrue,
 )
@@ -56,7 +56,7 @@ _TOLD = {
 Keep = Callable[[Sequence[float]], None]
 
 
-def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, foresight_s: float) -> Program:
+def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, foresight_s: float) -> SpeedProgram:
     """The virtual string's course within the limits. Raises PreflightRefused or EvaluationRefused, and says why."""
     if limits.load != "none":
         raise PreflightRefused(
@@ -64,7 +64,7 @@ def course_of(case: EvaluationCase, limits: MachineLimits, period_s: float, fore
             next_step="Evaluate before the string is below the drive",
         )
     refuse_untrue(case, period_s)
-    window = Window(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
+    window = RigWindow(limits.speed_min_rad_s, limits.speed_max_rad_s, limits.torque_nm, foresight_s)
     program = program_for(case, window)
     needed_s = program.longest_s + BEFORE_S + RESERVE_S
     if needed_s > limits.time_s:
@@ -101,7 +101,7 @@ def go_to(
 
 
 def run_virtual_string(
-    loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program, keep: Keep,
+    loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: SpeedProgram, keep: Keep,
     say: Callable[[str], None], resolution_rad_s: float, noise_rad_s: float,
 ) -> None:
     """All of the course, from steady rotation at its first speed; ``keep`` gets a row a cycle.
@@ -111,7 +111,7 @@ def run_virtual_string(
     """
     host = HostLoop(case.string, case.meant, case.law, case.rig, program, loop.period_s, limits.torque_nm,
                     case.own_loop)
-    ratio, watch = case.rig.gear_ratio, _Watch(loop, limits, case, program, resolution_rad_s, noise_rad_s)
+    ratio, watch = case.rig.gear_ratio, _LoopWatch(loop, limits, case, program, resolution_rad_s, noise_rad_s)
     last = loop.last
     speed = last.speed_rad_s if last is not None else program.start_rad_s * ratio
     torque = case.rig.coulomb_nm + case.rig.viscous_nm_s_rad * speed
@@ -143,11 +143,11 @@ def run_virtual_string(
                 say(text)
 
 
-class _Watch:
+class _LoopWatch:
     """Looks at every cycle of the loop, and raises LimitHit."""
 
     def __init__(
-        self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: Program,
+        self, loop: ControlLoop, limits: MachineLimits, case: EvaluationCase, program: SpeedProgram,
         resolution_rad_s: float, noise_rad_s: float,
     ) -> None:
         assert case.string.bit is not None

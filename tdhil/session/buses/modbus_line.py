@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
-from profiles.modbus import Line, ModbusProfile
+from profiles.modbus import BusLine, ModbusProfile
 from tdhil.config import Modbus, Origin, Rig, Setting, check_values
 from tdhil.errors import UsageError
 from tdhil.session.connection import LineConfig
@@ -103,4 +103,4 @@ def modbus_config(cli: Mapping[str, Any], rig: Rig | None, profile: ModbusProfil
     return found
 
 
-_STANDARD = Line(transports=("tcp", "rtu"), source="the Modbus specification", confidence="verified")
+_STANDARD = BusLine(transports=("tcp", "rtu"), source="the Modbus specification", confidence="verified")

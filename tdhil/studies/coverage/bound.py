@@ -37,7 +37,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, FloatArray, Report
+from tdhil.studies.coverage.plants import ComplexArray, CoveragePlant, FloatArray, ReportFilter
 from tdhil.studies.coverage.simulate import quiet_shaft
 
 _FOLDS = 30              # multiples of the sampling rate that are folded in, either way
@@ -50,7 +50,7 @@ _ROUGH = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])    # five equal shares of the rou
 
 
 @dataclass(frozen=True)
-class Watched:
+class WatchedSpeed:
     """One mean speed: ``speed`` (K,) complex lines of reported speed, rad/s, over ``seconds`` of whole periods."""
 
     mean_rad_s: float
@@ -72,7 +72,7 @@ def impedance_of(plant: CoveragePlant, theta: FloatArray, s: ComplexArray) -> Co
     shown = []
     for report in (plant.speed_report, plant.torque_report):
         lags = tuple(float(rest.pop(0)) for _ in report.lags_s)
-        shown.append(Report(lags, float(rest.pop(0)) if report.average_s > 0.0 else 0.0))
+        shown.append(ReportFilter(lags, float(rest.pop(0)) if report.average_s > 0.0 else 0.0))
     shaft = theta[0] * s + theta[1]
     seen: ComplexArray = shaft * shown[1].response(s) / shown[0].response(s) * np.exp(-theta[-1] * s)
     return seen
@@ -139,7 +139,7 @@ def slopes_of_unknown(plant: CoveragePlant, hertz: FloatArray) -> tuple[ComplexA
 
 
 def information(
-    plant: CoveragePlant, hertz: FloatArray, watched: list[Watched], slopes: ComplexArray | None = None
+    plant: CoveragePlant, hertz: FloatArray, watched: list[WatchedSpeed], slopes: ComplexArray | None = None
 ) -> FloatArray:
     """Fisher information about theta, (n, n); ``slopes`` (K, n): of another theta than the one whose lags are known."""
     slopes = slopes_of(plant, hertz) if slopes is None else slopes
@@ -192,7 +192,7 @@ def cramer_rao(plant: CoveragePlant, periods: int) -> Bounds:
             turned: ComplexArray = np.exp(-2j * np.pi * np.outer(hertz, time)).astype(np.complex128)
             lines: ComplexArray = (turned @ speed.astype(np.complex128)) * (2.0 / len(time))
             lines = lines * plant.speed_report.response(2j * np.pi * hertz.astype(np.complex128))
-            watched.append(Watched(float(speed.mean()), lines, segment.end_s - first))
+            watched.append(WatchedSpeed(float(speed.mean()), lines, segment.end_s - first))
         fisher = information(plant, hertz, watched)
         known.append(bound_of(fisher[np.ix_(_KNOWN_LAGS, _KNOWN_LAGS)] if plant.degenerate else fisher))
         slopes, plausible = slopes_of_unknown(plant, hertz)

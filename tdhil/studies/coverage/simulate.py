@@ -13,8 +13,8 @@ from tdhil.errors import TdhilError
 from tdhil.estimation import Options, identify
 from tdhil.process_pool import Loss, Pool, TaskLimits
 from tdhil.recording import Excitation, Recording, Segment
-from tdhil.runner.excitation import ExcitationWish, MotionLimits, Plan, RigGuess, make_plan
-from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, Report
+from tdhil.runner.excitation import MotionLimits, Plan, PlanRequest, RigGuess, make_plan
+from tdhil.studies.coverage.plants import CoveragePlant, FloatArray, ReportFilter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What the shaft is asked to do: a plan of stage 5 per run, each from its own rough inertia, on one time grid.
@@ -27,7 +27,7 @@ _TAIL_S = 1.0             # the excitation goes on after its last whole period, 
 
 
 @dataclass(frozen=True)
-class Motion:
+class SimulatedMotion:
     """``target`` (steps, runs) rad/s and ``feed`` (steps, runs) N·m; ``segments`` per run, ``rough`` (runs,) kg·m²."""
 
     target: FloatArray
@@ -51,10 +51,10 @@ def plan_for(plant: CoveragePlant, guess: RigGuess, periods: int) -> Plan:
     """The default multisine about two mean speeds: so many periods that count at each, after 10 s of settling."""
     limits = MotionLimits(*plant.window_rad_s, plant.torque_limit_nm)
     settle = max(1, math.ceil(10.0 * plant.lowest_hz - 1e-9))
-    return make_plan(limits, guess, ExcitationWish(frequency_hz=plant.lowest_hz, periods=settle + periods))
+    return make_plan(limits, guess, PlanRequest(frequency_hz=plant.lowest_hz, periods=settle + periods))
 
 
-def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> Motion:
+def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> SimulatedMotion:
     """Every run's reference on the same grid, which depends on the plant only, not on which runs there are."""
     plans = [plan_for(plant, guess, periods) for guess in guesses]
     join = _join_s(plant, periods)
@@ -70,7 +70,7 @@ def motion(plant: CoveragePlant, guesses: list[RigGuess], periods: int) -> Motio
     segments = tuple(
         tuple(segment.recorded(start) for segment, start in zip(plan.segments, starts, strict=True)) for plan in plans
     )
-    return Motion(target, feed, segments, np.array([guess.inertia_kg_m2 for guess in guesses]), plant.step_s)
+    return SimulatedMotion(target, feed, segments, np.array([guess.inertia_kg_m2 for guess in guesses]), plant.step_s)
 
 
 def _join_s(plant: CoveragePlant, periods: int) -> float:
@@ -151,7 +151,7 @@ def coloured(white: FloatArray, step_s: float, time_s: float) -> FloatArray:
     return found
 
 
-def turn(plant: CoveragePlant, motion: Motion, load: FloatArray, ripple: FloatArray) -> SimulatedShaft:
+def turn(plant: CoveragePlant, motion: SimulatedMotion, load: FloatArray, ripple: FloatArray) -> SimulatedShaft:
     """Step the shaft; ``load`` and ``ripple`` (steps, runs), N·m. Raises ValueError if the speed reaches zero."""
     step = motion.step_s
     keep, early, late = lag_weights(step, plant.inertia_kg_m2 / plant.viscous_nm_s_rad)
@@ -218,7 +218,7 @@ def simulate(plant: CoveragePlant, seeds: list[tuple[int, ...]], periods: int) -
     ]
 
 
-def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[Motion, SimulatedShaft]:
+def quiet_shaft(plant: CoveragePlant, shares: FloatArray, periods: int) -> tuple[SimulatedMotion, SimulatedShaft]:
     """What would happen without any noise, for rough inertias wrong by ``shares`` (runs,) of the largest error."""
     asked = motion(plant, [rough_guess(plant, np.array([share, 0.0])) for share in shares], periods)
     return asked, turn(plant, asked, np.zeros_like(asked.target), np.zeros_like(asked.target))
@@ -232,7 +232,7 @@ def _white(streams: list[np.random.Generator], steps: int) -> FloatArray:
     return found
 
 
-def lagged(signal: FloatArray, report: Report, step_s: float) -> FloatArray:
+def lagged(signal: FloatArray, report: ReportFilter, step_s: float) -> FloatArray:
     """The poles of a report, exact for inputs that are straight between steps; (steps, runs), settled at the start."""
     from scipy.signal import lfilter
 
@@ -242,7 +242,7 @@ def lagged(signal: FloatArray, report: Report, step_s: float) -> FloatArray:
     return signal
 
 
-def shown(signal: FloatArray, report: Report, step_s: float, at_s: FloatArray) -> FloatArray:
+def shown(signal: FloatArray, report: ReportFilter, step_s: float, at_s: FloatArray) -> FloatArray:
     """One signal (steps,), its poles passed already, at instants of its own: moving average and delay."""
     grid = np.arange(len(signal)) * step_s
     when = at_s - report.delay_s
@@ -256,7 +256,7 @@ def shown(signal: FloatArray, report: Report, step_s: float, at_s: FloatArray) -
 
 
 def read(
-    plant: CoveragePlant, asked: Motion, run: int, shaft: SimulatedShaft, stream: np.random.Generator
+    plant: CoveragePlant, asked: SimulatedMotion, run: int, shaft: SimulatedShaft, stream: np.random.Generator
 ) -> Recording:
     """Sample one run as its host would; ``shaft`` holds that run's signals (steps,) behind the poles of the reports."""
     reading, noise, step = plant.reading, plant.noise, shaft.step_s
@@ -316,7 +316,7 @@ class SimulatedRun:
 
 
 @dataclass(frozen=True)
-class Task:
+class SimulationTask:
     """Runs ``first`` … ``first + count − 1`` of one plant."""
 
     plant: CoveragePlant
@@ -329,16 +329,16 @@ class Task:
 
 def tasks(
     plants: Iterable[CoveragePlant], seeds: int, base_seed: int, periods: int, confidence: float
-) -> list[Task]:
+) -> list[SimulationTask]:
     """Every plant's runs in groups."""
     return [
-        Task(plant, first, min(GROUP, seeds - first), base_seed, periods, confidence)
+        SimulationTask(plant, first, min(GROUP, seeds - first), base_seed, periods, confidence)
         for plant in plants
         for first in range(0, seeds, GROUP)
     ]
 
 
-def run_task(task: Task) -> tuple[SimulatedRun, ...]:
+def run_task(task: SimulationTask) -> tuple[SimulatedRun, ...]:
     """Simulate and identify one group."""
     own = zlib.crc32(task.plant.name.encode())      # by name: a plant's runs don't depend on which others there are
     numbers = range(task.first, task.first + task.count)
@@ -360,14 +360,14 @@ def _head(run: SimulatedRun) -> tuple[str, int, float, str, str]:
     return run.plant, run.number, run.seconds, run.verdict, run.reason
 
 
-def run_all(wanted: list[Task], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
+def run_all(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
     """Groups as they are done, in no particular order. What is under way when this is interrupted is dropped."""
     if processes <= 1:
         return map(run_task, wanted)
     return _by_several(wanted, processes)
 
 
-def _by_several(wanted: list[Task], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
+def _by_several(wanted: list[SimulationTask], processes: int) -> Iterator[tuple[SimulatedRun, ...]]:
     """Raises TdhilError where a process died with a task: a benchmark with a hole in it is none."""
     with Pool(run_task, min(processes, len(wanted)), TaskLimits(None, None)) as pool:
         for task, result in pool.run(wanted):

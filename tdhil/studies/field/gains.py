@@ -16,7 +16,7 @@ import numpy as np
 from tdhil.recording import FloatArray
 from tdhil.studies.field.bench import FieldBench
 from tdhil.studies.field.loops import best_kp, gain, tones_with_steady_rise
-from tdhil.studies.field.settings import GainSweepSettings, KiSweepSettings, KpSweepSettings
+from tdhil.studies.field.settings import FieldKiSweepSettings, FieldKpSweepSettings, GainSweepSettings
 from tdhil.studies.field.tone import PUBLISHED_STYLE, Amplitudes, colour, swept_amplitudes, tidy
 from tdhil.studies.study import Progress, ResultTable, Statement, StudyOutcome
 
@@ -179,9 +179,9 @@ class KpSweep:
     bench: FieldBench
     name: str = "figure20"
     title: str = "Field rig: input and output amplitude over P"
-    settings_model: type[KpSweepSettings] = KpSweepSettings
+    settings_model: type[FieldKpSweepSettings] = FieldKpSweepSettings
 
-    def run(self, settings: KpSweepSettings, progress: Progress) -> StudyOutcome:
+    def run(self, settings: FieldKpSweepSettings, progress: Progress) -> StudyOutcome:
         """One run a P."""
         loops = [(kp, settings.ki_nm_rad) for kp in settings.kp_values_nm_s_rad]
         found, simulated_s = _swept(self.bench, settings, loops, progress)
@@ -196,9 +196,9 @@ class KiSweep:
     bench: FieldBench
     name: str = "figure21"
     title: str = "Field rig: input and output amplitude over I"
-    settings_model: type[KiSweepSettings] = KiSweepSettings
+    settings_model: type[FieldKiSweepSettings] = FieldKiSweepSettings
 
-    def run(self, settings: KiSweepSettings, progress: Progress) -> StudyOutcome:
+    def run(self, settings: FieldKiSweepSettings, progress: Progress) -> StudyOutcome:
         """One run an I."""
         loops = [(settings.kp_nm_s_rad, ki) for ki in settings.ki_values_nm_rad]
         found, simulated_s = _swept(self.bench, settings, loops, progress)

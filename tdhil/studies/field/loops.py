@@ -193,7 +193,7 @@ OUTSIDE = 3.0
 
 
 @dataclass(frozen=True)
-class LoopRecord:
+class FieldLoopRecord:
     """One run."""
 
     loop: LoopPair
@@ -221,7 +221,7 @@ class LoopScatter:
             report = part_of(progress, index, len(wanted), f"P {loop.kp_nm_s_rad:g}, I {loop.ki_nm_rad:g}")
             recording = self.bench.run(wish, report)
             span_s = float(recording.time_s[-1] - recording.time_s[0])
-            records.append(LoopRecord(loop, seed, scatter(recording), span_s))
+            records.append(FieldLoopRecord(loop, seed, scatter(recording), span_s))
         loops, repeats = records[: len(settings.loops)], [records[0], *records[len(settings.loops) :]]
         rows = tuple(
             (r.loop.kp_nm_s_rad, r.loop.ki_nm_rad, r.seed, r.points.fit.inertia_kg_m2, r.points.fit.intercept_nm,
@@ -239,7 +239,7 @@ class LoopScatter:
 
 
 def _statements(
-    settings: ScatterSettings, loops: list[LoopRecord], repeats: list[LoopRecord]
+    settings: ScatterSettings, loops: list[FieldLoopRecord], repeats: list[FieldLoopRecord]
 ) -> tuple[Statement, ...]:
     slopes = np.array([record.points.fit.inertia_kg_m2 for record in loops])
     chance = float(np.std([record.points.fit.inertia_kg_m2 for record in repeats], ddof=1))
@@ -268,7 +268,7 @@ def _statements(
     )
 
 
-def _draw(figure: Figure, loops: list[LoopRecord], hertz: float) -> None:
+def _draw(figure: Figure, loops: list[FieldLoopRecord], hertz: float) -> None:
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
     for index, record in enumerate(loops):
         alpha, fit = record.points.acceleration_rad_s2, record.points.fit

@@ -109,13 +109,13 @@ class GainSweepSettings(AmplitudeSettings):
     other_tones_hz: Tones = Field(default=(0.1, 0.3), description="shown from the linear loop only")
 
 
-class KpSweepSettings(GainSweepSettings):
+class FieldKpSweepSettings(GainSweepSettings):
     """Figure 20: over P."""
 
     kp_values_nm_s_rad: Gains = (150.0, 225.0, 300.0, 450.0, 700.0, 1000.0, 1500.0)
 
 
-class KiSweepSettings(GainSweepSettings):
+class FieldKiSweepSettings(GainSweepSettings):
     """Figure 21: over I."""
 
     ki_values_nm_rad: Gains = (200.0, 350.0, 500.0, 800.0, 1200.0, 1800.0, 2500.0)

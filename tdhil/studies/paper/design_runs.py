@@ -59,7 +59,7 @@ def closed_form_inertia(run: LoopSettings) -> float | None:
 # ---------------------------------------------------------------------------------------------------------------------
 # The paper's simulated runs, identified as this tool does it: whole periods, errors in both signals, no lags.
 #
-# The paper's fit of T on α finds 0.2 to 1.6 % too little in these very records (`tables_bias` says why).
+# The paper's fit of T on α finds 0.2 to 1.6 % too little in these very records (`closed_form_inertia` says why).
 
 
 _SETTLE = 1      # periods: the loop settles within J/Kp, below a second

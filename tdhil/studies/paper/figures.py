@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class ScatterStudy(OverDesign):
-    """`figure14` (the runs of Table 6) and `figure15` (of Table 7)."""
+    """``figure14`` (the runs of Table 6) and ``figure15`` (of Table 7)."""
 
     def run(self, settings: DesignSettings, progress: Progress) -> StudyOutcome:
         result = self.carried_out(settings, progress)
@@ -216,7 +216,7 @@ def _draw(figure: Figure, record: LoopRecord) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 class EffectStudy(OverDesign):
-    """`figure16` (Table 6) and `figure17` (Table 7)."""
+    """``figure16`` (Table 6) and ``figure17`` (Table 7)."""
 
     def __init__(self, name: str, title: str, model: type[DesignSettings], table: str) -> None:
         super().__init__(name, title, model)

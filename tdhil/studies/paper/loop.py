@@ -35,8 +35,8 @@ from sim_bus.plant import LARGEST_BRISTLE_STEP, SPEED, FixedStep, Shafts, white_
 # What can be set about one run of the paper's closed loop, and the names by which a factor or `--set` calls it.
 #
 # The defaults are Table 1's where the paper names one value and inferred where it does not: friction and duration from
-# Table 6, P and I from the two gains of section 3.4.3 (see `figures_signal`). They are consistent with the published
-# figures, not confirmed by them.
+# Table 6, P and I from the two gains of section 3.4.3 (see `figures.SignalSettings`). They are consistent with the
+# published figures, not confirmed by them.
 
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -146,7 +146,7 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True)
-class Sine:
+class SineReference:
     """w(t) = A sin(2πf t) + offset (equation 8; the paper's w_t is 2πf)."""
 
     offset_rad_s: float
@@ -162,7 +162,7 @@ class Sine:
 
 
 @dataclass(frozen=True)
-class Step:
+class StepReference:
     """w(t) = A0 before, A1 from ``at_s`` on (equation 9, whose step is at zero)."""
 
     before_rad_s: float
@@ -175,7 +175,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Chirp:
+class ChirpReference:
     """w(t) = offset + A sin(2π(f0 t + (f1 − f0) t²/(2T))): the frequency goes linearly from f0 to f1 within T."""
 
     offset_rad_s: float
@@ -192,7 +192,7 @@ class Chirp:
 
 
 @dataclass(frozen=True)
-class Multisine:
+class MultisineReference:
     """w(t) = offset + (A/M) Σ sin(2πk f t + φ_k), k = 1…n, with Schroeder's phases φ_k = −π k(k−1)/n for a low crest.
 
     M is the sum's own peak, so that the speed stays within offset ± A. (M. R. Schroeder, IEEE Trans. Inf. Theory 16,
@@ -222,12 +222,12 @@ class Multisine:
 def reference_of(run: LoopSettings) -> Reference:
     """What ``run`` asks for. The step goes from the offset to offset + amplitude at a quarter of the period (3.4.3)."""
     if run.signal == "step":
-        return Step(run.offset_rad_s, run.offset_rad_s + run.amplitude_rad_s, 0.25 / run.frequency_hz)
+        return StepReference(run.offset_rad_s, run.offset_rad_s + run.amplitude_rad_s, 0.25 / run.frequency_hz)
     if run.signal == "chirp":
-        return Chirp(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz, run.chirp_end_hz, run.duration_s)
+        return ChirpReference(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz, run.chirp_end_hz, run.duration_s)
     if run.signal == "multisine":
-        return Multisine(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
-    return Sine(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
+        return MultisineReference(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
+    return SineReference(run.offset_rad_s, run.amplitude_rad_s, run.frequency_hz)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

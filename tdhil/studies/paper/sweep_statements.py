@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from math import pi
 
-from tdhil.studies.paper.sweeps import Point, SweepSettings
+from tdhil.studies.paper.sweeps import SweepPoint, SweepSettings
 from tdhil.studies.study import Statement
 
 
@@ -20,29 +20,29 @@ def falls(values: Sequence[float]) -> bool:
     return grows([-value for value in values])
 
 
-def _row(points: Sequence[Point], name: str, digits: int = 3) -> str:
+def _row(points: Sequence[SweepPoint], name: str, digits: int = 3) -> str:
     return ", ".join(f"{getattr(point.response, name):.{digits}f}" for point in _sorted(points))
 
 
-def _sorted(points: Sequence[Point]) -> list[Point]:
+def _sorted(points: Sequence[SweepPoint]) -> list[SweepPoint]:
     return sorted(points, key=lambda point: point.value)
 
 
-def _column(points: Sequence[Point], name: str) -> list[float]:
+def _column(points: Sequence[SweepPoint], name: str) -> list[float]:
     return [getattr(point.response, name) for point in _sorted(points)]
 
 
-def _lag_moves(points: Sequence[Point], *, up: bool) -> bool:
+def _lag_moves(points: Sequence[SweepPoint], *, up: bool) -> bool:
     """By both ways of measuring it."""
     moves = grows if up else falls
     return moves(_column(points, "lag_fundamental_deg")) and moves(_column(points, "lag_zeros_deg"))
 
 
-def _lags(points: Sequence[Point]) -> str:
+def _lags(points: Sequence[SweepPoint]) -> str:
     return f"{_row(points, 'lag_fundamental_deg', 1)}° (zero crossing: {_row(points, 'lag_zeros_deg', 1)}°)"
 
 
-def figure9(settings: SweepSettings, points: list[Point]) -> tuple[Statement, ...]:
+def figure9(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
     """Inertia."""
     return (
         Statement(
@@ -68,7 +68,7 @@ def figure9(settings: SweepSettings, points: list[Point]) -> tuple[Statement, ..
     )
 
 
-def figure10(settings: SweepSettings, points: list[Point]) -> tuple[Statement, ...]:
+def figure10(settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
     """Frequency."""
     gains = _column(points, "gain_fundamental")
     peak = gains.index(max(gains))
@@ -95,7 +95,7 @@ def figure10(settings: SweepSettings, points: list[Point]) -> tuple[Statement, .
     )
 
 
-def figure12(_settings: SweepSettings, points: list[Point]) -> tuple[Statement, ...]:
+def figure12(_settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
     """Proportional gain."""
     gains = _column(points, "gain")
     return (
@@ -104,7 +104,7 @@ def figure12(_settings: SweepSettings, points: list[Point]) -> tuple[Statement, 
     )
 
 
-def figure13(_settings: SweepSettings, points: list[Point]) -> tuple[Statement, ...]:
+def figure13(_settings: SweepSettings, points: list[SweepPoint]) -> tuple[Statement, ...]:
     """Integral gain."""
     short = [abs(one) for one in _column(points, "amplitude_difference_rad_s")]
     return (

@@ -1,8 +1,8 @@
 """Figures 9, 10, 12 and 13: one thing is swept, the speed follows the sine more or less well (section 3.4).
 
 P and I of these figures aren't printed, and "the parameters are held constant" through 3.4.1 to 3.4.3: the defaults
-are those that give the two gains printed for figure 11 (`figures_signal`). Amplitude, gain and phase are taken over
-the last whole periods of each record's second half.
+are those that give the two gains printed for figure 11 (`figures.SignalSettings`). Amplitude, gain and phase are taken
+over the last whole periods of each record's second half.
 """
 
 from __future__ import annotations
@@ -164,14 +164,14 @@ class KiSweepSettings(SweepSettings):
 
 
 @dataclass(frozen=True)
-class Point:
+class SweepPoint:
     """One value of what is swept, and how the speed followed."""
 
     value: float
     response: Response
 
 
-Claims = Callable[[SweepSettings, list[Point]], tuple[Statement, ...]]
+Claims = Callable[[SweepSettings, list[SweepPoint]], tuple[Statement, ...]]
 
 
 class SweepStudy:
@@ -193,7 +193,7 @@ class SweepStudy:
             window = settled_periods(run.steps, run.sample_period_s, 1.0 / run.frequency_hz)
             assert window is not None   # the settings were checked for it
             time, asked, speed, _ = record.of(number, window)
-            points.append(Point(settings.values[number], response(time, asked, speed, run.frequency_hz)))
+            points.append(SweepPoint(settings.values[number], response(time, asked, speed, run.frequency_hz)))
             curves.append(Curve(settings.values[number], (time - time[0]) * run.frequency_hz, asked, speed))
         progress(1.0, self.name)
         return StudyOutcome(
@@ -204,7 +204,7 @@ class SweepStudy:
         )
 
 
-def _columns(point: Point) -> dict[str, float]:
+def _columns(point: SweepPoint) -> dict[str, float]:
     found = point.response
     return {
         "amplitude_in_rad_s": found.amplitude_in_rad_s, "amplitude_out_rad_s": found.amplitude_out_rad_s,
@@ -214,11 +214,11 @@ def _columns(point: Point) -> dict[str, float]:
     }
 
 
-def _table(name: str, settings: SweepSettings, points: list[Point]) -> ResultTable:
+def _table(name: str, settings: SweepSettings, points: list[SweepPoint]) -> ResultTable:
     rows: list[tuple[Cell, ...]] = [(point.value, *_columns(point).values()) for point in points]
     return ResultTable(f"{name}_response", (settings.swept, *_columns(points[0])), tuple(rows))
 
 
-def _document(settings: SweepSettings, points: list[Point]) -> dict[str, Any]:
+def _document(settings: SweepSettings, points: list[SweepPoint]) -> dict[str, Any]:
     runs = [{settings.swept: point.value, **_columns(point)} for point in points]
     return {"settings": settings.model_dump(mode="json"), "runs": runs}

@@ -19,16 +19,16 @@ from profiles import DataModel
 from tdhil.soft_torque import (
     RPM,
     Begin,
-    Bottom,
+    BottomEnd,
     ClosedSystem,
     CriticalSpeeds,
     DrillString,
+    PipeSection,
     Search,
-    Section,
+    SimulationTrace,
     SpeedController,
     StringFile,
     TopDrive,
-    Trace,
     TuneCase,
     critical_speeds,
     largest_stable_share,
@@ -76,8 +76,8 @@ class SoftTorqueSettings(DataModel):
 
     def string(self) -> DrillString:
         """5 inch pipe, steel, and the bit."""
-        section = Section(length_m=self.length_m, outer_diameter_m=0.127, inner_diameter_m=0.1086)
-        bottom = Bottom(
+        section = PipeSection(length_m=self.length_m, outer_diameter_m=0.127, inner_diameter_m=0.1086)
+        bottom = BottomEnd(
             inertia_kg_m2=self.bottom_inertia_kg_m2, friction="stribeck", static_nm=self.static_nm,
             coulomb_nm=self.coulomb_nm, stribeck_speed_rad_s=self.stribeck_speed_rad_s,
             viscous_nm_s_rad=self.bit_viscous_nm_s_rad,
@@ -96,7 +96,7 @@ class SoftTorqueSettings(DataModel):
 
 
 @dataclass(frozen=True)
-class Expected:
+class PrototypeResult:
     """What the prototype gave for one controller."""
 
     reflection: float
@@ -107,27 +107,27 @@ class Expected:
 
 
 @dataclass(frozen=True)
-class Row:
+class ControllerRow:
     """One controller and what came out."""
 
     name: str
     drive: TopDrive
     law: SpeedController
-    expected: Expected
+    expected: PrototypeResult
     reflection: float
     dampings: tuple[float, ...]
     modes_hz: tuple[float, ...]
     critical: CriticalSpeeds | None = None
 
 
-EXPECTED: Mapping[str, Expected] = {
-    "stiff, phase margin 60°": Expected(0.992, (0.036,), 24, 170, 183),
-    "the paper's 300/300, scaled to J": Expected(0.932, (0.062,), 22, 106, 133),
-    "soft a = 1": Expected(0.046, (0.059, 0.083), 21, 71, 72),
-    "soft a = 0.25": Expected(0.593, (0.23, 0.27), 22, 58, 57),
-    "a = 0.35 at 0.84 f₁": Expected(0.537, (0.14, 0.28), 27, 48, 46),
-    "the same, half of J compensated": Expected(0.477, (0.26, 0.53), 29, 40, 40),
-    IDEAL: Expected(0.0, (0.80,), 35, 30, 20),
+EXPECTED: Mapping[str, PrototypeResult] = {
+    "stiff, phase margin 60°": PrototypeResult(0.992, (0.036,), 24, 170, 183),
+    "the paper's 300/300, scaled to J": PrototypeResult(0.932, (0.062,), 22, 106, 133),
+    "soft a = 1": PrototypeResult(0.046, (0.059, 0.083), 21, 71, 72),
+    "soft a = 0.25": PrototypeResult(0.593, (0.23, 0.27), 22, 58, 57),
+    "a = 0.35 at 0.84 f₁": PrototypeResult(0.537, (0.14, 0.28), 27, 48, 46),
+    "the same, half of J compensated": PrototypeResult(0.477, (0.26, 0.53), 29, 40, 40),
+    IDEAL: PrototypeResult(0.0, (0.80,), 35, 30, 20),
 }
 
 ERROR_ROWS: Mapping[str, tuple[float | None, ...]] = {
@@ -142,7 +142,7 @@ ERROR_ROWS: Mapping[str, tuple[float | None, ...]] = {
 SHARE_ROWS: Mapping[str, tuple[float, ...]] = {"33 ms": (0.65, 0.60, 0.55, 0.35), "8 ms": (0.70, 0.65, 0.60, 0.35)}
 
 
-def controllers(settings: SoftTorqueSettings) -> list[Row]:
+def controllers(settings: SoftTorqueSettings) -> list[ControllerRow]:
     """The seven of the reference table, with what theory says of them."""
     string, drive = settings.string(), settings.drive()
     held = string_modes_hz(string)
@@ -162,9 +162,9 @@ def controllers(settings: SoftTorqueSettings) -> list[Row]:
         modes = ClosedSystem(string, machine, law).modes(float(np.sqrt(held[0] * held[1])))
         swinging = [mode for mode in modes if name != "the paper's 300/300, scaled to J" or mode.damping < 0.5]
         reflected = reflection_at(machine, law, string, np.array([held[0]]))[0]
-        rows.append(Row(name, machine, law, EXPECTED[name], float(reflected),
-                        tuple(sorted(mode.damping for mode in swinging)),
-                        tuple(mode.frequency_hz for mode in swinging)))
+        rows.append(ControllerRow(name, machine, law, EXPECTED[name], float(reflected),
+                                  tuple(sorted(mode.damping for mode in swinging)),
+                                  tuple(mode.frequency_hz for mode in swinging)))
     return rows
 
 
@@ -253,7 +253,7 @@ def largest_shares(settings: SoftTorqueSettings, lags_s: tuple[float, ...]) -> t
     return tuple(float(share) for share in shares)
 
 
-def start_by_ramp(rows: Sequence[Row], settings: SoftTorqueSettings) -> ResultTable:
+def start_by_ramp(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> ResultTable:
     """Start speed by the ramp."""
     ramps = (3.0, 4.0, 5.0, 10.0)
     loops = [(row.drive, row.law) for row in rows]
@@ -263,7 +263,7 @@ def start_by_ramp(rows: Sequence[Row], settings: SoftTorqueSettings) -> ResultTa
     return ResultTable("start_by_ramp", ("controller", *(f"rpm_at_{ramp:g}_rpm_s" for ramp in ramps)), tuple(cells))
 
 
-def onset_by_beginning(rows: Sequence[Row], settings: SoftTorqueSettings) -> ResultTable:
+def onset_by_beginning(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> ResultTable:
     """Onset by the set speed that the fall begins at."""
     starts = np.array([100.0, 130.0, 150.0, 170.0, 190.0, 210.0, 240.0])
     begin = np.tile(starts * RPM, (len(rows), 1))
@@ -276,7 +276,7 @@ def onset_by_beginning(rows: Sequence[Row], settings: SoftTorqueSettings) -> Res
     return ResultTable("onset_by_beginning", columns, tuple(cells))
 
 
-def stick_slip(rows: Sequence[Row], settings: SoftTorqueSettings) -> tuple[tuple[str, ...], Trace]:
+def stick_slip(rows: Sequence[ControllerRow], settings: SoftTorqueSettings) -> tuple[tuple[str, ...], SimulationTrace]:
     """Bit and top under three of them, from a stuck bit."""
     taken = (rows[0], rows[1], rows[3])
     target = np.full((len(taken), 1), settings.shown_at_rpm * RPM)
@@ -289,9 +289,9 @@ def stick_slip(rows: Sequence[Row], settings: SoftTorqueSettings) -> tuple[tuple
 # Tables and statements.
 
 
-def controller_table(rows: Sequence[Row]) -> ResultTable:
+def controller_table(rows: Sequence[ControllerRow]) -> ResultTable:
     """The reference table."""
-    def cells(row: Row) -> tuple[Cell, ...]:
+    def cells(row: ControllerRow) -> tuple[Cell, ...]:
         speeds = row.critical
         return (row.name, row.law.gain_nm_s_rad, row.law.integral_nm_rad, row.law.compensated_kg_m2, row.reflection,
                 *((speeds.onset_rpm, speeds.start_rpm, speeds.cure_rpm) if speeds else (None, None, None)))
@@ -300,7 +300,7 @@ def controller_table(rows: Sequence[Row]) -> ResultTable:
                                        "start_rpm", "cure_rpm"), tuple(cells(row) for row in rows))
 
 
-def modes_table(rows: Sequence[Row]) -> ResultTable:
+def modes_table(rows: Sequence[ControllerRow]) -> ResultTable:
     """Each of the lowest modes."""
     cells: list[tuple[Cell, ...]] = []
     for row in rows:
@@ -324,7 +324,7 @@ def share_table(shares: Mapping[str, Sequence[float]]) -> ResultTable:
     return ResultTable("largest_stable_share", ("inner_lag", *names), rows)
 
 
-def controller_statements(rows: Sequence[Row]) -> list[Statement]:
+def controller_statements(rows: Sequence[ControllerRow]) -> list[Statement]:
     """Two a controller: what theory says, and what the simulation does."""
     found = []
     for row in rows:
@@ -344,7 +344,7 @@ def controller_statements(rows: Sequence[Row]) -> list[Statement]:
     return found
 
 
-def _speeds(row: Row, critical: CriticalSpeeds) -> Statement:
+def _speeds(row: ControllerRow, critical: CriticalSpeeds) -> Statement:
     expected = row.expected
     pairs = {
         "onset": (critical.onset_rpm, expected.onset_rpm), "start": (critical.start_rpm, expected.start_rpm),
@@ -397,7 +397,8 @@ def _cures(values: Sequence[float | None]) -> str:
 
 
 def draw(
-    string: DrillString, rows: Sequence[Row], shown: tuple[tuple[str, ...], Trace], settings: SoftTorqueSettings,
+    string: DrillString, rows: Sequence[ControllerRow], shown: tuple[tuple[str, ...], SimulationTrace],
+    settings: SoftTorqueSettings,
     figure: Figure,
 ) -> None:
     """|r(f)| of all, then bit and top in time."""

@@ -1,0 +1,46 @@
+"""One name, one thing: no two classes of the source have the same name, but for those that mean the same.
+
+A leading underscore does not make another name: ``_Point`` beside ``Point`` is met by the same search.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+ROOMS = ("tdhil", "drivers", "sim_bus", "profiles")
+
+# Names of several classes, where these stand, and why one name is right.
+SHARED = {
+    "Check": ({"drivers/drive.py", "tdhil/service/run_state.py"},
+              "one line of the preflight table: as the driver makes it, and as the service's document names it"),
+    "DrillString": ({"tdhil/soft_torque/drill_string.py", "sim_bus/plant/drill_string.py"},
+                    "the same string, written twice on purpose: the simulator shares no physics with what it proves"),
+    "Faults": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"},
+               "the script of one drive, on either bus"),
+    "Misbehaviour": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"},
+                     "what a fault of the bus in question overrides"),
+    "Parameter": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "Position": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "QuickStop": ({"profiles/canopen.py", "profiles/modbus.py"}, "the same section of a profile, on either bus"),
+    "Scene": ({"sim_bus/canopen/faults.py", "sim_bus/modbus/faults.py"}, "where a fault happens, on either bus"),
+    "State": ({"drivers/canopen/state_machine.py", "sim_bus/cia402.py", "tdhil/service/run_state.py"},
+              "the states of CiA 402, which driver and simulator each take from the standard; and those of a run, as "
+              "the service's document names them"),
+}
+
+
+def test_no_two_classes_have_one_name():
+    found = defaultdict(list)
+    for room in ROOMS:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            source = path.read_text(encoding="utf-8")
+            if "class " in source:
+                for node in ast.walk(ast.parse(source)):
+                    if isinstance(node, ast.ClassDef):
+                        found[node.name.lstrip("_")].append(path.relative_to(ROOT).as_posix())
+    twice = {name: sorted(paths) for name, paths in found.items() if len(paths) > 1}
+    assert len(found) > 800
+    assert twice == {name: sorted(paths) for name, (paths, _) in SHARED.items()}
