@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import TOLERANCE, amount, share
+from tdhil.cli.arguments import add_settings, amount, settings_in
 from tdhil.cli.results import print_json
-from tdhil.config import MODELS
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -51,10 +50,7 @@ def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: each run's, or auto)")
-    parser.add_argument("--confidence", type=share, metavar="P", help="of the intervals (default: each run's, or 0.95)")
-    parser.add_argument("--tolerance", type=share, metavar="SHARE",
-                        help="half-width of the interval that is enough (default: each run's, or 0.05)")
+    add_settings(parser, "each run's")
     parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
                         help="for one log; twice over it, it is set aside (default 120 s)")
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
@@ -147,16 +143,12 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
         raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
-    if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
-        raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
-    if namespace.tolerance is not None and not 0.0 < namespace.tolerance < 1.0:
-        raise UsageError(f"{namespace.tolerance:g}: must be {TOLERANCE}", where="--tolerance")
     if not namespace.time_limit > 0.0:
         raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit")
     if not namespace.memory_limit >= 100:
         raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
     return FleetRequest(
-        roots, out, Settings(namespace.model, namespace.confidence, namespace.tolerance),
+        roots, out, Settings(**settings_in(namespace)),
         jobs=namespace.jobs or usable_cores(),
         scheduler=getattr(namespace, "scheduler", None),
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),

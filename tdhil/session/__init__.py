@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         require_file as require_file,
     )
     from tdhil.session.run_session import (
-        OperatorInterface as OperatorInterface, Overrides as Overrides, RunRequest as RunRequest,
+        OperatorInterface as OperatorInterface, RunRequest as RunRequest,
         RunSession as RunSession,
     )
     from tdhil.session.stop_signals import Ending as Ending, stop_on_signals as stop_on_signals
