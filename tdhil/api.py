@@ -284,11 +284,11 @@ def run(
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
     """What would be opened: the command line's checks, in its order. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
-    from tdhil.session import check_log_path, check_names, connection_of, plan_peer, with_faults
+    from tdhil.session import check_log_path, check_unverified, connection_of, plan_peer, with_faults
 
     cli = {**drive.options, **asked}
     options, connection = connection_of(cli, drive.rig, resolve(cli, drive.rig))
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     check_log_path(Path(options.log), "log")
     return options, connection, with_faults(plan_peer(options, connection), drive.faults, connection.drive)
 

@@ -15,7 +15,6 @@ from profiles import quantities
 from profiles.quantities import SHARE, Unit
 from tdhil.config import ASKED_AGAIN, OPTIONS, Group, Option
 from tdhil.errors import UsageError
-from tdhil.session import bus_kinds
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -96,5 +95,7 @@ def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGr
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     """Where it is, on any bus: python-can's own options are the most, and come last."""
+    from tdhil.session import bus_kinds
+
     for kind in reversed(bus_kinds()):
         kind.add_arguments(parser)

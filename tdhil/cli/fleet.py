@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import add_settings, amount, settings_in
+from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
-    parser.add_argument("--json", action="store_true", help="the summary as one JSON document on stdout")
+    add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
 
 
 def _add_jobs(group: Any) -> None:

@@ -80,7 +80,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     """
     from tdhil.cli.dry_run import dry_run, dry_run_course, say_unreachable
     from tdhil.report import stderr_console
-    from tdhil.session import RunRequest, check_names, connection_of, plan_peer, suited, with_faults
+    from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -89,7 +89,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     if options.json is True:
         namespace.json = True
     options, connection = connection_of(vars(namespace), rig, options)
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     console = stderr_console()
     if namespace.report is not None:
         from tdhil.report import check_report_path

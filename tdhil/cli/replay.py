@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     # Optional for argparse only: behind --columns the file's name is taken for one more column (`_log`).
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE",
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
     add_option(parser, OPTION["operator"], help="who ran it, for the report (default: as the log says)")

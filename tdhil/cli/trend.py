@@ -10,8 +10,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import add_settings, settings_in
+from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="with a picture, in one file (extra `report`)")
 
 

@@ -284,7 +284,7 @@ class RunOptions:
         "--string-impedance", "run.string_impedance_nm_s_rad", group=Group.MOTION, unit=FRICTION, metavar="NMS",
         ge=0, le=1e9, unset="that of the pipe in `load`, if any",
         help="N·m·s/rad at the main shaft: of the pipe that the reflection is told for",
-        more="at the main shaft; ζ of the string that the reflection is told for",
+        more="ζ, at the main shaft, of the string that the reflection is told for",
     )
     model: str = option(
         "--model", "run.model", "auto", group=Group.RESULT, choices=MODELS, api=True, asked_again="of the shaft",

@@ -45,10 +45,11 @@ EXCITATIONS: dict[str, Entry] = {
     "sine": Entry("tdhil.runner.excitation.signals:SINE", "one tone (equation 8 of the paper)", True),
     "step": Entry("tdhil.runner.excitation.signals:STEP", "a square wave of speed (equation 9 of the paper)", True,
                   True),
-    "prbs": Entry("tdhil.runner.excitation.signals:PRBS", "pseudo-random torque, for a drill string on bottom", True,
-                  before_echo=True),
+    "prbs": Entry("tdhil.runner.excitation.signals:PRBS", "pseudo-random torque, for a string whose pipe is known",
+                  periodic=True, before_echo=True),
     "pulses": Entry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
-    "coast-down": Entry("tdhil.runner.excitation.pulses:COAST_DOWN", "without torque down, under power back up"),
+    "coast-down": Entry("tdhil.runner.excitation.pulses:COAST_DOWN",
+                        "without torque down, under power back up; never with a string"),
 }
 """Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
 

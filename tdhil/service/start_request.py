@@ -251,12 +251,12 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
 
     Raises UsageError, DataFileError and PreflightRefused.
     """
-    from tdhil.session import RunRequest, check_names, plan_peer, with_faults
+    from tdhil.session import RunRequest, check_unverified, plan_peer, with_faults
 
     asked = _taken(asked)
     details = RunDetails.of(asked)
     options, connection = rig.way(asked)
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     options = options.replaced(log=replace(options.settings["log"], value="run.mcap"))
     peer = with_faults(plan_peer(options, connection), details.faults, connection.drive)
     if not peer.embedded:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         opened_drive as opened_drive, plan_peer as plan_peer, with_faults as with_faults,
     )
     from tdhil.session.overrides import (
-        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
+        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_unverified as check_unverified, doubtful as doubtful,
         is_accepted as is_accepted,
     )
     from tdhil.session.run_record import (
