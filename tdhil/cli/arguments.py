@@ -69,13 +69,13 @@ def add_options(parser: argparse.ArgumentParser, *groups: Group) -> dict[Group, 
 
 
 def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
-    """What a log may be identified with; ``whose`` settings are the default, such as ``the run's``."""
+    """Options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
     for option in ASKED_AGAIN:
         add_option(parser, option, help=f"{option.asked_again} (default: {whose}, or {option.default_text})")
 
 
 def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
-    """Those of them that were given. UsageError names an option whose value is out of its limits."""
+    """Return those that were given, by name. UsageError names an option whose value is out of its limits."""
     given: dict[str, Any] = {}
     for one in ASKED_AGAIN:
         if (value := getattr(namespace, one.name)) is None:

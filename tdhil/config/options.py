@@ -149,13 +149,13 @@ class Option:
         return self.help.replace("{default}", self.default_text)
 
     def refusal(self, value: float) -> str:
-        """What a number must be, if it is not; '' if it is within the limits."""
+        """Return the limits, in words, that a number is not within; '' if it is."""
         right = all(_LIMITS[name][1](value, limit) for name, limit in self.limits.items())
         return "" if right else " and ".join(f"{_LIMITS[name][0]} {limit:g}" for name, limit in self.limits.items())
 
     @property
     def form_hint(self) -> str:
-        """What an empty field of a form stands for."""
+        """Text of an empty field: the value that applies."""
         if self.form is None or self.form.hint or self.default is None or self.joined:
             return self.unset if self.form is None else self.form.hint or self.unset
         default = self.default if self.form.unit is None else f"{self.form.unit.of_si(self.default):g}"
@@ -223,16 +223,16 @@ class RunOptions:
     )
     accept_unverified: tuple[str, ...] = option(
         "--accept-unverified", "accept_unverified", (), group=Group.OVERRIDES, metavar="NAME", api=True,
-        form=Form("Entries of the profile that nobody verified", ("real",), hint="likely", wide=True),
-        help="take this entry of the profile although nobody verified it; 'likely' takes all of those",
-        more="entries of the profile that are taken although nobody verified them, by name, such as `[watchdog, "
-             "parameters.time_out]`; a section's name takes what is `likely` in it, `likely` takes all of that, and "
-             "what is `unverified` goes by its own name only. Adds to what the command line names",
+        form=Form("Entries of the profile that are not verified", ("real",), hint="likely", wide=True),
+        help="accept this entry of the profile although it is not verified; 'likely' accepts all of those",
+        more="entries of the profile that are accepted although they are not verified, by name, such as `[watchdog, "
+             "parameters.time_out]`; the name of a section accepts its `likely` entries, `likely` accepts all of "
+             "those, and an `unverified` entry is accepted by its own name only. Adds to those of the command line",
     )
     rate_hz: float | None = option(
         "--rate", "rate_hz", group=Group.CYCLE, unit=FREQUENCY, metavar="HZ", api=True, gt=0, le=2000,
         unset="what this computer holds", help="cycles a second (default: {default}, up to the profile's)",
-        more="cycles a second, up to 2000. Where nobody names it, the profile's (250 as a rule) and lower ones are "
+        more="cycles a second, up to 2000. Without it, the profile's (250 as a rule) and lower ones are "
              "tried before motion, and the highest is taken at which 999 cycles of 1000 begin, and are answered, in "
              "time by half a period",
     )
@@ -283,8 +283,8 @@ class RunOptions:
     string_impedance_nm_s_rad: float | None = option(
         "--string-impedance", "run.string_impedance_nm_s_rad", group=Group.MOTION, unit=FRICTION, metavar="NMS",
         ge=0, le=1e9, unset="that of the pipe in `load`, if any",
-        help="N·m·s/rad at the main shaft: of the pipe that the reflection is told for",
-        more="ζ, at the main shaft, of the string that the reflection is told for",
+        help="impedance of the pipe for which the reflection is reported, N·m·s/rad at the main shaft",
+        more="ζ, at the main shaft, of the string for which the reflection is reported",
     )
     model: str = option(
         "--model", "run.model", "auto", group=Group.RESULT, choices=MODELS, api=True, asked_again="of the shaft",
@@ -302,7 +302,7 @@ class RunOptions:
     )
     simulate: bool = option(
         "--simulate", "run.simulate", False, group=Group.SIMULATED, python=False,
-        help="embedded simulator; the default where nobody says where the drive is",
+        help="embedded simulator; the default if no bus or line of a drive is configured",
         more="embedded simulator, whatever bus is configured",
     )
     real_time: bool = option(
@@ -372,7 +372,7 @@ class _Said:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """From values by the options' names; None is not given."""
+        """Build it from values by the options' names; None is not given."""
         given = {one.keyword: values.get(one.name) for one in _rows(cls)}
         return cls(**{name: tuple(value) if isinstance(value, list) else value
                       for name, value in given.items() if value is not None})
@@ -405,7 +405,7 @@ class Overrides(_Said):
     reset_fault: bool = option(
         "--reset-fault", group=Group.OVERRIDES, default=False, api=True,
         form=Form("reset a drive that is in fault", ("real",)),
-        help="reset a drive that is in fault; never done unasked",
+        help="reset a drive that is in fault; never done without this option",
     )
 
 
@@ -419,7 +419,7 @@ class RunDetails(_Said):
     )
     note: str | None = option(
         "--note", group=Group.OUTPUT, metavar="TEXT", api=True, longest=500, form=Form("Note", wide=True),
-        help="whatever else log and report shall say of this run",
+        help="remark on this run, for log and report",
     )
     faults: tuple[str, ...] = option(
         "--fault", group=Group.SIMULATED, default=(), metavar="FAULT", api=True,
@@ -438,7 +438,7 @@ OPTIONS: Final = (*RESOLVED, *_rows(Overrides), *_rows(RunDetails))
 """The whole table."""
 OPTION: Final = MappingProxyType({one.name: one for one in OPTIONS})
 ASKED_AGAIN: Final = tuple(sorted((one for one in OPTIONS if one.asked_again), key=lambda one: one.name))
-"""What a replay, or a fleet, may ask for otherwise than the run had it."""
+"""Options that a replay, a comparison or a fleet may set otherwise than the run."""
 
 
 CLOCKS: Final = ("real_time", "stepped")
@@ -446,7 +446,7 @@ CLOCKS: Final = ("real_time", "stepped")
 
 
 def is_name(flag: str, value: str) -> bool:
-    """Is the value of a file's option the name of a profile that ships, and no file?"""
+    """Tell the name of a profile that ships from a file."""
     return flag == OPTION["profile"].flag and not value.endswith((".yaml", ".yml"))
 
 

@@ -92,7 +92,7 @@ def _value(option: Option, value: Any) -> Any:
 
 
 def _taken(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """No other option than those that may come over HTTP, whatever a file of the service states."""
+    """Keep only the options that may come over HTTP, also of a request that was read from a file."""
     return {name: value for name, value in asked.items() if name in TAKEN}
 
 

@@ -118,7 +118,7 @@ _KEYWORDS = {
     "--columns": "columns", "--rated-torque": "rated_torque_nm", "--torque-limit": "torque_limit_nm",
     "--gear": "gear_ratio", "--torque-scale-sd": "torque_scale_rel_sd", "--skew-sd": "skew_sd_s",
 }
-"""What a flag is called in Python, beside the options of a run and of its bus, which have their own."""
+"""Python keywords of the flags that no table of options has: those of `read`, and short ones of python-can."""
 
 
 class ByKeyword(ContextDecorator):
