@@ -14,13 +14,23 @@ Everything here raises `tdhil.TdhilError` and its kind, each with what happened,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from tdhil.errors import UsageError
+from tdhil.config import (
+    DEFAULT_BUS,
+    OF_THE_RESULT,
+    OF_THE_RUN,
+    OF_THE_SIMULATOR,
+    OPTION,
+    Overrides,
+    RunDetails,
+    values_of,
+    with_keywords,
+)
 from tdhil.runner import StopRequest
 from tdhil.session import ByKeyword, RunRecord, read
 
@@ -156,25 +166,19 @@ class Result:
         return card_html(self.document)
 
 
+@with_keywords(OF_THE_RESULT)
 @ByKeyword()
-def identify(
-    recorded: RunRecord,
-    *,
-    model: str | None = None,
-    confidence: float | None = None,
-    tolerance: float | None = None,
-) -> Result:
+def identify(recorded: RunRecord, **options: Any) -> Result:
     """Identify J and all that comes with it from a recording; the same as ``tdhil replay``, digit for digit.
 
-    ``model``: auto, rigid, two-mass, string or paper; ``confidence`` of the intervals; ``tolerance``: the relative
-    half-width that is enough for ``valid``. None: as the run had it. Raises UsageError for values that can't be, and
-    NothingRecorded where the run in a log ended before anything moved.
+    ``options``: ``model`` of the shaft, ``confidence`` of the intervals, ``tolerance``: the relative half-width that is
+    enough for `valid`; the page on rig.yaml describes them. None: as the run had it. Raises UsageError for values that
+    can't be, and NothingRecorded where the run in a log ended before anything moved.
     """
     from tdhil.session import conclude
 
     recorded.require_motion()
-    asked = {"model": model, "confidence": confidence, "tolerance": tolerance}
-    configuration = recorded.asked({name: value for name, value in asked.items() if value is not None})
+    configuration = recorded.asked(values_of(OF_THE_RESULT, options, "tdhil.identify"))
     found = conclude(recorded.recording, configuration, recorded.log, recorded.assumed)
     return Result(found.identification, found.document, found.exit_code, recorded)
 
@@ -207,68 +211,56 @@ def open_drive(rig: str | Path, **options: Any) -> Iterator[DriveHandle]:
     yield handle
 
 
+@with_keywords(OF_THE_SIMULATOR)
 @contextmanager
-def simulate(
-    *,
-    seed: int | None = None,
-    plant: str | Path | None = None,
-    drive: str = "canopen",
-    profile: str | None = None,
-    rig: str | Path | None = None,
-    faults: Sequence[str] = (),
-    real_time: bool = False,
-) -> Iterator[DriveHandle]:
-    """The embedded simulated drive and rig, in stepped time; ``plant``: a plant.yaml; ``faults`` as of ``--fault``."""
+def simulate(*, rig: str | Path | None = None, **options: Any) -> Iterator[DriveHandle]:
+    """The embedded simulated drive and rig, in stepped time unless ``real_time``; CANopen unless ``drive``.
+
+    ``options``: those of the drive and of the simulated rig, such as ``seed``, ``plant`` (a plant.yaml) and ``faults``
+    (a list, as of ``--fault``); the page on rig.yaml describes them.
+    """
     from tdhil.config import load_rig
 
-    asked = {
-        "simulate": True, "seed": seed, "plant": None if plant is None else str(plant), "drive": drive,
-        "profile": profile, "real_time": real_time or None,
-    }
-    given = {name: value for name, value in asked.items() if value is not None}
-    handle = DriveHandle(None if rig is None else load_rig(Path(rig)), given, tuple(faults))
+    given = {"drive": DEFAULT_BUS, **values_of(OF_THE_SIMULATOR, options, "tdhil.simulate"), "simulate": True}
+    handle = DriveHandle(None if rig is None else load_rig(Path(rig)), given, RunDetails.of(given).faults)
     with ByKeyword():
         _peer(handle, {})
     yield handle
 
 
+@with_keywords(OF_THE_RUN)
 @ByKeyword()
 def run(
     drive: DriveHandle,
     motion: Motion | None = None,
     *,
     confirm: Callable[[str], bool] | None = None,
-    log: str | Path = "run.mcap",
-    mode: Literal["torque", "speed"] | None = None,
-    tolerance: float | None = None,
-    max_time_s: float | None = None,
-    operator: str | None = None,
-    note: str | None = None,
     stop: StopRequest | None = None,
-    **overrides: Any,
+    **options: Any,
 ) -> RunRecord:
     """Run the five stages and the stop, and give what was recorded; the log is closed then, and the shaft at rest.
 
     ``confirm`` is asked once before a real shaft moves, with what will move in words; anything but True refuses. None:
-    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``overrides``: fields
-    of `tdhil.session.Overrides`, by name. Ctrl-C is a stop, as on the command line, where this is the main thread; in
-    another one give a ``stop``, and ``ask()`` it: signals are not looked at there.
+    it is typed at the terminal, and refused where there is none. A simulated drive asks nobody. ``options``: those of
+    motion, result, control loop, overrides and log, such as ``log``, ``mode``, ``tolerance``, ``max_time_s``,
+    ``operator``, ``note``, ``no_watchdog``; ``help(tdhil.run)`` lists them, the page on rig.yaml describes them.
+    Ctrl-C is a stop, as on the command line, where this is the main thread; in another one give a ``stop``, and
+    ``ask()`` it: signals are not looked at there.
 
     Raises what ended the run, with the log's name as a note, once the shaft has been taken care of; StopNotConfirmed
     where it was not seen at rest: use the hard-wired stop then.
     """
     from tdhil.runner import not_confirmed
-    from tdhil.session import Overrides, RunRequest, RunSession
+    from tdhil.session import RunRequest, RunSession
 
-    unknown = set(overrides) - {one.name for one in fields(Overrides)}
-    if unknown:
-        raise UsageError(f"no such override: {', '.join(sorted(unknown))}", where="tdhil.run")
-    asked: dict[str, Any] = {"log": str(log), "mode": mode, "tolerance": tolerance, "max_time_s": max_time_s}
     motion = motion or Multisine()
-    asked |= {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()}
-    options, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
-    request = RunRequest.of(options, connection, peer, drive.rig, overrides=Overrides(**overrides), operator=operator,
-                            note=note)
+    asked = {"excitation" if name == "kind" else name: value for name, value in asdict(motion).items()}
+    asked |= {"log": OPTION["log"].default, **values_of(OF_THE_RUN, options, "tdhil.run")}
+    details = RunDetails.of(asked)
+    chosen, connection, peer = _peer(drive, {name: one for name, one in asked.items() if one is not None})
+    request = RunRequest.of(chosen, connection, peer, drive.rig, overrides=Overrides.of(asked),
+                            operator=details.operator, note=details.note,
+                            real_time_priority=bool(details.real_time_priority))
     session = RunSession(request, _operator_interface(request, confirm))
     try:
         outcome = session.move(stop)
@@ -292,11 +284,11 @@ def run(
 def _peer(drive: DriveHandle, asked: Mapping[str, Any]) -> tuple[RunOptions, Connection, PeerPlan]:
     """What would be opened: the command line's checks, in its order. Raises UsageError and DataFileError."""
     from tdhil.config import resolve
-    from tdhil.session import check_log_path, check_names, connection_of, plan_peer, with_faults
+    from tdhil.session import check_log_path, check_unverified, connection_of, plan_peer, with_faults
 
     cli = {**drive.options, **asked}
     options, connection = connection_of(cli, drive.rig, resolve(cli, drive.rig))
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     check_log_path(Path(options.log), "log")
     return options, connection, with_faults(plan_peer(options, connection), drive.faults, connection.drive)
 

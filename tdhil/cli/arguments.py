@@ -9,11 +9,12 @@ import argparse
 import difflib
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config import BUSES, DEFAULT_BUS
-from tdhil.session import bus_kinds
+from tdhil.config import ASKED_AGAIN, OPTIONS, Group, Option
+from tdhil.errors import UsageError
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Quantities as people type them on the command line: 1%, 0.01, 5min, 40rpm. `profiles.quantities` has the units.
@@ -34,8 +35,6 @@ def amount(unit: Unit) -> Callable[[str], float]:
 share = amount(SHARE)
 """``1%`` or ``0.01``."""
 
-TOLERANCE = "a share between 0 and 1, such as 1% or 0.01"
-
 
 def meant(name: str, known: Iterable[str]) -> str:
     """The question whether it is the one of ``known`` that is much like it, and a space; nothing where none is."""
@@ -45,21 +44,58 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 # ---------------------------------------------------------------------------------------------------------------------
 
+def add_option(group: argparse._ActionsContainer, option: Option, *, help: str = "") -> None:
+    """A row of the table as an argument; ``help``: of a command for which it means something else."""
+    words: dict[str, Any] = {"dest": option.name, "help": (help or option.help_text).replace("%", "%%")}
+    if option.kind is bool:
+        words |= {"action": "store_const", "const": True}
+    else:
+        words |= {"metavar": option.metavar, "choices": option.allowed or None}
+        if option.joined:
+            words["action"] = "append"
+        elif option.kind is not str:
+            words["type"] = option.kind if option.unit is None else amount(option.unit)
+    group.add_argument(option.flag, **words)
+
+
+def add_options(parser: argparse.ArgumentParser, *groups: Group) -> dict[Group, argparse._ArgumentGroup]:
+    """The rows of these groups, in a section each, for what a command has to add to it."""
+    sections = {group: parser.add_argument_group(group.value) for group in groups}
+    for group, section in sections.items():
+        for option in OPTIONS:
+            if option.group is group:
+                add_option(section, option)
+    return sections
+
+
+def add_settings(parser: argparse.ArgumentParser, whose: str) -> None:
+    """Options of identifying a log again; ``whose`` settings are the default, such as ``the run's``."""
+    for option in ASKED_AGAIN:
+        add_option(parser, option, help=f"{option.asked_again} (default: {whose}, or {option.default_text})")
+
+
+def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
+    """Return those that were given, by name. UsageError names an option whose value is out of its limits."""
+    given: dict[str, Any] = {}
+    for one in ASKED_AGAIN:
+        if (value := getattr(namespace, one.name)) is None:
+            continue
+        if one.limits and (wanted := one.refusal(value)):
+            raise UsageError(f"{value:g}: must be {wanted}", where=one.flag)
+        given[one.name] = value
+    return given
+
+
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Which drive; the group, for what a command has to add to it."""
-    kinds = bus_kinds()
-    drive = parser.add_argument_group("drive")
-    drive.add_argument("--drive", choices=tuple(BUSES),
-                       help=f"how the drive is spoken to (default: as the profile is, else {DEFAULT_BUS})")
-    drive.add_argument("--profile", metavar="NAME", help="vendor/model, or a .yaml file (default "
-                       f"{', '.join(kind.default_profile for kind in kinds)})")
+    drive = add_options(parser, Group.DRIVE)[Group.DRIVE]
     drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
-    for kind in kinds:
-        kind.add_drive_arguments(drive)
     return drive
 
 
 def add_line_arguments(parser: argparse.ArgumentParser) -> None:
     """Where it is, on any bus: python-can's own options are the most, and come last."""
+    from tdhil.session import bus_kinds
+
     for kind in reversed(bus_kinds()):
         kind.add_arguments(parser)

@@ -141,12 +141,13 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The drive and the line, as for identify."""
-    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
+    from tdhil.config import OPTION
 
     drive = add_drive_arguments(parser)
-    drive.add_argument("--simulate", action="store_const", const=True, help="look at the embedded simulator")
-    drive.add_argument("--log", metavar="run.mcap", help="where a run would write its log")
-    parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    add_option(drive, OPTION["simulate"], help="look at the embedded simulator")
+    add_option(drive, OPTION["log"], help="where a run would write its log")
+    add_option(parser, OPTION["json"])
     add_line_arguments(parser)
     parser.set_defaults(run=run)
 

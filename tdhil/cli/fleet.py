@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import TIME
-from tdhil.cli.arguments import TOLERANCE, amount, share
+from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_json
-from tdhil.config import MODELS
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -51,16 +51,13 @@ def add_watch_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: each run's, or auto)")
-    parser.add_argument("--confidence", type=share, metavar="P", help="of the intervals (default: each run's, or 0.95)")
-    parser.add_argument("--tolerance", type=share, metavar="SHARE",
-                        help="half-width of the interval that is enough (default: each run's, or 0.05)")
+    add_settings(parser, "each run's")
     parser.add_argument("--time-limit", type=amount(TIME), default=120.0, metavar="S",
                         help="for one log; twice over it, it is set aside (default 120 s)")
     parser.add_argument("--memory-limit", type=int, default=1500, metavar="MB",
                         help="for one log (default 1500 MB)")
     parser.add_argument("--no-cache", action="store_true", help="keep no recordings beside the table")
-    parser.add_argument("--json", action="store_true", help="the summary as one JSON document on stdout")
+    add_option(parser, OPTION["json"], help="the summary as one JSON document on stdout")
 
 
 def _add_jobs(group: Any) -> None:
@@ -147,16 +144,12 @@ def _request(namespace: argparse.Namespace, roots: tuple[str, ...], out: Path) -
 
     if namespace.jobs is not None and not 1 <= namespace.jobs <= 1024:
         raise UsageError(f"{namespace.jobs}: must be from 1 to 1024", where="--jobs")
-    if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
-        raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
-    if namespace.tolerance is not None and not 0.0 < namespace.tolerance < 1.0:
-        raise UsageError(f"{namespace.tolerance:g}: must be {TOLERANCE}", where="--tolerance")
     if not namespace.time_limit > 0.0:
         raise UsageError(f"{namespace.time_limit:g}: must be a positive time", where="--time-limit")
     if not namespace.memory_limit >= 100:
         raise UsageError(f"{namespace.memory_limit}: must be at least 100 MB", where="--memory-limit")
     return FleetRequest(
-        roots, out, FleetSettings(namespace.model, namespace.confidence, namespace.tolerance),
+        roots, out, FleetSettings(**settings_in(namespace)),
         jobs=namespace.jobs or usable_cores(),
         scheduler=getattr(namespace, "scheduler", None),
         limits=TaskLimits(namespace.time_limit, namespace.memory_limit * 1_000_000),

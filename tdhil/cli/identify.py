@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from profiles.quantities import FREQUENCY, SPEED, TIME
-from tdhil.config import EXCITATIONS, MODELS, load_rig, resolve
+from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
+from tdhil.config import OPTION, Group, Overrides, RunDetails, load_rig, resolve
 from tdhil.errors import ExitCode, LogError, TdhilError, exit_code
 from tdhil.session import PeerPlan, bus_kinds
 
@@ -52,74 +52,19 @@ def show_settings(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
-    from tdhil.cli.arguments import amount, share
-
-    motion = parser.add_argument_group("motion")
-    motion.add_argument("--excitation", choices=tuple(EXCITATIONS), help="stage 5 (default multisine)")
-    motion.add_argument("--mode", choices=("torque", "speed"), help="what the drive regulates in stage 5")
-    motion.add_argument("--frequency", dest="frequency_hz", type=amount(FREQUENCY), metavar="HZ",
-                        help="lowest line or the tone")
-    motion.add_argument("--amplitude", dest="amplitude_rad_s", type=amount(SPEED), metavar="RAD_S",
-                        help="peak of the speed, such as 1.5 or 15rpm")
-    motion.add_argument("--offset", dest="offset_rad_s", type=amount(SPEED), metavar="RAD_S",
-                        help="mean speed, such as 4 or 40rpm")
-    motion.add_argument("--periods", type=int, metavar="N", help="periods per mean speed, settling included")
-    motion.add_argument("--max-time", dest="max_time_s", type=amount(TIME), metavar="TIME",
-                        help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)")
-    motion.add_argument("--impedance", choices=("offset", "reference"),
-                        help="measure the drive's own impedance, in its speed loop, by its torque offset or reference")
-    motion.add_argument("--string-impedance", dest="string_impedance_nm_s_rad", type=float, metavar="NMS",
-                        help="N·m·s/rad at the main shaft: of the pipe that the reflection is told for")
-    motion.add_argument("--dry-run", action="store_true", help="show the plan and what to expect; nothing moves")
-    result = parser.add_argument_group("result")
-    result.add_argument("--tolerance", type=share, metavar="SHARE",
-                        help="acquire until the half-width of J's interval is this share of it, such as 1%% or 0.01")
-    result.add_argument("--confidence", type=share, metavar="P", help="of the interval (default 0.95)")
-    result.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default auto: the simplest that fits)")
-    result.add_argument("--report", type=Path, metavar="FILE",
-                        help="the result with pictures in one file: report.html, or report.pdf on A4")
+    sections = add_options(parser, Group.MOTION, Group.RESULT)
+    sections[Group.MOTION].add_argument("--dry-run", action="store_true",
+                                        help="show the plan and what to expect; nothing moves")
+    sections[Group.RESULT].add_argument("--report", type=Path, metavar="FILE", help="the result with pictures in one "
+                                        "file: report.html, or report.pdf on A4")
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
     """Which drive and where, what the operator takes upon himself, the log, and the simulated rig: of any run."""
-    from drivers import own_limits
-    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, amount
-
-    drive = add_drive_arguments(parser)
-    drive.add_argument("--rate", dest="rate_hz", type=amount(FREQUENCY), metavar="HZ",
-                       help="cycles a second (default: what this computer holds, up to the profile's)")
-    drive.add_argument("--real-time-priority", action="store_true",
-                       help="the control loop before all other programs, its memory locked, where that is allowed")
-    drive.add_argument("--accept-unverified", action="append", metavar="NAME",
-                       help="take this entry of the profile although nobody verified it; 'likely' takes all of those")
-    drive.add_argument("--accept-no-watchdog", action="store_true",
-                       help="take a drive whose watchdog can't be armed: it won't stop by itself if this host dies")
-    drive.add_argument("--accept-shared-watchdog", action="store_true",
-                       help="Modbus: take a drive whose watchdog other clients feed, too: it won't stop by itself if "
-                       "this host dies while one of them goes on asking")
-    drive.add_argument("--accept-wider-limit", action="append", choices=own_limits.NAMES,
-                       help="let the run widen this limit of the drive's own; otherwise a tighter one stays")
-    drive.add_argument("--accept-speed-unit", action="store_true",
-                       help="take the profile's unit of speed without seeing the shaft turn as fast as it says")
-    drive.add_argument("--reset-fault", action="store_true", help="reset a drive that is in fault; never done unasked")
-    drive.add_argument("--yes", action="store_const", const=True, help="no prompt before motion; limits stay")
-    kept = parser.add_argument_group("log and output")
-    kept.add_argument("--log", metavar="run.mcap", help="where the log goes; an older one is moved aside")
-    kept.add_argument("--operator", metavar="NAME", help="who ran it, for log and report")
-    kept.add_argument("--note", metavar="TEXT", help="whatever else log and report shall say of this run")
-    kept.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
-    simulated = parser.add_argument_group("simulated rig")
-    simulated.add_argument("--simulate", action="store_const", const=True,
-                           help="embedded simulator; the default where nobody says where the drive is")
-    simulated.add_argument("--plant", metavar="plant.yaml", help="other parameters of the embedded rig")
-    simulated.add_argument("--fault", action="append", metavar="FAULT",
-                           help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' shows them all")
-    simulated.add_argument("--seed", type=int, metavar="N", help="repeats a simulated run")
-    simulated.add_argument("--real-time", action="store_const", const=True, help="against the wall clock")
-    simulated.add_argument("--stepped", action="store_const", const=True, help="step a simulator on the bus by SYNC")
-    simulated.add_argument("--trace", metavar="shaft.csv", help="true shaft of the embedded rig")
+    add_drive_arguments(parser)
+    add_options(parser, Group.CYCLE, Group.OVERRIDES, Group.OUTPUT, Group.SIMULATED)
     add_line_arguments(parser)
 
 
@@ -135,7 +80,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     """
     from tdhil.cli.dry_run import dry_run, dry_run_course, say_unreachable
     from tdhil.report import stderr_console
-    from tdhil.session import Overrides, RunRequest, check_names, connection_of, plan_peer, suited, with_faults
+    from tdhil.session import RunRequest, check_unverified, connection_of, plan_peer, suited, with_faults
 
     if "list" in (namespace.fault or ()):
         return list_faults()
@@ -144,7 +89,7 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
     if options.json is True:
         namespace.json = True
     options, connection = connection_of(vars(namespace), rig, options)
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     console = stderr_console()
     if namespace.report is not None:
         from tdhil.report import check_report_path
@@ -161,16 +106,10 @@ def run_with(namespace: argparse.Namespace, evaluation: EvaluationCase | None = 
         return dry_run(options, rig, simulated, connection.profile.can_torque, lets_go)
     peer = with_faults(plan_peer(options, connection), namespace.fault, connection.drive)
     show_settings(console, options, connection, peer, rig)
-    overrides = Overrides(
-        no_watchdog=namespace.accept_no_watchdog,
-        shared_watchdog=namespace.accept_shared_watchdog,
-        wider_limits=tuple(namespace.accept_wider_limit or ()),
-        speed_unit=namespace.accept_speed_unit,
-        reset_fault=namespace.reset_fault,
-    )
+    details = RunDetails.of(vars(namespace))
     request = RunRequest.of(
-        options, connection, peer, rig, overrides=overrides, operator=namespace.operator, note=namespace.note,
-        real_time_priority=namespace.real_time_priority, evaluation=evaluation,
+        options, connection, peer, rig, overrides=Overrides.of(vars(namespace)), operator=details.operator,
+        note=details.note, real_time_priority=bool(details.real_time_priority), evaluation=evaluation,
     )
     if evaluation is None and (said := say_unreachable(options, rig, connection, simulated)) is not None:
         console.print(said, style="yellow", markup=False)
@@ -181,21 +120,12 @@ def _check_files(namespace: argparse.Namespace, options: RunOptions) -> None:
     """Before anything is opened: no file of this run is another's. UsageError names the option."""
     from tdhil.session import check_different_files, check_log_path
 
-    log, trace = Path(options.log), options.trace
-    profile = options.profile
-    check_different_files({
-        "--rig": namespace.rig,
-        "--profile": Path(profile) if profile.endswith((".yaml", ".yml")) else None,
-        "--plant": None if options.plant is None else Path(options.plant),
-        "--log": log,
-        "--report": namespace.report,
-        "--trace": None if trace is None else Path(trace),
-    })
-    check_log_path(log, options.source("log") if options.given("log") else "--log")
-    if trace is not None:
+    check_different_files({"--rig": namespace.rig, "--report": namespace.report, **options.files()})
+    check_log_path(Path(options.log), options.source("log") if options.given("log") else OPTION["log"].flag)
+    if options.trace is not None:
         from sim_bus import check_trace_path
 
-        check_trace_path(Path(trace), "--trace")
+        check_trace_path(Path(options.trace), options.source("trace"))
 
 
 def _run(request: RunRequest, console: Console, report: Path | None) -> int:

@@ -11,6 +11,7 @@ from profiles import DataFileError, Profile, ProfileEntry, eds_path, load_profil
 from profiles.canopen import CanopenProfile, Parameter
 from profiles.modbus import ModbusProfile
 from profiles.modbus import Parameter as ModbusParameter
+from tdhil.cli.arguments import add_option
 from tdhil.cli.profile_text import (
     counts,
     facts_of,
@@ -23,6 +24,7 @@ from tdhil.cli.profile_text import (
     watchdog_text,
 )
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode
 from tdhil.session import UNVERIFIED_FLAG, doubtful
 
@@ -182,7 +184,7 @@ def _table(title: str, *headings: str) -> Table:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """`tdhil profiles`, `… show NAME`, `… check FILE`, `… import FILE`."""
-    parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
     shown = actions.add_parser("show", help="all that a person at the drive needs of one profile",
                                description="All that a person at the drive needs of one profile. A vendor's name "

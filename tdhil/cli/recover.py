@@ -7,7 +7,9 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, metavar="broken.mcap", help="the log of a run that was cut short or damaged")
     parser.add_argument("-o", "--output", type=Path, metavar="whole.mcap",
                         help="write what can be read as a finished log; never over the damaged one")
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.set_defaults(run=run)
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from profiles.quantities import SHARE, TIME, TORQUE
-from tdhil.cli.arguments import TOLERANCE, amount, share
+from tdhil.cli.arguments import add_option, add_settings, amount, settings_in
 from tdhil.cli.results import print_result, save_report
-from tdhil.config import MODELS
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 from tdhil.session import conclude_evaluation, is_evaluation, is_log, read, require_file
 
@@ -26,15 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     # Optional for argparse only: behind --columns the file's name is taken for one more column (`_log`).
     parser.add_argument("log", type=Path, nargs="?", metavar="run.mcap|trace.csv",
                         help="the log of a run, whole or cut short, or a trace in CSV; told apart by their content")
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE",
                         help="the result with pictures in one file: report.html, or report.pdf on A4")
-    parser.add_argument("--operator", metavar="NAME", help="who ran it, for the report (default: as the log says)")
-    parser.add_argument("--note", metavar="TEXT", help="what else the report shall say (default: as the log says)")
-    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: the run's, or auto)")
-    parser.add_argument("--confidence", type=share, metavar="P", help="of the interval (default: the run's, or 0.95)")
-    parser.add_argument("--tolerance", type=share, metavar="SHARE",
-                        help="half-width of the interval that is enough (default: the run's, or 0.05)")
+    add_option(parser, OPTION["operator"], help="who ran it, for the report (default: as the log says)")
+    add_option(parser, OPTION["note"], help="what else the report shall say (default: as the log says)")
+    add_settings(parser, "the run's")
     trace = parser.add_argument_group("a trace in CSV (a run.mcap brings all this along)")
     trace.add_argument("--columns", nargs="+", metavar="QUANTITY=NAME:UNIT",
                        help="such as time=t_s speed=n_rpm:rpm torque=m_pct:%%; default: time_s speed_rad_s torque_nm")
@@ -90,9 +87,8 @@ def _evaluation(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     """What the virtual string of this log did, and print it."""
     from tdhil.report import stderr_console
 
-    for name in ("model", "confidence", "tolerance"):
-        if getattr(namespace, name) is not None:
-            raise UsageError("is for a run that identifies; this log is of a virtual string", where=f"--{name}")
+    for name in settings_in(namespace):
+        raise UsageError("is for a run that identifies; this log is of a virtual string", where=OPTION[name].flag)
     recorded.require_motion()
     assert recorded.virtual_string is not None
     found = conclude_evaluation(
@@ -112,9 +108,7 @@ def _identify(namespace: argparse.Namespace, recorded: RunRecord) -> int:
     from tdhil.api import identify
     from tdhil.report import stderr_console
 
-    result = identify(
-        recorded, model=namespace.model, confidence=namespace.confidence, tolerance=namespace.tolerance
-    )
+    result = identify(recorded, **settings_in(namespace))
     console = stderr_console()
     for problem in recorded.problems:
         console.print(f"tdhil: {recorded.log}: {problem}", style="yellow", markup=False)
@@ -141,9 +135,8 @@ def _said(namespace: argparse.Namespace) -> dict[str, str]:
 
 def _check(namespace: argparse.Namespace) -> None:
     """Numbers that no trace could make sense of. UsageError names the option."""
+    settings_in(namespace)
     for name, low, high, wanted in (
-        ("confidence", 0.5, 1.0, "at least 0.5 and below 1"),
-        ("tolerance", 1e-9, 1.0, TOLERANCE),
         ("rated_torque", 1e-9, 1e9, "a positive number of N·m"),
         ("torque_limit", 1e-9, 1e9, "a positive number of N·m"),
         ("gear", 1e-6, 1e6, "a positive number"),

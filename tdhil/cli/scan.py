@@ -177,15 +177,16 @@ def _comment(text: str) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The bus or line, as for identify; what to ask, and where a starter file goes."""
-    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
+    from tdhil.config import OPTION
 
     drive = add_drive_arguments(parser)
-    drive.add_argument("--simulate", action="store_const", const=True, help="look at the embedded simulator")
+    add_option(drive, OPTION["simulate"], help="look at the embedded simulator")
     scan = parser.add_argument_group("scan")
     for name in BUSES:
         bus_commands(name).add_scan_arguments(scan)
     scan.add_argument("--write", type=Path, metavar="rig.yaml", help="a rig.yaml to start from; never over a file")
-    scan.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    add_option(scan, OPTION["json"])
     add_line_arguments(parser)
     parser.set_defaults(run=run)
 

@@ -22,10 +22,11 @@ NOT_CONFIRMED = "STOP NOT CONFIRMED: use the hard-wired emergency stop now."
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The bus or line, as for identify."""
-    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments
+    from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_option
+    from tdhil.config import OPTION
 
     add_drive_arguments(parser)
-    parser.add_argument("--json", action="store_const", const=True, help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     add_line_arguments(parser)
     parser.set_defaults(run=run)
 

@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tdhil.cli.arguments import add_option
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.version import __version__
 
 if TYPE_CHECKING:
@@ -177,7 +179,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "studies", nargs="*", metavar="NAME", help=f"studies to run; '{LIST}' names them, '{ALL}' runs all of them"
     )
     parser.add_argument("--out", type=Path, default=Path("study"), metavar="DIR", help="where files go (default study)")
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--set", dest="assignments", action="append", default=[], metavar="NAME=VALUE",
                         help="one setting of one study, such as Kp=3000; may be repeated")
     parser.add_argument("--study", dest="file", type=Path, metavar="my.yaml", help="settings from a file")

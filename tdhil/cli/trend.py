@@ -10,9 +10,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tdhil.cli.arguments import share
+from tdhil.cli.arguments import add_option, add_settings, settings_in
 from tdhil.cli.results import print_json
-from tdhil.config import MODELS
+from tdhil.config import OPTION
 from tdhil.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,14 +33,13 @@ def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of compare."""
     parser.add_argument("logs", nargs="+", type=Path, metavar="run.mcap",
                         help="two or more; each is held beside the first")
-    parser.add_argument("--model", choices=tuple(MODELS), help="of the shaft (default: each run's, or auto)")
-    parser.add_argument("--confidence", type=share, metavar="P", help="of the intervals (default: each run's, or 0.95)")
+    add_settings(parser, "each run's")
     _add_output(parser)
     parser.set_defaults(run=run_compare)
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE.html", help="with a picture, in one file (extra `report`)")
 
 
@@ -72,10 +71,8 @@ def run_compare(namespace: argparse.Namespace) -> int:
     for log in namespace.logs:
         if not log.is_file():
             raise UsageError("there is no such log", where=str(log), next_step="Name a run.mcap of this tool")
-    if namespace.confidence is not None and not 0.5 <= namespace.confidence < 1.0:
-        raise UsageError(f"{namespace.confidence:g}: must be at least 0.5 and below 1", where="--confidence")
+    settings = FleetSettings(**settings_in(namespace))
     _check_report(namespace.report, namespace.logs)
-    settings = FleetSettings(namespace.model, namespace.confidence)
     document = compare_document([identified(log, settings) for log in namespace.logs])
     if namespace.json:
         print_json(document)

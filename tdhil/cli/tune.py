@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from profiles import load_profile
 from profiles.quantities import RPM, TIME, TORQUE
-from tdhil.cli.arguments import amount, share
+from tdhil.cli.arguments import add_option, amount, share
 from tdhil.cli.results import print_json
+from tdhil.config import OPTION
 from tdhil.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rated-torque", type=amount(TORQUE), metavar="NM", help="of the motor, for gains in %%")
     parser.add_argument("--rated-speed", type=amount(RPM), metavar="RPM", help="of the motor, for gains in %%")
     parser.add_argument("--no-simulation", action="store_true", help="without critical speeds, which take a minute")
-    parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    add_option(parser, OPTION["json"])
     parser.add_argument("--report", type=Path, metavar="FILE", help="with pictures: tune.html, or tune.pdf")
     parser.set_defaults(run=run)
 

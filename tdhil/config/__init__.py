@@ -5,9 +5,14 @@ from typing import TYPE_CHECKING
 from profiles import lazy_face
 
 if TYPE_CHECKING:
+    from tdhil.config.keywords import (
+        OF_THE_RESULT as OF_THE_RESULT, OF_THE_RUN as OF_THE_RUN, OF_THE_SIMULATOR as OF_THE_SIMULATOR,
+        values_of as values_of, with_keywords as with_keywords,
+    )
     from tdhil.config.options import (
-        OPTIONS as OPTIONS, Origin as Origin, RunOptions as RunOptions, Setting as Setting,
-        check_values as check_values, resolve as resolve,
+        ASKED_AGAIN as ASKED_AGAIN, OPTION as OPTION, OPTIONS as OPTIONS, Group as Group, Option as Option,
+        Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
+        Setting as Setting, form_options as form_options,
     )
     from tdhil.config.registry import (
         BUSES as BUSES, DEFAULT_BUS as DEFAULT_BUS, DEFAULT_EXCITATION as DEFAULT_EXCITATION,
@@ -15,6 +20,7 @@ if TYPE_CHECKING:
         has_plateaus as has_plateaus, imported as imported, load as load,
         told_before_echo as told_before_echo,
     )
+    from tdhil.config.resolution import check_values as check_values, resolve as resolve
     from tdhil.config.rig import (
         DriveData as DriveData, Limits as Limits, Modbus as Modbus, Registered as Registered, Rig as Rig,
         bit_rate_problem as bit_rate_problem, load_rig as load_rig, parse_rig as parse_rig,

@@ -47,10 +47,10 @@ EXCITATIONS: dict[str, RegistryEntry] = {
     "step": RegistryEntry("tdhil.runner.excitation.signals:STEP",
                           "a square wave of speed (equation 9 of the paper)", True, True),
     "prbs": RegistryEntry("tdhil.runner.excitation.signals:PRBS",
-                          "pseudo-random torque, for a drill string on bottom", True, before_echo=True),
+                          "pseudo-random torque, for a string whose pipe is known", periodic=True, before_echo=True),
     "pulses": RegistryEntry("tdhil.runner.excitation.pulses:PULSES", "torque pulses between steady speeds"),
     "coast-down": RegistryEntry("tdhil.runner.excitation.pulses:COAST_DOWN",
-                                "without torque down, under power back up"),
+                        "without torque down, under power back up; never with a string"),
 }
 """Excitations of stage 5; each a `tdhil.runner.excitation.ExcitationKind`."""
 

@@ -12,17 +12,27 @@ motor shaft. It is frozen, and knows from which line of which file each of its k
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, PrivateAttr, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    PrivateAttr,
+    ValidationError,
+    create_model,
+)
 from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
 from profiles import Conversion, DataModel, Finding, Loaded, load_with_lines, messages_of, one_of, parse_with_lines
-from tdhil.config.registry import BUSES, EXCITATIONS, MODELS, RegistryEntry, names
+from tdhil.config.options import CLOCKS, OPTIONS, Group, Option
+from tdhil.config.registry import RegistryEntry, names
 
 
 def _within(low: float, high: float, *, zero: bool = False) -> Any:
@@ -59,8 +69,6 @@ Speed = Annotated[float, Field(ge=-1e5, le=1e5)]
 Time = Annotated[float, _within(1e-6, 1e7)]
 Inertia = Annotated[float, _within(1e-9, 1e9)]
 Ratio = Annotated[float, _within(1e-6, 1e6)]
-Amplitude = Annotated[float, _within(1e-9, 1e5)]
-Frequency = Annotated[float, _within(1e-6, 1e4)]
 
 CAN_BIT_RATES = (
     5_000, 10_000, 20_000, 33_000, 33_333, 47_000, 47_619, 50_000, 62_000, 62_500, 83_000, 83_300, 83_333, 95_000,
@@ -231,58 +239,67 @@ class Expected(DataModel):
     load_noise_nm: Torque | None = Field(default=None, description="N·m; standard deviation of what disturbs")
 
 
-_OPERATORS = {
-    "yes": "--yes",
-    "accept_no_watchdog": "--accept-no-watchdog",
-    "accept_shared_watchdog": "--accept-shared-watchdog",
-    "accept_wider_limit": "--accept-wider-limit NAME",
-    "accept_wider_limits": "--accept-wider-limit NAME",
-    "accept_speed_unit": "--accept-speed-unit",
-    "reset_fault": "--reset-fault",
-}
-_ONLY_THE_OPERATOR = {
-    key: f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the command line"
-    for key, flag in _OPERATORS.items()
-}
+def _only_the_operator() -> Iterator[tuple[str, str]]:
+    for one in OPTIONS:
+        if one.group is Group.OVERRIDES and not one.at:
+            flag = f"{one.flag} NAME" if one.joined else one.flag
+            text = (f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the "
+                    "command line")
+            yield one.name, text
+            if one.joined:
+                yield f"{one.name}s", text
 
 
-class RunSection(DataModel):
+_ONLY_THE_OPERATOR = dict(_only_the_operator())
+
+
+def attribute_of(key: str) -> str:
+    """The attribute of a key of rig.yaml: pydantic has methods of its own, such as ``json``."""
+    return f"{key}_" if hasattr(BaseModel, key) else key
+
+
+def _with_options(section: str, base: type[DataModel]) -> Any:
+    """``base`` with a field for each option that may stand in this section of rig.yaml; None: not given."""
+    found: dict[str, Any] = {}
+    for one in OPTIONS:
+        at, _, key = one.at.rpartition(".")
+        if one.at and at == section:
+            alias = key if attribute_of(key) != key else None
+            field = Field(default=None, alias=alias, description=one.help_text)
+            found[attribute_of(key)] = (_annotation(one), field)
+    name = base.__name__.removeprefix("_")
+    return create_model(name, __base__=base, __module__=__name__, __doc__=base.__doc__, **found)
+
+
+def _annotation(one: Option) -> Any:
+    if one.known:
+        return Literal[one.known] | None
+    if isinstance(one.choices, Mapping):
+        return Annotated[str, Registered(one.choices)] | None
+    if one.joined:
+        return tuple[str, ...] | None
+    return Annotated[one.kind, Field(**one.limits)] | None if one.limits else one.kind | None
+
+
+class _RunSection(DataModel):
     """What the options of the command line say of a run; None = chosen by the plan, or by the default."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
-    excitation: Annotated[str, Registered(EXCITATIONS)] | None = None
-    mode: Literal["torque", "speed"] | None = Field(default=None, description="what the drive regulates meanwhile")
-    frequency_hz: Frequency | None = Field(default=None, description="Hz; base frequency of the excitation")
-    amplitude_rad_s: Amplitude | None = Field(default=None, description="rad/s; amplitude of the speed")
-    offset_rad_s: Speed | None = Field(default=None, description="rad/s; mean speed")
-    periods: int | None = Field(default=None, ge=1, le=10_000)
-    tolerance: float | None = Field(default=None, gt=0, lt=1, description="half-width of the interval asked for, / J")
-    max_time_s: Time | None = Field(default=None, description="s; longest stage 5")
-    impedance: Literal["offset", "reference"] | None = Field(
-        default=None, description="measure the drive's own impedance, by its torque offset or its speed reference"
-    )
-    string_impedance_nm_s_rad: NotNegative | None = Field(
-        default=None, description="N·m·s/rad at the main shaft; of the pipe that |r| is told for"
-    )
-    model: Annotated[str, Registered(MODELS)] | None = Field(
-        default=None, description="of the shaft; auto: the simplest that fits"
-    )
-    confidence: float | None = Field(default=None, gt=0.5, lt=1, description="of the interval, such as 0.95")
-    seed: int | None = Field(default=None, ge=0, le=2**63 - 1, description="repeats a simulated run")
-    simulate: bool | None = Field(default=None, description="run on the embedded simulator whatever the bus")
-    real_time: bool | None = Field(default=None, description="simulator against the wall clock")
-    stepped: bool | None = Field(default=None, description="simulator in another process, stepped by SYNC")
-    json_: bool | None = Field(default=None, alias="json", description="one JSON document on stdout")
-    log: str | None = Field(default=None, min_length=1, description="file to write, from the working directory")
-    plant: str | None = Field(default=None, min_length=1, description="simulated rig's parameters, beside rig.yaml")
-    trace: str | None = Field(default=None, min_length=1, description="CSV of the simulated rig's true shaft")
-
     @classmethod
     def contradictions(cls, values: Mapping[str, Any]) -> list[Finding]:
         """Two clocks."""
-        both = values.get("real_time") and values.get("stepped")
-        return [("stepped", "and real_time exclude each other; keep one")] if both else []
+        first, second = CLOCKS
+        both = values.get(first) and values.get(second)
+        return [(second, f"and {first} exclude each other; keep one")] if both else []
+
+
+if TYPE_CHECKING:
+    RunSection = _RunSection
+    _Options = DataModel
+else:
+    RunSection = _with_options("run", _RunSection)
+    _Options = _with_options("", DataModel)
 
 
 class Service(DataModel):
@@ -294,21 +311,14 @@ class Service(DataModel):
     )
 
 
-class Rig(DataModel):
+class Rig(_Options):
     """Everything that a bench has; each key is optional until something needs it."""
 
     never_here: ClassVar[Mapping[str, str]] = _ONLY_THE_OPERATOR
 
     name: str | None = Field(default=None, min_length=1, max_length=200, description="of the rig, for reports and logs")
-    drive: Annotated[str, Registered(BUSES)] | None = None
     bus: Bus = Bus()
-    node: int | None = Field(default=None, ge=1, le=127, description="CANopen node number")
     modbus: Modbus = Modbus()
-    profile: str | None = Field(default=None, min_length=1, description="name, or a .yaml file beside rig.yaml")
-    accept_unverified: tuple[str, ...] | None = Field(
-        default=None, description="entries of the profile that are taken although nobody verified them"
-    )
-    rate_hz: float | None = Field(default=None, gt=0, le=2000, description="cycles a second")
     limits: Limits | None = Field(default=None, description="needed on everything but a simulated drive")
     gear: Gear = Gear()
     load: Annotated[Load, BeforeValidator(_load_of)] = Load()
@@ -365,7 +375,7 @@ class Rig(DataModel):
         """The value of a key such as ``run.seed``."""
         value: Any = self
         for part in dotted.split("."):
-            value = getattr(value, "json_" if part == "json" else part)
+            value = getattr(value, attribute_of(part))
         return value
 
     @property

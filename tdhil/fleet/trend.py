@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from tdhil.config import OPTION
 from tdhil.errors import UsageError
 from tdhil.fleet.change_detection import LEAST, Difference, History, Measured, difference, history
 from tdhil.fleet.rows import FleetRow, FleetSettings, counted, row_of
@@ -225,8 +226,7 @@ def _settings(
         "stated lag of speed, s": prior.speed_lag_s,
         "stated lag of torque, s": prior.torque_lag_s,
         "model": row.model,
-        "confidence": asked.get("confidence", 0.95),
-        "tolerance": asked.get("tolerance", 0.05),
+        **{name: asked.get(name, OPTION[name].default) for name in ("confidence", "tolerance")},
         "recorded by": row.recorded_by,
         "simulated": "yes" if row.simulated else "no",
         "run": row.part_text or "whole",

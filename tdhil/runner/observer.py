@@ -675,7 +675,8 @@ class Observer:
         if point.time_s - seen[0][0] < YIELD_S - 2.0 * self._point_s:
             return
         # What was told last has not been answered yet, and what changes from cycle to cycle is torque noise.
-        told = _means([(time_s, one) for time_s, one, _ in seen if point.time_s - time_s >= 2.0 * self._lag_s], SMOOTH_S)
+        until_s = point.time_s - 2.0 * self._lag_s
+        told = _means([(time_s, one) for time_s, one, _ in seen if time_s <= until_s], SMOOTH_S)
         went = [one for _, _, one in seen]
         mean = math.fsum(abs(one) for one in told) / max(1, len(told))
         told_range, went_range = max(told) - min(told), max(went) - min(went)

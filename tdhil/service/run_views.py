@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from starlette.responses import FileResponse, Response
 
-from tdhil.config import resolve
+from tdhil.config import ASKED_AGAIN, resolve
 from tdhil.errors import UsageError
 from tdhil.service.access import principal
 from tdhil.service.fleets import TABLE, FleetView
@@ -88,7 +88,7 @@ async def _fleet(site: Site, request: Request, body: None) -> FleetView:
 
 def settings_of(body: ReplayBody | FleetBody) -> dict[str, Any]:
     """What a log is to be identified with, as a run is asked for it. Raises UsageError for what no run would take."""
-    given = {"model": body.model, "tolerance": body.tolerance, "confidence": body.confidence}
+    given = {one.name: getattr(body, one.name) for one in ASKED_AGAIN}
     found = options_of(given)
     resolve(found, None)
     return found

@@ -18,6 +18,7 @@ from tdhil.service.audit import Broken, Entry
 from tdhil.service.fleets import FleetView
 from tdhil.service.foxglove import PROTOCOLS
 from tdhil.service.run_state import Check, Confirmation, Entered, State, Stop, Told, Watch
+from tdhil.service.start_request import TAKEN, option_schema
 from tdhil.service.store import Summary
 from tdhil.version import __version__
 
@@ -507,7 +508,8 @@ def document() -> dict[str, Any]:
     def schema(kind: Any, mode: Literal["validation", "serialization"] = "serialization") -> dict[str, Any]:
         if kind == OPTIONS:
             return {"type": "object", "description": "the command line's options, such as "
-                    '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit'}
+                    '{"seed": 7, "tolerance": 0.01}; numbers in SI, or a text with a unit',
+                    "properties": {name: option_schema(one) for name, one in TAKEN.items()}}
         found = adapter(kind).json_schema(mode=mode, ref_template="#/components/schemas/{model}")
         schemas.update(found.pop("$defs", {}))
         if isinstance(kind, type) and found.get("type") == "object":

@@ -12,11 +12,24 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from drivers import DataFileError, PreflightRefused
-from profiles.quantities import FREQUENCY, SHARE, SPEED, TIME, Unit, read
-from tdhil.config import Rig, RunOptions, load_rig, parse_rig, resolve
+from profiles.quantities import read
+from tdhil.config import (
+    OPTION,
+    OPTIONS,
+    Group,
+    Option,
+    Overrides,
+    Rig,
+    RunDetails,
+    RunOptions,
+    load_rig,
+    parse_rig,
+    resolve,
+)
 from tdhil.errors import UsageError
 from tdhil.service.run_state import NotAllowed, NotThere
 from tdhil.session import Connection, address_of, connection_of
@@ -28,28 +41,10 @@ RIG_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 BUILT_IN: Final = Path(__file__).with_name("rigs")
 """Two simulated rigs, for where nobody has any."""
 
-UNITS: Final[Mapping[str, Unit]] = {
-    "frequency_hz": FREQUENCY, "rate_hz": FREQUENCY, "amplitude_rad_s": SPEED, "offset_rad_s": SPEED,
-    "max_time_s": TIME, "tolerance": SHARE, "confidence": SHARE,
-}
-RUN_OPTIONS: Final = frozenset({
-    "excitation", "mode", "frequency_hz", "amplitude_rad_s", "offset_rad_s", "periods", "tolerance", "max_time_s",
-    "model", "confidence", "rate_hz", "seed", "real_time", "accept_unverified",
-})
-"""Of `tdhil.config.RunOptions`, those that may come over HTTP."""
-BESIDE: Final = frozenset({
-    "fault", "operator", "note", "accept_wider_limit", "accept_speed_unit", "reset_fault", "real_time_priority",
-})
-_OF_FLAGS: Final = {          # the options by their flags' names, as the command line has them
-    "frequency": "frequency_hz", "amplitude": "amplitude_rad_s", "offset": "offset_rad_s", "rate": "rate_hz",
-    "max_time": "max_time_s",
-}
-_ONLY_THERE: Final = {
-    "accept_no_watchdog": "nothing but who stands there would stop the shaft: it is never taken over HTTP",
-    "accept_shared_watchdog": "nothing but who stands there may stop the shaft: it is never taken over HTTP",
-    "yes": "a confirmation is typed in for each run; nothing replaces it",
-}
-_SIMULATED_ONLY: Final = ("seed", "real_time", "fault")
+TAKEN: Final = MappingProxyType({one.name: one for one in OPTIONS if one.api is True})
+"""The options that may come over HTTP, by their names."""
+_NAMES: Final = {one.flag.removeprefix("--").replace("-", "_"): one.name for one in OPTIONS}
+"""The options by their flags' names, as the command line has them."""
 
 
 def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,41 +52,64 @@ def options_of(asked: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for given, value in asked.items():
         name = str(given).removeprefix("--").replace("-", "_")
-        name = _OF_FLAGS.get(name, name)
-        if name in _ONLY_THERE and value not in (None, False):
-            raise NotAllowed(_ONLY_THERE[name], where=name, next_step="Run it at the rig: tdhil identify")
-        if name not in RUN_OPTIONS | BESIDE:
+        name = _NAMES.get(name, name)
+        reason = OPTION[name].api if name in OPTION else False
+        if isinstance(reason, str) and value not in (None, False):
+            raise NotAllowed(reason, where=name, next_step="Run it at the rig: tdhil identify")
+        if name not in TAKEN:
             raise UsageError("is no option of a run here", where=str(given)[:60],
-                             next_step=f"There are {', '.join(sorted(RUN_OPTIONS | BESIDE))}")
+                             next_step=f"There are {', '.join(sorted(TAKEN))}")
         if value is not None:
-            found[name] = _value(name, value)
+            found[name] = _value(TAKEN[name], value)
     return found
 
 
-def _value(name: str, value: Any) -> Any:
-    if name in UNITS:
+def _value(option: Option, value: Any) -> Any:
+    """The value as the command line would have it; what is left for rig.yaml's own checks goes through."""
+    where = option.name
+    if option.unit is not None:
         if isinstance(value, str):
             try:
-                return read(value, UNITS[name])
+                return read(value, option.unit)
             except ValueError as error:
-                raise UsageError(str(error), where=name) from None
+                raise UsageError(str(error), where=where) from None
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UsageError("must be a number, or a text with a unit", where=name)
+            raise UsageError("must be a number, or a text with a unit", where=where)
         return float(value)
-    if name in ("accept_unverified", "accept_wider_limit", "fault"):
+    if option.joined:
         values = [value] if isinstance(value, str) else value
         if not isinstance(values, list) or not all(isinstance(one, str) for one in values):
-            raise UsageError("must be a text, or a list of texts", where=name)
-        if name == "accept_wider_limit" and (wrong := set(values) - {"torque", "speed", "quick-stop"}):
-            raise UsageError(f"knows torque, speed and quick-stop, not {', '.join(sorted(wrong))[:60]}", where=name)
+            raise UsageError("must be a text, or a list of texts", where=where)
+        if option.allowed and (wrong := set(values) - set(option.allowed)):
+            *first, last = option.allowed
+            raise UsageError(f"knows {', '.join(first)} and {last}, not {', '.join(sorted(wrong))[:60]}", where=where)
         return values
-    if name in ("operator", "note"):
-        if not isinstance(value, str) or len(value) > 500:
-            raise UsageError("must be a text of at most 500 characters", where=name)
-        return value
-    if name in ("accept_speed_unit", "reset_fault", "real_time", "real_time_priority") and not isinstance(value, bool):
-        raise UsageError("must be true or false", where=name)
+    if option.longest is not None and not (isinstance(value, str) and len(value) <= option.longest):
+        raise UsageError(f"must be a text of at most {option.longest} characters", where=where)
+    if option.kind is bool and not isinstance(value, bool):
+        raise UsageError("must be true or false", where=where)
     return value
+
+
+def _taken(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Keep only the options that may come over HTTP, also of a request that was read from a file."""
+    return {name: value for name, value in asked.items() if name in TAKEN}
+
+
+def option_schema(option: Option) -> dict[str, Any]:
+    """The JSON schema of an option's value, as `options_of` takes it."""
+    text: dict[str, Any] = {"type": "string"}
+    if option.allowed:
+        text["enum"] = list(option.allowed)
+    if option.longest is not None:
+        text["maxLength"] = option.longest
+    if option.joined:
+        found: dict[str, Any] = {"type": "array", "items": text}
+    elif option.unit is not None:
+        found = {"type": ["number", "string"], "x-unit": option.unit.symbol}
+    else:
+        found = text if option.kind is str else {"type": {bool: "boolean", int: "integer"}[option.kind]}
+    return {**found, "description": option.help_text, **({} if option.default is None else {"default": option.default})}
 
 
 @dataclass(frozen=True)
@@ -116,7 +134,7 @@ class RigFile:
         """Its options and the way to its drive. Raises UsageError and DataFileError."""
         if self.rig is None:
             raise UsageError(self.problem, next_step="Mend the rig's file")
-        cli = {name: value for name, value in (asked or {}).items() if name in RUN_OPTIONS}
+        cli = _taken(asked or {})
         options, connection = connection_of(cli, self.rig, resolve(cli, self.rig))
         return options, connection
 
@@ -233,24 +251,22 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
 
     Raises UsageError, DataFileError and PreflightRefused.
     """
-    from tdhil.session import Overrides, RunRequest, check_names, plan_peer, with_faults
+    from tdhil.session import RunRequest, check_unverified, plan_peer, with_faults
 
+    asked = _taken(asked)
+    details = RunDetails.of(asked)
     options, connection = rig.way(asked)
-    check_names(connection.profile, options.accept_unverified, options.source("accept_unverified"))
+    check_unverified(connection.profile, options)
     options = options.replaced(log=replace(options.settings["log"], value="run.mcap"))
-    peer = with_faults(plan_peer(options, connection), asked.get("fault"), connection.drive)
+    peer = with_faults(plan_peer(options, connection), details.faults, connection.drive)
     if not peer.embedded:
-        for name in _SIMULATED_ONLY:
-            if asked.get(name):
-                raise UsageError("is for a simulated rig", where=name)
-    overrides = Overrides(
-        wider_limits=tuple(asked.get("accept_wider_limit") or ()), speed_unit=bool(asked.get("accept_speed_unit")),
-        reset_fault=bool(asked.get("reset_fault")),
-    )
+        for one in OPTIONS:
+            if one.group is Group.SIMULATED and asked.get(one.name):
+                raise UsageError("is for a simulated rig", where=one.name)
     return RunRequest.of(
-        options, connection, replace(peer, left_in=left_in), rig.rig, overrides=overrides,
-        operator=asked.get("operator"), note=asked.get("note"),
-        real_time_priority=bool(asked.get("real_time_priority", not peer.embedded)),
+        options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),
+        operator=details.operator, note=details.note,
+        real_time_priority=not peer.embedded if details.real_time_priority is None else details.real_time_priority,
     )
 
 

@@ -38,6 +38,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from tdhil.config import form_options
 from tdhil.errors import LogError, TdhilError, UsageError
 from tdhil.service import auth_routes, run_views
 from tdhil.service.access import (
@@ -144,6 +145,7 @@ class Web:
             lstrip_blocks=True,
         )
         self._pages.globals["version"] = __version__
+        self._pages.globals["form_options"] = form_options
         self.app = Starlette(routes=self._routes(), lifespan=self._lifespan,
                              middleware=[Middleware(AuthenticationMiddleware, backend=self.access)],
                              exception_handlers=dict.fromkeys((TdhilError, HTTPException, OSError, Exception),

@@ -30,10 +30,11 @@ def plan(asked: dict[str, Any]) -> dict[str, Any]:
 def replay(asked: dict[str, Any]) -> dict[str, Any]:
     """The log again, with another model, tolerance or confidence."""
     from tdhil.api import identify
+    from tdhil.config import ASKED_AGAIN
     from tdhil.session import read
 
     os.chdir(asked["folder"])
-    given = {name: asked[name] for name in ("model", "tolerance", "confidence") if asked.get(name) is not None}
+    given = {one.name: value for one in ASKED_AGAIN if (value := asked.get(one.name)) is not None}
     return {"document": identify(read("run.mcap"), **given).to_dict()}
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         opened_drive as opened_drive, plan_peer as plan_peer, with_faults as with_faults,
     )
     from tdhil.session.overrides import (
-        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_names as check_names, doubtful as doubtful,
+        UNVERIFIED_FLAG as UNVERIFIED_FLAG, check_unverified as check_unverified, doubtful as doubtful,
         is_accepted as is_accepted,
     )
     from tdhil.session.run_record import (
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         require_file as require_file,
     )
     from tdhil.session.run_session import (
-        OperatorInterface as OperatorInterface, Overrides as Overrides, RunRequest as RunRequest,
+        OperatorInterface as OperatorInterface, RunRequest as RunRequest,
         RunSession as RunSession,
     )
     from tdhil.session.stop_signals import Ending as Ending, stop_on_signals as stop_on_signals

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from tdhil.config import ASKED_AGAIN
 from tdhil.errors import ExitCode, UsageError
 from tdhil.estimation import Identification, Verdict
 from tdhil.recording import Recording
@@ -61,11 +62,12 @@ def conclude(
     from tdhil.runner import precondition_warnings, speed_warnings, stage_warnings
 
     asked = run.get("identify", {})
-    known = {name: asked[name] for name in ("confidence", "tolerance", "model") if asked.get(name) is not None}
+    known = {one.name: one.default if asked.get(one.name) is None else asked[one.name] for one in ASKED_AGAIN}
     try:
         options = Options(**known)
     except (TypeError, ValueError) as error:
-        raise UsageError(str(error), where=log, next_step="Say --model, --confidence or --tolerance anew") from error
+        flags = " or ".join(one.flag for one in ASKED_AGAIN)
+        raise UsageError(str(error), where=log, next_step=f"Say {flags} anew") from error
     working = working_confidence_of(run, options.confidence)
     identification = after_looks(identify(recording, replace(options, confidence=working)), run, options.confidence)
     said = (

@@ -88,10 +88,6 @@ class BusKind(ABC):
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Its options, in a group of their own."""
 
-    def add_drive_arguments(self, drive: argparse._ArgumentGroup) -> None:
-        """What stands among the options that say which drive."""
-        return
-
     @abstractmethod
     def line(self, cli: Mapping[str, Any], rig: Rig | None, profile: Profile) -> LineConfig:
         """Where the drive is, by all who have a say. Raises UsageError and DataFileError for what can't be used."""

@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
+from tdhil.config import OPTION
 from tdhil.errors import LogBroken, UsageError
 
 _LARGEST_STUB = 1_000_000      # bytes; a log that holds motion is read no further than its size
@@ -109,7 +110,7 @@ class LogPlace:
                 self.path = final
 
 
-def check_log_path(path: Path, where: str = "--log") -> None:
+def check_log_path(path: Path, where: str = OPTION["log"].flag) -> None:
     """UsageError for a file that is no log: it would be moved aside by mistake."""
     from tdhil.recording import MAGIC
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from drivers import Clock, Drive, FrameTap, MonotonicClock, SteppedClock
-from tdhil.config import DriveData, RunOptions
+from tdhil.config import OPTION, DriveData, RunOptions
 from tdhil.errors import UsageError
 from tdhil.session.connection import Connection, PeerPlan, bus_kind
 from tdhil.session.drive_lock import address_of, hold
@@ -62,7 +62,7 @@ def with_faults(plan: PeerPlan, texts: Sequence[str] | None, drive: str) -> Peer
         return plan
     if not plan.embedded:
         raise UsageError(
-            "faults can be scripted in the embedded simulator only", where="--fault",
+            "faults can be scripted in the embedded simulator only", where=OPTION["fault"].flag,
             next_step="Add --simulate, or give --fault to tdhil simulate",
         )
     return replace(plan, faults=bus_kind(drive).parse_faults(texts))

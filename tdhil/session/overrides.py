@@ -11,10 +11,12 @@ from collections.abc import Collection, Iterable
 
 from drivers import PreflightRefused
 from profiles import Profile, ProfileEntry
+from tdhil.config import OPTION, RunOptions
 from tdhil.errors import UsageError
 
 ALL_LIKELY = "likely"
-UNVERIFIED_FLAG = "--accept-unverified"
+UNVERIFIED = OPTION["accept_unverified"]
+UNVERIFIED_FLAG = UNVERIFIED.flag
 
 
 def doubtful(profile: Profile) -> tuple[tuple[str, ProfileEntry], ...]:
@@ -42,6 +44,11 @@ def check_names(profile: Profile, accepted: Iterable[str], source: str = UNVERIF
                 f"profile {profile.name} has no entry '{name[:60]}'; {meant}", where=source,
                 next_step=f"See tdhil profiles show {profile.name}",
             )
+
+
+def check_unverified(profile: Profile, options: RunOptions) -> None:
+    """The same of a run's options."""
+    check_names(profile, options.accept_unverified, options.source(UNVERIFIED.name))
 
 
 def require_accepted(profile: Profile, accepted: Collection[str]) -> None:

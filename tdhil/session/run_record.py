@@ -114,13 +114,11 @@ class RunRecord:
 
 
 _KEYWORDS = {
-    "-i": "interface", "-c": "channel", "-b": "bitrate", "--fault": "faults",
-    "--accept-no-watchdog": "no_watchdog", "--accept-shared-watchdog": "shared_watchdog",
-    "--accept-wider-limit": "wider_limits", "--accept-speed-unit": "speed_unit", "--reset-fault": "reset_fault",
+    "-i": "interface", "-c": "channel", "-b": "bitrate",
     "--columns": "columns", "--rated-torque": "rated_torque_nm", "--torque-limit": "torque_limit_nm",
     "--gear": "gear_ratio", "--torque-scale-sd": "torque_scale_rel_sd", "--skew-sd": "skew_sd_s",
 }
-"""What a flag is called in Python, beside the options of a run and of its bus, which know their own."""
+"""Python keywords of the flags that no table of options has: those of `read`, and short ones of python-can."""
 
 
 class ByKeyword(ContextDecorator):
@@ -135,7 +133,7 @@ class ByKeyword(ContextDecorator):
             from tdhil.session.connection import bus_kinds
 
             of_buses = {flag: name for kind in bus_kinds() for name, flag in kind.flags.items()}
-            error.spelling = {**of_buses, **{option.flag: option.name for option in OPTIONS}, **_KEYWORDS}
+            error.spelling = {**of_buses, **{option.flag: option.keyword for option in OPTIONS}, **_KEYWORDS}
 
 
 @ByKeyword()
@@ -217,6 +215,7 @@ def _read_trace(
     torque_limit_nm: float | None, gear_ratio: float | None, scale: float | None, lags: LagPrior | None,
     skew_sd_s: float | None,
 ) -> RunRecord:
+    from tdhil.config import ASKED_AGAIN
     from tdhil.recording import USUAL, Bench, LagPrior, parse_columns, read_recording
     from tdhil.session.task import ASSUMED_TORQUE_SCALE_REL_SD
 
@@ -232,7 +231,7 @@ def _read_trace(
     recording, assumed = read_recording(path, choices, None if excitation is None else Path(excitation), bench)
     if scale is None:
         assumed = (*assumed, f"the torque scale was assumed right to {ASSUMED_TORQUE_SCALE_REL_SD:.0%} (1 sd)")
-    return RunRecord(recording, {"identify": {"tolerance": 0.05, "confidence": 0.95}}, str(path), assumed)
+    return RunRecord(recording, {"identify": {one.name: one.default for one in ASKED_AGAIN}}, str(path), assumed)
 
 
 def _extra(name: str) -> Any:

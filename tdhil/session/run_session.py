@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from tdhil.config import Rig, RunOptions
+from tdhil.config import Overrides, Rig, RunOptions
 from tdhil.errors import LogError, TdhilError
 from tdhil.recording import RunLog, RunWriter
 from tdhil.runner import Display, ExcitationRequest, Idle, Runner, RunOutcome, StopRequest, Task
@@ -32,17 +32,6 @@ if TYPE_CHECKING:
     from tdhil.session.conclusion import Conclusion
     from tdhil.session.evaluation import EvaluationConclusion
     from tdhil.soft_torque import EvaluationCase
-
-
-@dataclass(frozen=True)
-class Overrides:
-    """What the operator takes upon himself by name, for one run: no file of the bench says any of it."""
-
-    no_watchdog: bool = False
-    shared_watchdog: bool = False
-    wider_limits: tuple[str, ...] = ()
-    speed_unit: bool = False
-    reset_fault: bool = False
 
 
 @dataclass(frozen=True)

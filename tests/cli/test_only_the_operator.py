@@ -8,7 +8,8 @@ import pytest
 
 from drivers.errors import DataFileError, PreflightRefused
 from tdhil.cli.main import main
-from tdhil.config.options import OPTIONS, resolve
+from tdhil.config.options import RESOLVED
+from tdhil.config.resolution import resolve
 from tdhil.config.rig import load_rig
 from tdhil.session.confirm import confirm_motion
 
@@ -57,7 +58,7 @@ def test_nothing_that_the_operator_answers_for_stands_in_a_file(tmp_path, sectio
 
 
 def test_no_option_takes_the_confirmation_from_a_rig():
-    assert {option.name for option in OPTIONS if not option.at} == {"yes"}
+    assert {option.name for option in RESOLVED if not option.at} == {"yes"}
     assert resolve({"yes": True}, None).yes is True
     assert resolve({}, None).yes is False
 

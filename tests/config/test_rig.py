@@ -6,7 +6,8 @@ import pytest
 from pydantic import ValidationError
 
 from drivers.errors import DataFileError, PreflightRefused
-from tdhil.config.options import OPTIONS, resolve
+from tdhil.config.options import OPTIONS
+from tdhil.config.resolution import resolve
 from tdhil.config.rig import Limits, Rig, load_rig, require_limits, simulated_default_rig
 from tdhil.errors import UsageError
 from tdhil.session.task import pipe_of

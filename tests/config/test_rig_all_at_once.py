@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import DataFileError
-from tdhil.config.options import resolve
+from tdhil.config.resolution import resolve
 from tdhil.config.rig import load_rig
 from tdhil.session.connection import connection_of
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tdhil.config.options import resolve
+from tdhil.config.resolution import resolve
 from tdhil.config.rig import load_rig
 from tdhil.session.dry_run import refuse_hopeless
 from tests.path.path_runs import tdhil

@@ -865,10 +865,10 @@ def test_addresses_that_a_name_came_from_are_kept_up_to_a_number(monkeypatch):
 
 def test_runs_of_more_than_a_day_ago_do_not_count(monkeypatch):
     time_s = 0.0
-    pace = Pace(lambda: time_s)
+    pace = RequestPace(lambda: time_s)
     for _ in range(3):
         pace.begin("anna", "192.0.2.1", "a")
-        time_s += Pace.LIMITS[-1][0]
+        time_s += RequestPace.LIMITS[-1][0]
     assert [len(times) for times in pace._begun.values()] == [1, 1]
 
 
@@ -896,12 +896,12 @@ def test_tries_of_long_ago_are_forgotten(monkeypatch):
 
 def test_who_asked_for_runs_long_ago_is_forgotten(monkeypatch):
     time_s = 0.0
-    pace = Pace(lambda: time_s)
-    monkeypatch.setattr(Pace, "_MOST", 3)
+    pace = RequestPace(lambda: time_s)
+    monkeypatch.setattr(RequestPace, "_MOST", 3)
     for number in range(6):
         pace.begin(f"user {number}", f"192.0.2.{number}", "a")
     assert len(pace._begun) == 12              # all of them count yet
-    time_s = Pace.LIMITS[-1][0]
+    time_s = RequestPace.LIMITS[-1][0]
     pace.begin("anna", "192.0.2.77", "a")
     assert set(pace._begun) == {("user", "anna"), ("address", "192.0.2.77")}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import sqlite3
 import threading
@@ -14,6 +15,8 @@ import jsonschema
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
+from tdhil.config.options import OPTIONS
+from tdhil.config.registry import EXCITATIONS, MODELS
 from tdhil.errors import UsageError
 from tdhil.service.run_state import State
 from tdhil.service.schemas import API, ROUTES, SOCKETS, document
@@ -694,3 +697,35 @@ def test_a_process_that_cannot_be_started_on_a_full_disk_is_refused_in_words(cal
     (run,) = service.store.ids()
     assert service.store.status(run).state is State.FAILED
     assert service.supervisor.live() == []
+
+
+@pytest.mark.parametrize(("path", "fields"), [
+    ("/start/a", {"tolerance", "max_time_s", "excitation", "operator", "note", "seed", "fault", "real_time"}),
+    ("/start/real", {"tolerance", "max_time_s", "excitation", "operator", "note", "accept_unverified",
+                     "accept_speed_unit", "reset_fault"}),
+    ("/rehearse/a", {"stage", "after", "duration", "real_time"}),
+    ("/fleets", {"folder", "below", "tolerance", "model"}),
+])
+def test_a_form_has_the_fields_of_the_table(client, path, fields):
+    page = client.get(path)
+    assert page.status_code == 200
+    assert set(re.findall(r'<(?:input|select)[^>]* name="(\w+)"', page.text)) == fields
+    for name, choices in (("excitation", EXCITATIONS), ("model", MODELS)):
+        if name in fields:
+            select = re.search(rf'<select name="{name}">(.*?)</select>', page.text, re.DOTALL)
+            assert re.findall(r"<option>([^<]+)</option>", select[1]) == list(choices)
+
+
+def test_the_form_asks_for_minutes_and_per_cent(client):
+    page = client.get("/start/a").text
+    assert re.search(r'name="tolerance" placeholder="as rig.yaml, else 5"[^>]*data-unit="%"', page)
+    assert re.search(r'name="max_time_s" placeholder="as the limits allow"[^>]*data-unit="min"', page)
+
+
+def test_the_document_describes_every_option(call):
+    body = call("GET", "/openapi.json", 200)["paths"]["/api/v1/rigs/{rig}/runs"]["post"]["requestBody"]
+    described = body["content"]["application/json"]["schema"]["properties"]
+    assert set(described) == {option.name for option in OPTIONS if option.api is True}
+    assert described["excitation"]["enum"] == list(EXCITATIONS)
+    assert described["accept_wider_limit"]["items"]["enum"] == ["torque", "speed", "quick-stop"]
+    assert (described["tolerance"]["x-unit"], described["max_time_s"]["x-unit"]) == ("1", "s")

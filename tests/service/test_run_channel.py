@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from tdhil.service.run_channel import SOCKET, Listener, ask
+from tdhil.service.run_channel import SOCKET, ChannelListener, ask
 from tests.service.conftest import HANGS_S, wait_for
 
 
 @pytest.fixture
-def listener(tmp_path: Path) -> Iterator[Listener]:
-    with Listener(tmp_path, lambda asked: {"heard": asked.get("number")}) as found:
+def listener(tmp_path: Path) -> Iterator[ChannelListener]:
+    with ChannelListener(tmp_path, lambda asked: {"heard": asked.get("number")}) as found:
         yield found
 
 
 @pytest.fixture
-def folder(tmp_path: Path, listener: Listener) -> Path:
+def folder(tmp_path: Path, listener: ChannelListener) -> Path:
     return tmp_path
 
 
@@ -39,7 +39,7 @@ def test_a_request_is_answered_by_a_thread_that_was_there(folder, listener, monk
     begun: list[str] = []
     monkeypatch.setattr(listener, "_begin", lambda: begun.append("a thread"))
     for number in range(20):
-        wait_for("a spare thread", lambda: listener._idle == Listener.SPARE)
+        wait_for("a spare thread", lambda: listener._idle == ChannelListener.SPARE)
         assert ask(folder, {"number": number}, timeout_s=HANGS_S) == {"heard": number}
     assert begun == []
 
@@ -49,7 +49,7 @@ def test_silent_clients_hold_nobody_up_and_their_threads_end(folder):
     silent_ones = [silent(folder) for _ in range(10)]
     for number in range(5):
         assert ask(folder, {"number": number}, timeout_s=HANGS_S) == {"heard": number}
-    assert threads() >= before + 10 - Listener.SPARE + 1
+    assert threads() >= before + 10 - ChannelListener.SPARE + 1
     for one in silent_ones:
         one.close()
     wait_for("their end", lambda: threads() <= before)

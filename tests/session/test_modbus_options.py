@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import DataFileError
 from profiles.library import load_modbus_profile
-from tdhil.config.options import resolve
+from tdhil.config.resolution import resolve
 from tdhil.config.rig import Rig, load_rig
 from tdhil.errors import UsageError
 from tdhil.session.buses.modbus_line import modbus_config

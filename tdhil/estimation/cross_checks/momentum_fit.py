@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tdhil.estimation.cross_checks.momentum import KNOT_S, Balances, BalanceKind, BalanceRow, overlap_s
+from tdhil.estimation.cross_checks.momentum import KNOT_S, BalanceKind, BalanceRow, Balances, overlap_s
 from tdhil.estimation.frequency_domain import fisher_tail, student_quantile
 from tdhil.estimation.setpoint_sampling import EXACT_READING, ReadingShare
 from tdhil.recording import FloatArray

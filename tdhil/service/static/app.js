@@ -119,8 +119,11 @@
     const at = new Date(iso);
     return Number.isNaN(at.getTime()) ? iso : `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${time(at)}`;
   }
-  /** What was typed in as per cent, for the service to judge. */
-  const share = (text) => `${text.trim().replace(",", ".").replace(/\s*%$/, "")}%`;
+  /** A quantity as it was typed, in this unit if it has none, for the service to check. */
+  function quantity(text, unit) {
+    const typed = text.trim().replace(",", ".");
+    return /[\d.]$/.test(typed) ? typed + unit : typed;
+  }
   function span(seconds) {
     const whole = Math.max(0, Math.round(seconds));
     return whole < 90 ? `${whole} s` : `${Math.floor(whole / 60)} min ${String(whole % 60).padStart(2, "0")} s`;
@@ -175,15 +178,18 @@
 
   // -- start
 
+  /** The options of a form, by the names of their fields; an empty field is left out. */
   function asked(form) {
     const found = {};
-    const text = (name) => (form.elements[name] ? form.elements[name].value.trim() : "");
-    if (text("tolerance")) found.tolerance = share(text("tolerance"));
-    if (text("max_time")) found.max_time = `${text("max_time").replace(",", ".").replace(/\s*min$/, "")}min`;
-    if (text("seed")) found.seed = /^\d+$/.test(text("seed")) ? Number(text("seed")) : text("seed");
-    for (const name of ["excitation", "operator", "note"]) if (text(name)) found[name] = text(name);
-    for (const name of ["fault", "accept_unverified"]) if (text(name)) found[name] = text(name).split(/[\s,]+/);
-    for (const name of ["real_time", "accept_speed_unit", "reset_fault"]) if (form.elements[name] && form.elements[name].checked) found[name] = true;
+    for (const field of form.querySelectorAll("[name]:not(button)")) {
+      const text = field.value.trim(), { kind, unit } = field.dataset;
+      if (field.type === "checkbox") {
+        if (field.checked) found[field.name] = true;
+      } else if (text) {
+        found[field.name] = unit ? quantity(text, unit) : kind === "tuple" ? text.split(/[\s,]+/)
+          : kind === "int" && /^\d+$/.test(text) ? Number(text) : text;
+      }
+    }
     return found;
   }
 
@@ -573,7 +579,7 @@
   });
 
   const pages = { login: loginPage, accounts: accountsPage, "rig-file": rigFilePage, rigs: rigsPage, start: startPage, live: livePage, audit: auditPage };
-  window.tdhil = { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, share, show, span, when };
+  window.tdhil = { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, may, number, ofResult, pages, percent, show, span, when };
   document.addEventListener("DOMContentLoaded", () => {
     for (const one of document.querySelectorAll("time")) one.textContent = when(one.dateTime);
     try {

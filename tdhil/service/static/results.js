@@ -1,7 +1,7 @@
 // What came of runs: one, several side by side, a rig over time, many logs. As in app.js, what comes from elsewhere is text.
 "use strict";
 (() => {
-  const { API, ENDED, STATES, Refused, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, share, show, span, when } = window.tdhil;
+  const { API, ENDED, STATES, Refused, asked, away, badge, byId, call, el, every, inertia, interval, number, ofResult, pages, percent, show, span, when } = window.tdhil;
 
   // -- one run
 
@@ -78,12 +78,10 @@
     const replay = byId("replay");
     replay.addEventListener("submit", async (event) => {
       event.preventDefault();
-      const said = byId("replay-said"), body = {};
+      const said = byId("replay-said");
       said.hidden = true;
-      if (replay.elements.model.value) body.model = replay.elements.model.value;
-      if (replay.elements.tolerance.value.trim()) body.tolerance = share(replay.elements.tolerance.value);
       try {
-        await call("POST", `/runs/${id}/replays`, body);
+        await call("POST", `/runs/${id}/replays`, asked(replay));
       } catch (error) {
         said.textContent = error.message;
         said.hidden = false;
@@ -309,11 +307,8 @@
     call("GET", "/fleets/folders").then((folders) => show(form.elements.folder, ...folders.map((one) => el("option", { value: one }, one || "the runs of this service"))), () => {});
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
-      const body = { folder: form.elements.folder.value, below: form.elements.below.value.trim() };
-      if (form.elements.model.value) body.model = form.elements.model.value;
-      if (form.elements.tolerance.value.trim()) body.tolerance = share(form.elements.tolerance.value);
       try {
-        const found = await call("POST", "/fleets", body);
+        const found = await call("POST", "/fleets", asked(form));
         location.assign(`/fleets/${found.id}`);
       } catch (error) {
         show(byId("said"), el("p", { class: "alarm", role: "alert" }, error instanceof Refused ? error.message : "No answer from tdhil serve."));

@@ -42,10 +42,6 @@ class CanopenKind(BusKind):
     default_profile = PLAIN
     steps_over_a_wire = True
 
-    def add_drive_arguments(self, drive: argparse._ArgumentGroup) -> None:
-        """The node."""
-        drive.add_argument("--node", type=int, metavar="N", help="CANopen node number (default: the profile's)")
-
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """python-can's own."""
         from can.cli import add_bus_arguments

@@ -1,0 +1,60 @@
+"""The rows of docs/rig.md that describe the options, from their table.
+
+``python -m tdhil.config.reference`` rewrites them in a clone; a test fails if they are stale.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from tdhil.config.options import OPTIONS, Option
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "rig.md"
+
+
+def page_of(text: str) -> str:
+    """The page with a row for each option: in place of the row that it had, or below those of its section."""
+    lines = text.splitlines()
+    places = {line.split(" |")[0]: number for number, line in enumerate(lines)}
+    new: list[tuple[int, str]] = []
+    for one in OPTIONS:
+        if (start := _start(one)) in places:
+            lines[places[start]] = row_of(one)
+        else:
+            beside = (_start(other) for other in OPTIONS if _section(other) == _section(one))
+            new.append((1 + max(places[row] for row in beside if row in places), row_of(one)))
+    for number, row in sorted(new, key=lambda pair: -pair[0]):
+        lines.insert(number, row)
+    return "\n".join(lines) + "\n"
+
+
+def row_of(option: Option) -> str:
+    """The option's row: key, default, flag and meaning; without a key flag, keyword in Python and meaning."""
+    meaning = _meaning(option)
+    if not option.at:
+        return f"{_start(option)} | {f'`{option.keyword}`' if option.python else ''} | {meaning} |"
+    return f"{_start(option)} | {option.default_text or '–'} | `{option.flag}` | {meaning} |"
+
+
+def _start(option: Option) -> str:
+    return f"| `{option.at or option.flag}`"
+
+
+def _section(option: Option) -> str:
+    """Its section of rig.yaml, '' for the top; '-' of an option that no file states."""
+    return option.at.rpartition(".")[0] if option.at else "-"
+
+
+def _meaning(option: Option) -> str:
+    text = option.more or option.help_text
+    if option.unit is not None and option.unit.symbol != "1":
+        text = f"{option.unit.symbol}; {text}" if not text.startswith("(") else f"{option.unit.symbol} {text}"
+    if isinstance(option.choices, Mapping):
+        return f"{text}. " + "; ".join(f"`{name}`: {entry.text}" for name, entry in option.choices.items())
+    if option.allowed:
+        *first, last = (f"`{name}`" for name in option.allowed)
+        return f"{text}: {', '.join(first)} or {last}"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page_of(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
