@@ -89,7 +89,7 @@ SUBJECTS = {
     ),
     "acquire": _run(
         "stages/acquire", "test_kept_within.py", *_RUNS, "test_dither.py", "test_adaptive_duration.py",
-        within="Follower run_acquire _dither_of _Course",
+        within="Follower run_acquire _dither_of _SegmentCourse",
     ),
     "acquire pulses": _run(
         "stages/acquire", "test_kept_within.py", "test_pulses.py", within="_LONGEST run_swings _calm _coast"
@@ -127,7 +127,7 @@ SUBJECTS = {
     "canopen/other_master": _driver("canopen/other_master", "test_other_master.py", "test_falling_out.py"),
     "canopen/read back": _driver(
         "canopen/supervision", "test_other_master.py", "test_changed_feedback.py",
-        within="Group ReadBack _Watched _shown",
+        within="Group ReadBack _WatchedObject _shown",
     ),
     "angle": _driver("angle", "test_angle_in_cycle.py"),
     "bare stop": _driver("quick_stop", "test_modbus_quick_stop.py", "test_no_valid_state.py"),
@@ -152,7 +152,7 @@ SUBJECTS = {
     "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/parameters": _driver(
         "modbus/parameters", "test_modbus_preflight.py", "test_modbus_wrongs.py",
-        within="_SLACK Setting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting _unit",
+        within="_SLACK RegisterSetting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting _unit",
     ),
     "modbus/quick_stop": _driver("modbus/quick_stop", "test_modbus_quick_stop.py"),
     "log_writer": Subject(

@@ -172,8 +172,8 @@ def identify(recorded: RunRecord, **options: Any) -> Result:
     """Identify J and all that comes with it from a recording; the same as ``tdhil replay``, digit for digit.
 
     ``options``: ``model`` of the shaft, ``confidence`` of the intervals, ``tolerance``: the relative half-width that is
-    enough for `valid`; the page on rig.yaml describes them. None: as the run had it. Raises UsageError for values that
-    can't be, and NothingRecorded where the run in a log ended before anything moved.
+    enough for ``valid``; the page on rig.yaml describes them. None: as the run had it. Raises UsageError for values
+    that can't be, and NothingRecorded where the run in a log ended before anything moved.
     """
     from tdhil.session import conclude
 

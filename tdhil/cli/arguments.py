@@ -13,7 +13,7 @@ from typing import Any
 
 from profiles import quantities
 from profiles.quantities import SHARE, Unit
-from tdhil.config import ASKED_AGAIN, OPTIONS, Group, Option
+from tdhil.config import ASKED_AGAIN, OPTIONS, Option, Topic
 from tdhil.errors import UsageError
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -58,7 +58,7 @@ def add_option(group: argparse._ActionsContainer, option: Option, *, help: str =
     group.add_argument(option.flag, **words)
 
 
-def add_options(parser: argparse.ArgumentParser, *groups: Group) -> dict[Group, argparse._ArgumentGroup]:
+def add_options(parser: argparse.ArgumentParser, *groups: Topic) -> dict[Topic, argparse._ArgumentGroup]:
     """The rows of these groups, in a section each, for what a command has to add to it."""
     sections = {group: parser.add_argument_group(group.value) for group in groups}
     for group, section in sections.items():
@@ -88,7 +88,7 @@ def settings_in(namespace: argparse.Namespace) -> dict[str, Any]:
 
 def add_drive_arguments(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
     """Which drive; the group, for what a command has to add to it."""
-    drive = add_options(parser, Group.DRIVE)[Group.DRIVE]
+    drive = add_options(parser, Topic.DRIVE)[Topic.DRIVE]
     drive.add_argument("--rig", type=Path, metavar="rig.yaml", help="the bench; needed to move anything real")
     return drive
 

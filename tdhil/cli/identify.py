@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from tdhil.cli.arguments import add_drive_arguments, add_line_arguments, add_options
-from tdhil.config import OPTION, Group, Overrides, RunDetails, load_rig, resolve
+from tdhil.config import OPTION, Overrides, RunDetails, Topic, load_rig, resolve
 from tdhil.errors import ExitCode, LogError, TdhilError, exit_code
 from tdhil.session import PeerPlan, bus_kinds
 
@@ -52,10 +52,10 @@ def show_settings(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of identify. None as a default means: rig.yaml, else the built-in default (`tdhil.config.options`)."""
-    sections = add_options(parser, Group.MOTION, Group.RESULT)
-    sections[Group.MOTION].add_argument("--dry-run", action="store_true",
+    sections = add_options(parser, Topic.MOTION, Topic.RESULT)
+    sections[Topic.MOTION].add_argument("--dry-run", action="store_true",
                                         help="show the plan and what to expect; nothing moves")
-    sections[Group.RESULT].add_argument("--report", type=Path, metavar="FILE", help="the result with pictures in one "
+    sections[Topic.RESULT].add_argument("--report", type=Path, metavar="FILE", help="the result with pictures in one "
                                         "file: report.html, or report.pdf on A4")
     add_peer_arguments(parser)
     parser.set_defaults(run=run)
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_peer_arguments(parser: argparse.ArgumentParser) -> None:
     """Which drive and where, what the operator takes upon himself, the log, and the simulated rig: of any run."""
     add_drive_arguments(parser)
-    add_options(parser, Group.CYCLE, Group.OVERRIDES, Group.OUTPUT, Group.SIMULATED)
+    add_options(parser, Topic.CYCLE, Topic.OVERRIDES, Topic.OUTPUT, Topic.SIMULATED)
     add_line_arguments(parser)
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
         values_of as values_of, with_keywords as with_keywords,
     )
     from tdhil.config.options import (
-        ASKED_AGAIN as ASKED_AGAIN, OPTION as OPTION, OPTIONS as OPTIONS, Group as Group, Option as Option,
+        ASKED_AGAIN as ASKED_AGAIN, OPTION as OPTION, OPTIONS as OPTIONS, Topic as Topic, Option as Option,
         Origin as Origin, Overrides as Overrides, RunDetails as RunDetails, RunOptions as RunOptions,
         Setting as Setting, form_options as form_options,
     )

@@ -5,10 +5,10 @@ import os
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final, TypeVar
 
-from tdhil.config.options import ASKED_AGAIN, OPTIONS, Group, Option
+from tdhil.config.options import ASKED_AGAIN, OPTIONS, Option, Topic
 from tdhil.errors import UsageError
 
-_OF_THE_DRIVE = frozenset({Group.DRIVE, Group.SIMULATED})
+_OF_THE_DRIVE = frozenset({Topic.DRIVE, Topic.SIMULATED})
 OF_THE_RUN: Final = tuple(one for one in OPTIONS if one.python and one.group not in _OF_THE_DRIVE)
 """Keywords of `tdhil.run`."""
 OF_THE_SIMULATOR: Final = tuple(one for one in OPTIONS if one.python and one.group in _OF_THE_DRIVE)

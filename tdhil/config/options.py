@@ -59,7 +59,7 @@ class Setting:
 # What is declared of an option.
 
 
-class Group(Enum):
+class Topic(Enum):
     """Sections of ``--help``, in their order."""
 
     MOTION = "motion"
@@ -110,7 +110,7 @@ class Option:
     known: tuple[str, ...]
     flag: str
     at: str
-    group: Group
+    group: Topic
     help: str
     more: str
     unset: str
@@ -163,7 +163,7 @@ class Option:
 
 
 def option(
-    flag: str, at: str = "", default: Any = None, *, group: Group, help: str, more: str = "", unset: str = "",
+    flag: str, at: str = "", default: Any = None, *, group: Topic, help: str, more: str = "", unset: str = "",
     unit: Unit | None = None, choices: Mapping[str, RegistryEntry] | tuple[str, ...] = (), metavar: str | None = None,
     python: bool = True, api: bool | str = False, form: Form | None = None, asked_again: str = "",
     beside_rig: bool = False, is_file: bool = False, longest: int | None = None, **limits: float,
@@ -206,23 +206,23 @@ class RunOptions:
     """
 
     drive: str = option(
-        "--drive", "drive", DEFAULT_BUS, group=Group.DRIVE, choices=BUSES,
+        "--drive", "drive", DEFAULT_BUS, group=Topic.DRIVE, choices=BUSES,
         help="how the drive is spoken to (default: as the profile is, else {default})",
         more="bus of the drive. Left out, it follows `profile`, or whichever of `bus` and `modbus` says where the "
              "drive is",
     )
     node: int | None = option(
-        "--node", "node", group=Group.DRIVE, metavar="N", ge=1, le=127, unset="the profile's",
+        "--node", "node", group=Topic.DRIVE, metavar="N", ge=1, le=127, unset="the profile's",
         help="CANopen node number (default: {default})", more="CANopen node number of the drive, 1 to 127",
     )
     profile: str = option(
-        "--profile", "profile", "generic/cia402", group=Group.DRIVE, metavar="NAME", beside_rig=True, is_file=True,
+        "--profile", "profile", "generic/cia402", group=Topic.DRIVE, metavar="NAME", beside_rig=True, is_file=True,
         min_length=1, help="vendor/model, or a .yaml file (default: the generic one of the bus, {default} on CANopen)",
         more="a drive that ships (`tdhil profiles`), or a `.yaml` file of your own; on Modbus `generic/modbus` is the "
              "default",
     )
     accept_unverified: tuple[str, ...] = option(
-        "--accept-unverified", "accept_unverified", (), group=Group.OVERRIDES, metavar="NAME", api=True,
+        "--accept-unverified", "accept_unverified", (), group=Topic.OVERRIDES, metavar="NAME", api=True,
         form=Form("Entries of the profile that are not verified", ("real",), hint="likely", wide=True),
         help="accept this entry of the profile although it is not verified; 'likely' accepts all of those",
         more="entries of the profile that are accepted although they are not verified, by name, such as `[watchdog, "
@@ -230,38 +230,38 @@ class RunOptions:
              "those, and an `unverified` entry is accepted by its own name only. Adds to those of the command line",
     )
     rate_hz: float | None = option(
-        "--rate", "rate_hz", group=Group.CYCLE, unit=FREQUENCY, metavar="HZ", api=True, gt=0, le=2000,
+        "--rate", "rate_hz", group=Topic.CYCLE, unit=FREQUENCY, metavar="HZ", api=True, gt=0, le=2000,
         unset="what this computer holds", help="cycles a second (default: {default}, up to the profile's)",
         more="cycles a second, up to 2000. Without it, the profile's (250 as a rule) and lower ones are "
              "tried before motion, and the highest is taken at which 999 cycles of 1000 begin, and are answered, in "
              "time by half a period",
     )
     excitation: str = option(
-        "--excitation", "run.excitation", DEFAULT_EXCITATION, group=Group.MOTION, choices=EXCITATIONS, api=True,
+        "--excitation", "run.excitation", DEFAULT_EXCITATION, group=Topic.MOTION, choices=EXCITATIONS, api=True,
         form=Form("Motion"), help="stage 5 (default {default})", more="motion of stage 5",
     )
     mode: Literal["torque", "speed"] | None = option(
-        "--mode", "run.mode", group=Group.MOTION, api=True, unset="torque, where the drive has it",
+        "--mode", "run.mode", group=Topic.MOTION, api=True, unset="torque, where the drive has it",
         help="what the drive regulates in stage 5",
     )
     frequency_hz: float | None = option(
-        "--frequency", "run.frequency_hz", group=Group.MOTION, unit=FREQUENCY, metavar="HZ", api=True, unset="planned",
+        "--frequency", "run.frequency_hz", group=Topic.MOTION, unit=FREQUENCY, metavar="HZ", api=True, unset="planned",
         ge=1e-6, le=1e4, help="lowest line or the tone", more="the lowest line, or the tone",
     )
     amplitude_rad_s: float | None = option(
-        "--amplitude", "run.amplitude_rad_s", group=Group.MOTION, unit=SPEED, metavar="RAD_S", api=True,
+        "--amplitude", "run.amplitude_rad_s", group=Topic.MOTION, unit=SPEED, metavar="RAD_S", api=True,
         unset="planned", ge=1e-9, le=1e5, help="peak of the speed, such as 1.5 or 15rpm", more="amplitude of the speed",
     )
     offset_rad_s: float | None = option(
-        "--offset", "run.offset_rad_s", group=Group.MOTION, unit=SPEED, metavar="RAD_S", api=True, unset="planned",
+        "--offset", "run.offset_rad_s", group=Topic.MOTION, unit=SPEED, metavar="RAD_S", api=True, unset="planned",
         ge=-1e5, le=1e5, help="mean speed, such as 4 or 40rpm", more="mean speed",
     )
     periods: int | None = option(
-        "--periods", "run.periods", group=Group.MOTION, metavar="N", api=True, unset="planned", ge=1, le=10_000,
+        "--periods", "run.periods", group=Topic.MOTION, metavar="N", api=True, unset="planned", ge=1, le=10_000,
         help="periods per mean speed, settling included", more="periods at each mean speed, the first of which settles",
     )
     tolerance: float = option(
-        "--tolerance", "run.tolerance", 0.05, group=Group.RESULT, unit=SHARE, metavar="SHARE", api=True, gt=0, lt=1,
+        "--tolerance", "run.tolerance", 0.05, group=Topic.RESULT, unit=SHARE, metavar="SHARE", api=True, gt=0, lt=1,
         form=Form("Tolerance: how tight, ± % of J", ("run", "replay"), PERCENT),
         asked_again="half-width of the interval that is enough",
         help="acquire until the half-width of J's interval is this share of it, such as 1% or 0.01",
@@ -269,72 +269,72 @@ class RunOptions:
              "wider one is `valid_wide`. If it is given, stage 5 goes on until the interval is this tight",
     )
     max_time_s: float | None = option(
-        "--max-time", "run.max_time_s", group=Group.MOTION, unit=TIME, metavar="TIME", api=True, ge=1e-6, le=1e7,
+        "--max-time", "run.max_time_s", group=Topic.MOTION, unit=TIME, metavar="TIME", api=True, ge=1e-6, le=1e7,
         unset="what `limits.time_s` leaves", form=Form("At most, minutes", unit=MINUTE, hint="as the limits allow"),
         help="longest stage 5, such as 300 or 5min (default: what limits.time_s leaves)",
         more="(on the command line `5min` too); longest stage 5. Without a tolerance: how long it is planned for",
     )
     impedance: Literal["offset", "reference"] | None = option(
-        "--impedance", "run.impedance", group=Group.MOTION,
+        "--impedance", "run.impedance", group=Topic.MOTION,
         help="measure the drive's own impedance, in its speed loop, by its torque offset or reference",
         more="measure [the drive's own impedance](soft_torque.md#the-drives-own-impedance), in its speed loop: by its "
              "torque offset, or by its speed reference",
     )
     string_impedance_nm_s_rad: float | None = option(
-        "--string-impedance", "run.string_impedance_nm_s_rad", group=Group.MOTION, unit=FRICTION, metavar="NMS",
+        "--string-impedance", "run.string_impedance_nm_s_rad", group=Topic.MOTION, unit=FRICTION, metavar="NMS",
         ge=0, le=1e9, unset="that of the pipe in `load`, if any",
         help="impedance of the pipe for which the reflection is reported, N·m·s/rad at the main shaft",
         more="ζ, at the main shaft, of the string for which the reflection is reported",
     )
     model: str = option(
-        "--model", "run.model", "auto", group=Group.RESULT, choices=MODELS, api=True, asked_again="of the shaft",
+        "--model", "run.model", "auto", group=Topic.RESULT, choices=MODELS, api=True, asked_again="of the shaft",
         form=Form("Model", ("replay",)), help="of the shaft (default {default}: the simplest that fits)",
         more="of the shaft",
     )
     confidence: float = option(
-        "--confidence", "run.confidence", 0.95, group=Group.RESULT, unit=SHARE, metavar="P", api=True, ge=0.5, lt=1,
+        "--confidence", "run.confidence", 0.95, group=Topic.RESULT, unit=SHARE, metavar="P", api=True, ge=0.5, lt=1,
         asked_again="of the interval", help="of the interval (default {default})", more="of the interval",
     )
     seed: int | None = option(
-        "--seed", "run.seed", group=Group.SIMULATED, metavar="N", api=True, ge=0, le=2**63 - 1,
+        "--seed", "run.seed", group=Topic.SIMULATED, metavar="N", api=True, ge=0, le=2**63 - 1,
         form=Form("Seed, repeats a run", ("simulated",), hint="drawn"), unset="drawn, and printed",
         help="repeats a simulated run",
     )
     simulate: bool = option(
-        "--simulate", "run.simulate", False, group=Group.SIMULATED, python=False,
+        "--simulate", "run.simulate", False, group=Topic.SIMULATED, python=False,
         help="embedded simulator; the default if no bus or line of a drive is configured",
         more="embedded simulator, whatever bus is configured",
     )
     real_time: bool = option(
-        "--real-time", "run.real_time", False, group=Group.SIMULATED, api=True,
+        "--real-time", "run.real_time", False, group=Topic.SIMULATED, api=True,
         form=Form("by the clock, not as fast as it goes", ("simulated", "rehearsal")), help="against the wall clock",
         more="the embedded rig against the wall clock; excludes `stepped`",
     )
     stepped: bool = option(
-        "--stepped", "run.stepped", False, group=Group.SIMULATED, help="step a simulator on the bus by SYNC",
+        "--stepped", "run.stepped", False, group=Topic.SIMULATED, help="step a simulator on the bus by SYNC",
         more="a simulator in another process is stepped by SYNC; a real drive is refused, and so is Modbus over a wire",
     )
     yes: bool = option(
-        "--yes", "", False, group=Group.OVERRIDES, python=False, help="no prompt before motion; limits stay",
+        "--yes", "", False, group=Topic.OVERRIDES, python=False, help="no prompt before motion; limits stay",
         api="a confirmation is typed in for each run; nothing replaces it",
     )
     json: bool = option(
-        "--json", "run.json", False, group=Group.OUTPUT, python=False, help="one JSON document on stdout",
+        "--json", "run.json", False, group=Topic.OUTPUT, python=False, help="one JSON document on stdout",
         more="one JSON document on stdout, nothing else there",
     )
     log: str = option(
-        "--log", "run.log", "run.mcap", group=Group.OUTPUT, metavar="run.mcap", is_file=True, min_length=1,
+        "--log", "run.log", "run.mcap", group=Topic.OUTPUT, metavar="run.mcap", is_file=True, min_length=1,
         help="where the log goes; an older one is moved aside",
         more="the log; an older one there is moved aside, a live one never: then this run takes a name of its own. "
              "What a run leaves that ended before anything moved goes to `run.refused.mcap`, beside the last good log",
     )
     plant: str | None = option(
-        "--plant", "run.plant", group=Group.SIMULATED, metavar="plant.yaml", beside_rig=True, is_file=True,
+        "--plant", "run.plant", group=Topic.SIMULATED, metavar="plant.yaml", beside_rig=True, is_file=True,
         min_length=1, help="other parameters of the embedded rig",
         more="[other parameters](../examples/plant.yaml) of the embedded rig",
     )
     trace: str | None = option(
-        "--trace", "run.trace", group=Group.SIMULATED, metavar="shaft.csv", is_file=True, min_length=1,
+        "--trace", "run.trace", group=Topic.SIMULATED, metavar="shaft.csv", is_file=True, min_length=1,
         help="true shaft of the embedded rig", more="CSV of the true shaft of the embedded rig",
     )
     settings: Mapping[str, Setting] = field(default_factory=dict)
@@ -383,27 +383,27 @@ class Overrides(_Said):
     """Overrides by the operator, by name, for one run: rig.yaml states none of them."""
 
     no_watchdog: bool = option(
-        "--accept-no-watchdog", group=Group.OVERRIDES, default=False,
+        "--accept-no-watchdog", group=Topic.OVERRIDES, default=False,
         api="nothing but who stands there would stop the shaft: it is never taken over HTTP",
         help="take a drive whose watchdog can't be armed: it won't stop by itself if this host dies",
     )
     shared_watchdog: bool = option(
-        "--accept-shared-watchdog", group=Group.OVERRIDES, default=False,
+        "--accept-shared-watchdog", group=Topic.OVERRIDES, default=False,
         api="nothing but who stands there may stop the shaft: it is never taken over HTTP",
         help="Modbus: take a drive whose watchdog other clients feed, too: it won't stop by itself if this host dies "
              "while one of them goes on asking",
     )
     wider_limits: tuple[str, ...] = option(
-        "--accept-wider-limit", group=Group.OVERRIDES, default=(), choices=own_limits.NAMES, api=True,
+        "--accept-wider-limit", group=Topic.OVERRIDES, default=(), choices=own_limits.NAMES, api=True,
         help="let the run widen this limit of the drive's own; otherwise a tighter one stays",
     )
     speed_unit: bool = option(
-        "--accept-speed-unit", group=Group.OVERRIDES, default=False, api=True,
+        "--accept-speed-unit", group=Topic.OVERRIDES, default=False, api=True,
         form=Form("the profile's unit of speed, unseen", ("real",)),
         help="take the profile's unit of speed without seeing the shaft turn as fast as it says",
     )
     reset_fault: bool = option(
-        "--reset-fault", group=Group.OVERRIDES, default=False, api=True,
+        "--reset-fault", group=Topic.OVERRIDES, default=False, api=True,
         form=Form("reset a drive that is in fault", ("real",)),
         help="reset a drive that is in fault; never done without this option",
     )
@@ -414,20 +414,20 @@ class RunDetails(_Said):
     """Details of one run: what the log states of it, faults to rehearse, the priority of its control loop."""
 
     operator: str | None = option(
-        "--operator", group=Group.OUTPUT, metavar="NAME", api=True, longest=500, form=Form("Operator"),
+        "--operator", group=Topic.OUTPUT, metavar="NAME", api=True, longest=500, form=Form("Operator"),
         help="who ran it, for log and report",
     )
     note: str | None = option(
-        "--note", group=Group.OUTPUT, metavar="TEXT", api=True, longest=500, form=Form("Note", wide=True),
+        "--note", group=Topic.OUTPUT, metavar="TEXT", api=True, longest=500, form=Form("Note", wide=True),
         help="remark on this run, for log and report",
     )
     faults: tuple[str, ...] = option(
-        "--fault", group=Group.SIMULATED, default=(), metavar="FAULT", api=True,
+        "--fault", group=Topic.SIMULATED, default=(), metavar="FAULT", api=True,
         form=Form("Rehearse a fault", ("simulated",), hint="sto@hold+2s"),
         help="rehearse a fault of the embedded rig, such as sto@hold+2s; 'list' shows them all",
     )
     real_time_priority: bool | None = option(
-        "--real-time-priority", group=Group.CYCLE, api=True,
+        "--real-time-priority", group=Topic.CYCLE, api=True,
         help="the control loop before all other programs, its memory locked, where that is allowed",
     )
 

@@ -31,7 +31,7 @@ from pydantic_core import core_schema
 
 from drivers import DataFileError, PreflightRefused, Problem
 from profiles import Conversion, DataModel, Finding, Loaded, load_with_lines, messages_of, one_of, parse_with_lines
-from tdhil.config.options import CLOCKS, OPTIONS, Group, Option
+from tdhil.config.options import CLOCKS, OPTIONS, Option, Topic
 from tdhil.config.registry import RegistryEntry, names
 
 
@@ -241,7 +241,7 @@ class Expected(DataModel):
 
 def _only_the_operator() -> Iterator[tuple[str, str]]:
     for one in OPTIONS:
-        if one.group is Group.OVERRIDES and not one.at:
+        if one.group is Topic.OVERRIDES and not one.at:
             flag = f"{one.flag} NAME" if one.joined else one.flag
             text = (f"a file never speaks for who stands at the shaft; take the line out and give {flag} on the "
                     "command line")

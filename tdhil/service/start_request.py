@@ -20,12 +20,12 @@ from profiles.quantities import read
 from tdhil.config import (
     OPTION,
     OPTIONS,
-    Group,
     Option,
     Overrides,
     Rig,
     RunDetails,
     RunOptions,
+    Topic,
     load_rig,
     parse_rig,
     resolve,
@@ -261,7 +261,7 @@ def run_request(rig: RigFile, asked: Mapping[str, Any], *, left_in: Path | None 
     peer = with_faults(plan_peer(options, connection), details.faults, connection.drive)
     if not peer.embedded:
         for one in OPTIONS:
-            if one.group is Group.SIMULATED and asked.get(one.name):
+            if one.group is Topic.SIMULATED and asked.get(one.name):
                 raise UsageError("is for a simulated rig", where=one.name)
     return RunRequest.of(
         options, connection, replace(peer, left_in=left_in), rig.rig, overrides=Overrides.of(asked),

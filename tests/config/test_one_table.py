@@ -29,7 +29,7 @@ PACKAGE = ROOT / "tdhil"
 TABLE = Path("tdhil/config/options.py")
 
 LINE = """\
-    dwell_s: float | None = option("--dwell", "run.dwell_s", group=Group.MOTION, unit=TIME, ge=0, le=60, api=True, \
+    dwell_s: float | None = option("--dwell", "run.dwell_s", group=Topic.MOTION, unit=TIME, ge=0, le=60, api=True, \
 form=Form("Dwell, s"), help="time at the mean speed before stage 5")
 """
 BEFORE = "    settings: Mapping[str, Setting] = field(default_factory=dict)\n"

@@ -5,8 +5,6 @@ import numpy as np
 from tdhil.recording.recording import Excitation, LagPrior, Recording, Segment
 
 LINES = (0.1, 0.2, 0.3, 0.4)
-UNRECORDED_S = 2.0
-"""Between two segments: the closed form has no torque that would change the mean speed, so it must not be recorded."""
 
 
 def closed_form(
@@ -25,8 +23,12 @@ def closed_form(
     rate_hz=50.0,
     lag_prior=None,
     seed=5,
+    unrecorded_s=0.0,
 ):
-    """``noise``: sd of white torque per sample, N·m, on the reported torque."""
+    """``noise``: sd of white torque per sample, N·m, on the reported torque. ``unrecorded_s``: pause between segments.
+
+    The closed form has no torque that would change the mean speed: without a pause its balance of momentum is false.
+    """
     rng = np.random.default_rng(seed)
     omega = 2.0 * np.pi * np.array(lines)
     s = 1j * omega
@@ -45,7 +47,7 @@ def closed_form(
             Segment(start + begin, start + begin + periods * period, period, 1, offset, tuple(lines),
                     tuple(amplitudes), tuple(np.angle(speed_lines)))
         )
-        begin += periods * period + UNRECORDED_S
+        begin += periods * period + unrecorded_s
     time = np.concatenate(times)
     count = len(time)
     return Recording(

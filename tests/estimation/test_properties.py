@@ -69,7 +69,7 @@ def test_rotation_may_be_either_way(plain):
     skew=st.floats(-0.05, 0.05),
 )
 def test_finds_the_truth_of_the_closed_form(inertia, viscous, coulomb, speed_lag, torque_lag, skew):
-    recording = closed_form(inertia, viscous, coulomb, speed_lag, torque_lag, skew, noise=0.02)
+    recording = closed_form(inertia, viscous, coulomb, speed_lag, torque_lag, skew, noise=0.02, unrecorded_s=2.0)
     found = identify(replace(recording, torque_limit_nm=None))
     assert found.verdict in (Verdict.VALID, Verdict.VALID_WIDE)
     width = found.inertia.high - found.inertia.low
