@@ -152,7 +152,8 @@ SUBJECTS = {
     "modbus/watchdog": _driver("modbus/watchdog", "test_modbus_preflight.py", "test_modbus_watchdog.py"),
     "modbus/parameters": _driver(
         "modbus/parameters", "test_modbus_preflight.py", "test_modbus_wrongs.py",
-        within="_SLACK RegisterSetting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting _unit",
+        within="_SLACK RegisterSetting _LIMIT set_limits _write_limit own_speed_limits write_setting wanted_setting"
+        " _unit",
     ),
     "modbus/quick_stop": _driver("modbus/quick_stop", "test_modbus_quick_stop.py"),
     "log_writer": Subject(

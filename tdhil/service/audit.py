@@ -13,8 +13,8 @@ deleted or put back from an older copy.
 What can't be held: a user of this computer who can read ``audit.key`` (the service's own user, root) can write another
 chain that holds. Where ``audit.key`` is deleted together with the folder, a new chain begins; where it is deleted
 alone, and the lines are written anew without a key, they are taken for lines from before there was one: the time at
-which the key was made, and the line "audit key made", then come too late. Only a head that was exported before shows each of
-these: `Audit.verify` takes it. So export it at times, to another computer.
+which the key was made, and the line "audit key made", then come too late. Only a head that was exported before shows
+each of these: `Audit.verify` takes it. So export it at times, to another computer.
 """
 
 from __future__ import annotations
