@@ -13,20 +13,6 @@ from tests.path.path_runs import tdhil
 
 COUNT, SEED = 50, 25
 
-SHORT = {
-    1469: "torque × 0.1 from stage 2 on, in speed mode without a torque demand: the change is not found yet",
-    5163: "a torque that sticks above a string: it is removed only once the shaft is beyond its limit (decision 0024)",
-}
-"""What falls short today, by number. Strict: a row that is mended has to go."""
-
-
-def combinations():
-    for one in sample(COUNT, SEED):
-        short = SHORT.get(one.number)
-        marks = [pytest.mark.xfail(reason=short, strict=True)] if short else []
-        yield pytest.param(one, id=str(one), marks=marks)
-
-
 def closed(log):
     try:
         return read_run(log).complete
@@ -35,7 +21,7 @@ def closed(log):
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("combination", combinations())
+@pytest.mark.parametrize("combination", sample(COUNT, SEED), ids=str)
 def test_no_lie_is_believed(combination, tmp_path):
     program, excuse = combination.program, unknowable(combination)
     for name, text in program.files.items():
