@@ -87,10 +87,11 @@ FLAT_MOVES, YIELD_MOVES = 12.0, 3.0
 a shaft must have been told to yield. A string that swings keeps a healthy speed within its noise against 5.6 times that
 (`benchmarks/healthy_runs.py`)."""
 
-YIELD_S, YIELD_STILL, YIELD_LEFT, SMOOTH_S = 4.0, 1.0, 0.05, 0.4
+YIELD_S, YIELD_STILL, YIELD_LEFT, SMOOTH_S, YIELD_STANDS = 4.0, 1.0, 0.05, 0.4, 0.25
 """A wound-up shaft that is told to yield follows, since the string pulls it. A reported speed that stays within this
 share of the range of the commanded speed, or within its own noise, does not; asked once the commanded one is beyond so
-many times the speed of standstill in the mean over so long, of means over the last, s."""
+many times the speed of standstill in the mean over so long, of means over the next, s, and the reported one is slower
+than the last share of it."""
 
 HELD_S = 1.5
 """A shaft that moved before and is reported to stand still for so long, in spite of a speed setpoint and a torque at
@@ -682,7 +683,7 @@ class Observer:
         told_range, went_range = max(told) - min(told), max(went) - min(went)
         noise = max(self._noise_rad_s(), YIELD_LEFT * told_range)
         clear = max(YIELD_STILL * self._still_rad_s, YIELD_MOVES * noise)
-        stands = abs(point.speed) <= 2.0 * self._still_rad_s
+        stands = math.fsum(abs(one) for one in went) / len(went) <= YIELD_STANDS * mean
         if stands and mean > clear and went_range <= noise:
             self._doubt(
                 frozenset({Signal.SPEED}),
