@@ -1398,7 +1398,10 @@ class _Runaway:
             return ""
         if self._unanswered_s >= UNANSWERED_S:
             return f"{self._pushed_nm:.0f} N·m for {self._unanswered_s:.0f} s have stopped any such shaft"
-        if self._pushing_s >= PUSHING_S and (believable or not self._limits.winds_up):
+        # Above a string the stop begins with a ramp of the setpoint, which may push: until that has ended.
+        ramp_s = self._limits.speed_max_rad_s / self._limits.quick_stop_rad_s2
+        pushes = not self._limits.winds_up or (believable and self._for_s >= ramp_s)
+        if self._pushing_s >= PUSHING_S and pushes:
             return f"{self._pushed_nm:.0f} N·m push the shaft on"
         by_impulse = self._by_impulse_rad_s
         if by_impulse is not None and self._beyond(by_impulse, more_rad_s, believable):
